@@ -1,0 +1,298 @@
+"""What the camera sees of the gripper: corners, edges and faces of its fingers, and how they move with the jaws.
+
+Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes from a YAML
+file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or as a
+table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+import msgspec
+import numpy as np
+import yaml
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon.records import Array
+
+LARGEST_EXTENT_M = 1.0
+SMALLEST_SPREAD_RATIO = 0.02
+
+_T = TypeVar("_T")
+Vector = tuple[float, float, float]
+Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]
+
+
+class GripperError(ValueError):
+    """A gripper file that can't be used; the text is ``key: what is wrong; what would be right``."""
+
+
+class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    nominal_m: Opening
+    min_m: Opening
+    max_m: Opening
+
+
+class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Metres of finger motion in the gripper frame for each metre of opening beyond nominal."""
+
+    axis: Vector
+
+
+class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Rows ``opening_m, dx_m, dy_m, dz_m``, openings ascending; linear between rows."""
+
+    table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
+
+
+class FingerModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    motion: dict[str, Any] | None = None
+
+
+class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    finger: str
+    xyz_m: Vector
+    corner: bool = False
+
+
+class EdgeModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}):
+    start: str
+    end: str
+    kind: Literal["contour", "crease"] = "contour"
+    brighter: Literal["left", "right", "any"] = "any"
+    bevel_m: Annotated[float, Meta(ge=0.0, le=0.02, description="width of a bevel or rounding (m)")] = 0.0
+
+
+class FaceModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    finger: str
+    points: Annotated[tuple[str, ...], Meta(min_length=3)]
+
+
+class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A gripper file as it is written; see ``configs/grippers`` for commented ones."""
+
+    name: str
+    fingers: dict[str, FingerModel]
+    points: dict[str, PointModel]
+    edges: dict[str, EdgeModel]
+    jaw: JawModel | None = None
+    faces: tuple[FaceModel, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FaceLoop:
+    finger: int
+    points: NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeView:
+    """How the edges show from one viewpoint: arrays over all edges of the gripper.
+
+    ``visible``: at least one adjacent face looks at the camera (or the gripper has no faces there).  ``crease``: both
+    adjacent faces do, so that the edge is a line between two shades of the finger, not its outline.  ``inside_point_m`` (e, 3):
+    a point of the visible adjacent face, gripper frame, that tells on which side of an outline the finger lies; NaN if unknown.
+    """
+
+    visible: NDArray[np.bool_]
+    crease: NDArray[np.bool_]
+    inside_point_m: Array
+
+
+class Gripper:
+    """A checked gripper model in arrays.  Raises :class:`GripperError` when the model can't work."""
+
+    def __init__(self, model: GripperModel):
+        self.model = model
+        self.name = model.name
+        self.finger_ids = tuple(model.fingers)
+        self.point_ids = tuple(model.points)
+        self.edge_ids = tuple(model.edges)
+        self._point_index = {name: i for i, name in enumerate(self.point_ids)}
+        finger_index = {name: i for i, name in enumerate(self.finger_ids)}
+        for name, point in model.points.items():
+            if point.finger not in finger_index:
+                raise GripperError(f"points.{name}.finger: there is no finger '{point.finger}'; one of {', '.join(finger_index)}")
+        self.point_finger = np.array([finger_index[p.finger] for p in model.points.values()], dtype=np.intp)
+        self._nominal_points_m = np.array([p.xyz_m for p in model.points.values()], dtype=float).reshape(-1, 3)
+        self.corner_points = np.flatnonzero([p.corner for p in model.points.values()])
+        self.corner_ids = tuple(self.point_ids[i] for i in self.corner_points)
+        self.edge_points = np.array([self._ends(n, e) for n, e in model.edges.items()], dtype=np.intp).reshape(-1, 2)
+        self.edge_finger = self.point_finger[self.edge_points[:, 0]]
+        self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
+        self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
+        self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
+        self.faces = tuple(self._face(i, f, finger_index) for i, f in enumerate(model.faces))
+        self._edge_faces, self._corner_faces = self._adjacency()
+        jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
+        self.has_jaw = model.jaw is not None
+        self.jaw_nominal_m, self.jaw_min_m, self.jaw_max_m = jaw.nominal_m, jaw.min_m, jaw.max_m
+        self._motion = [self._finger_motion(n, f.motion) for n, f in model.fingers.items()]
+        self._check()
+
+    def points_grip_m(self, jaw_opening_m: float | None = None) -> Array:
+        """All points (p, 3) in the gripper frame at an opening (nominal if None); outside the jaw's range: ValueError."""
+        if jaw_opening_m is None or not self.has_jaw:
+            return self._nominal_points_m
+        if not self.jaw_min_m - 1e-9 <= jaw_opening_m <= self.jaw_max_m + 1e-9:
+            raise ValueError(f"jaw opening {jaw_opening_m:.4f} m is outside {self.jaw_min_m} to {self.jaw_max_m} m")
+        return self._nominal_points_m + self._finger_offsets_m(jaw_opening_m)[self.point_finger]
+
+    def point_motion(self, jaw_opening_m: float) -> Array:
+        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is piecewise linear)."""
+        low, high = max(jaw_opening_m - 5e-5, self.jaw_min_m), min(jaw_opening_m + 5e-5, self.jaw_max_m)
+        if not high > low:
+            return np.zeros_like(self._nominal_points_m)
+        rate = (self._finger_offsets_m(high) - self._finger_offsets_m(low)) / (high - low)
+        return rate[self.point_finger]
+
+    def edge_view(self, points_grip_m: Array, eye_grip_m: Array) -> EdgeView:
+        """Which edges show from ``eye_grip_m`` (3,), the camera's centre in the gripper frame."""
+        facing = np.array([self._faces_eye(f, points_grip_m, eye_grip_m) for f in self.faces], dtype=bool)
+        visible = np.ones(len(self.edge_ids), dtype=bool)
+        crease = self._edge_crease.copy()
+        inside = np.full((len(self.edge_ids), 3), np.nan)
+        for i, faces in enumerate(self._edge_faces):
+            seen = [f for f in faces if facing[f]]
+            if faces:
+                visible[i] = bool(seen)
+            if len(faces) == 2:
+                crease[i] = len(seen) == 2
+            if len(seen) == 1:
+                inside[i] = points_grip_m[self.faces[seen[0]].points].mean(axis=0)
+        return EdgeView(visible, crease, inside)
+
+    def corners_visible(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
+        """(c,) whether a face at the corner looks at the camera; True for corners without faces."""
+        facing = [self._faces_eye(f, points_grip_m, eye_grip_m) for f in self.faces]
+        return np.array([not faces or any(facing[f] for f in faces) for faces in self._corner_faces], dtype=bool)
+
+    def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
+        """Indices of the edges that end in a corner (index into ``corner_ids``)."""
+        return np.flatnonzero((self.edge_points == self.corner_points[corner]).any(axis=1))
+
+    def _ends(self, name: str, edge: EdgeModel) -> tuple[int, int]:
+        for key, point in (("from", edge.start), ("to", edge.end)):
+            if point not in self._point_index:
+                raise GripperError(f"edges.{name}.{key}: there is no point '{point}'; one of {', '.join(self.point_ids)}")
+        i, j = self._point_index[edge.start], self._point_index[edge.end]
+        if self.point_finger[i] != self.point_finger[j]:
+            raise GripperError(f"edges.{name}: its ends lie on two fingers; an edge belongs to one finger")
+        if not np.linalg.norm(self._nominal_points_m[i] - self._nominal_points_m[j]) > 1e-4:
+            raise GripperError(f"edges.{name}: its ends are less than 0.1 mm apart; two different points")
+        return i, j
+
+    def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> FaceLoop:
+        unknown = [p for p in face.points if p not in self._point_index]
+        if unknown:
+            raise GripperError(f"faces[{index}].points: there is no point '{unknown[0]}'; one of {', '.join(self.point_ids)}")
+        if face.finger not in finger_index:
+            raise GripperError(f"faces[{index}].finger: there is no finger '{face.finger}'; one of {', '.join(finger_index)}")
+        loop = np.array([self._point_index[p] for p in face.points], dtype=np.intp)
+        strange = [p for p in face.points if self.model.points[p].finger != face.finger]
+        if strange:
+            raise GripperError(f"faces[{index}].points: '{strange[0]}' is not on finger '{face.finger}'; points of that finger")
+        centre = self._nominal_points_m[self.point_finger == finger_index[face.finger]].mean(axis=0)
+        corners = self._nominal_points_m[loop]
+        if np.dot(_normal(corners), corners.mean(axis=0) - centre) < 0.0:
+            raise GripperError(f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside")
+        return FaceLoop(finger_index[face.finger], loop)
+
+    def _adjacency(self) -> tuple[list[list[int]], list[list[int]]]:
+        members = [set(f.points.tolist()) for f in self.faces]
+        edges = [[k for k, m in enumerate(members) if {int(i), int(j)} <= m] for i, j in self.edge_points]
+        return edges, [[k for k, m in enumerate(members) if int(c) in m] for c in self.corner_points]
+
+    @staticmethod
+    def _faces_eye(face: FaceLoop, points_grip_m: Array, eye_grip_m: Array) -> bool:
+        loop = points_grip_m[face.points]
+        return bool(np.dot(_normal(loop), eye_grip_m - loop[0]) > 0.0)
+
+    def _finger_motion(self, name: str, motion: dict[str, Any] | None) -> Array:
+        """Table (rows, 4) of opening and offset; an axis becomes the table of its two ends."""
+        if motion is None:
+            return np.zeros((1, 4))
+        key = f"fingers.{name}.motion"
+        if not self.has_jaw:
+            raise GripperError(f"{key}: the gripper has no jaw; a section `jaw` with nominal_m, min_m, max_m")
+        if set(motion) == {"axis"}:
+            axis = np.array(_convert(motion, AxisMotion, key).axis)
+            ends = np.array([self.jaw_min_m, self.jaw_max_m])
+            return np.column_stack([ends, (ends - self.jaw_nominal_m)[:, None] * axis])
+        if set(motion) != {"table"}:
+            raise GripperError(f"{key}: has the keys {', '.join(motion) or 'none'}; either `axis` or `table`")
+        table = np.array(_convert(motion, TableMotion, key).table)
+        if not (np.diff(table[:, 0]) > 0.0).all():
+            raise GripperError(f"{key}.table: openings don't ascend; rows sorted by opening_m")
+        if table[0, 0] > self.jaw_min_m + 1e-9 or table[-1, 0] < self.jaw_max_m - 1e-9:
+            raise GripperError(f"{key}.table: covers {table[0, 0]} to {table[-1, 0]} m; all of jaw.min_m to jaw.max_m")
+        if np.abs(_interpolate(table, self.jaw_nominal_m)).max() > 1e-6:
+            raise GripperError(f"{key}.table: the finger is not at rest at jaw.nominal_m; an offset of zero there")
+        return table
+
+    def _finger_offsets_m(self, jaw_opening_m: float) -> Array:
+        return np.array([_interpolate(table, jaw_opening_m) for table in self._motion])
+
+    def _check(self) -> None:
+        if not self.finger_ids:
+            raise GripperError("fingers: there are none; at least one finger")
+        if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
+            raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
+        far = np.abs(self._nominal_points_m).max(axis=1, initial=0.0)
+        if far.max(initial=0.0) > LARGEST_EXTENT_M:
+            name = self.point_ids[int(far.argmax())]
+            raise GripperError(f"points.{name}.xyz_m: {far.max():g} m from the TCP; metres (millimetres were meant?)")
+        corners = self._nominal_points_m[self.corner_points]
+        if len(corners) < 3:
+            raise GripperError(f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line")
+        spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+        if spread[1] < SMALLEST_SPREAD_RATIO * spread[0]:
+            raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
+        if len(self.edge_ids) < 3:
+            raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
+        for i, name in enumerate(self.corner_ids):
+            if len(self.edges_at_corner(i)) < 2:
+                raise GripperError(f"points.{name}: fewer than two edges end in this corner; a corner is where edges meet")
+
+
+_POLARITY = {"any": 0, "right": 1, "left": -1}
+
+
+def _normal(loop: Array) -> Array:
+    """Outward normal (3,) of a planar loop (Newell), not normalised."""
+    following = np.roll(loop, -1, axis=0)
+    return np.cross(loop, following).sum(axis=0)
+
+
+def _interpolate(table: Array, opening_m: float) -> Array:
+    if len(table) == 1:
+        return table[0, 1:]
+    return np.array([np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)])
+
+
+def _convert(value: Any, kind: type[_T], key: str) -> _T:
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise GripperError(f"{key}: {error}") from None
+
+
+def gripper_from_dict(value: Any) -> Gripper:
+    """A parsed YAML document -> :class:`Gripper`.  ValidationError of msgspec where a key or a type is wrong."""
+    return Gripper(msgspec.convert(value, GripperModel))
+
+
+def load_gripper(path: Path | str) -> Gripper:
+    """Read a gripper file.  OSError if it can't be read; :class:`GripperError` if it can't be used."""
+    try:
+        value = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+        return gripper_from_dict(value)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise GripperError(f"not YAML: {' '.join(str(error).split())}; see configs/grippers for examples") from None
+    except msgspec.ValidationError as error:
+        raise GripperError(str(error)) from None
