@@ -1,0 +1,248 @@
+"""Parsed YAML -> typed settings, with errors that a person can act on.
+
+``msgspec`` does the conversion.  Where it refuses, its text names neither the entry of a mapping nor what would be right, so the first fault
+is searched for again here along the type, with the description and the bounds that stand in the settings.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from typing import Any, NamedTuple, TypeVar
+
+import msgspec
+from msgspec import inspect as mi
+
+_T = TypeVar("_T")
+
+
+class Fault(NamedTuple):
+    """What is wrong at a key, and what would be right."""
+
+    key: str
+    wrong: str
+    right: str
+
+
+class SettingsError(ValueError):
+    """A value doesn't fit its settings type; ``fault`` says where and why."""
+
+    def __init__(self, fault: Fault):
+        super().__init__(f"{fault.key}: {fault.wrong}; {fault.right}")
+        self.fault = fault
+
+
+def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:
+    """Convert parsed YAML to a settings type (a ``msgspec.Struct`` or a tagged union of them).
+
+    Raises :class:`SettingsError` with the full dotted key (below ``key``) for an unknown, missing or wrong entry, and for numbers
+    that are not finite.
+    """
+    node = mi.type_info(settings_type)
+    fault = _find_fault(value, node, key)
+    if fault is not None:
+        raise SettingsError(fault)
+    try:
+        return msgspec.convert(value, settings_type)
+    except msgspec.ValidationError as error:
+        text, _, where = str(error).partition(" - at ")
+        inner = where.strip("`$.")
+        raise SettingsError(Fault(_join(key, inner), text, "see the description of the section in configs/")) from None
+
+
+def _find_fault(value: Any, node: mi.Type, key: str, description: str = "") -> Fault | None:
+    if isinstance(node, mi.Metadata):
+        extra = (node.extra_json_schema or {}).get("description", "")
+        return _find_fault(value, node.type, key, extra or description)
+    if isinstance(node, mi.UnionType):
+        return _union_fault(value, node, key, description)
+    if isinstance(node, mi.StructType):
+        return _struct_fault(value, node, key, description)
+    if isinstance(node, mi.DictType):
+        return _dict_fault(value, node, key, description)
+    if isinstance(node, mi.TupleType | mi.VarTupleType | mi.ListType):
+        return _sequence_fault(value, node, key, description)
+    return _leaf_fault(value, node, key, description)
+
+
+def _union_fault(value: Any, node: mi.UnionType, key: str, description: str) -> Fault | None:
+    options = [_unwrap(t) for t in node.types]
+    if value is None and any(isinstance(t, mi.NoneType) for t in options):
+        return None
+    structs = [t for t in options if isinstance(t, mi.StructType)]
+    if structs and (isinstance(value, dict) or len(structs) == len(options)):
+        return _tagged_fault(value, structs, key) if len(structs) > 1 else _struct_fault(value, structs[0], key, description)
+    faults = [_find_fault(value, t, key, description) for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]
+    if any(fault is None for fault in faults):
+        return None
+    same_shape = [f for f in faults if f is not None and f.key != key]
+    return (same_shape or [f for f in faults if f is not None])[0]
+
+
+def _tagged_fault(value: Any, structs: list[mi.StructType], key: str) -> Fault | None:
+    tag_field = structs[0].tag_field or "type"
+    tags = [str(s.tag) for s in structs]
+    if not isinstance(value, dict):
+        return Fault(key, f"is {_show(value)}", f"a section with the key `{tag_field}`: {_one_of(tags)}")
+    if tag_field not in value:
+        return Fault(_join(key, tag_field), "is missing", _one_of(tags))
+    chosen = [s for s in structs if s.tag == value[tag_field]]
+    if not chosen:
+        return Fault(_join(key, tag_field), f"is {_show(value[tag_field])}{_did_you_mean(str(value[tag_field]), tags)}", _one_of(tags))
+    return _struct_fault(value, chosen[0], key, "")
+
+
+def _struct_fault(value: Any, node: mi.StructType, key: str, description: str) -> Fault | None:
+    names = [f.encode_name for f in node.fields]
+    known = [*names, node.tag_field] if node.tag_field else names
+    if not isinstance(value, dict):
+        return Fault(key, f"is {_show(value)}", description or f"a section with {', '.join(known)}")
+    if node.tag_field and node.tag_field in value and value[node.tag_field] != node.tag:
+        return Fault(_join(key, node.tag_field), f"is {_show(value[node.tag_field])}", str(node.tag))
+    for name in value:
+        if name not in known:
+            return Fault(_join(key, name), f"unknown key{_did_you_mean(name, known)}", f"one of {', '.join(known)}")
+    for field in node.fields:
+        inner_key = _join(key, field.encode_name)
+        if field.encode_name in value:
+            fault = _find_fault(value[field.encode_name], field.type, inner_key)
+            if fault is not None:
+                return fault
+        elif field.required:
+            return Fault(inner_key, "is missing", _expected(field.type))
+    return None
+
+
+def _dict_fault(value: Any, node: mi.DictType, key: str, description: str) -> Fault | None:
+    if not isinstance(value, dict):
+        return Fault(key, f"is {_show(value)}", description or "a section of named entries")
+    faults = (_find_fault(item, node.value_type, _join(key, str(name))) for name, item in value.items())
+    return next((fault for fault in faults if fault is not None), None)
+
+
+def _sequence_fault(value: Any, node: mi.TupleType | mi.VarTupleType | mi.ListType, key: str, description: str) -> Fault | None:
+    if not isinstance(value, list):
+        return Fault(key, f"is {_show(value)}", _expected(node, description))
+    if isinstance(node, mi.TupleType):
+        if len(value) != len(node.item_types):
+            return Fault(key, f"has {len(value)} values", _expected(node, description))
+        types = node.item_types
+    else:
+        if len(value) < (node.min_length or 0) or (node.max_length is not None and len(value) > node.max_length):
+            return Fault(key, f"has {len(value)} values", _expected(node, description))
+        types = (node.item_type,) * len(value)
+    faults = (_find_fault(item, t, f"{key}[{i}]", description) for i, (item, t) in enumerate(zip(value, types, strict=True)))
+    return next((fault for fault in faults if fault is not None), None)
+
+
+def _leaf_fault(value: Any, node: mi.Type, key: str, description: str) -> Fault | None:
+    if isinstance(node, mi.AnyType):
+        return None
+    if isinstance(value, float) and not math.isfinite(value):
+        return Fault(key, f"is {value}", _expected(node, description))
+    if isinstance(node, mi.EnumType):
+        options = [str(member.value) for member in node.cls]
+        return None if value in options else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+    if isinstance(node, mi.LiteralType):
+        options = [str(v) for v in node.values]
+        return None if value in node.values else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+    if _fits_leaf(value, node):
+        return None
+    return Fault(key, f"is {_show(value)}", _expected(node, description))
+
+
+def _fits_leaf(value: Any, node: mi.Type) -> bool:
+    if isinstance(node, mi.BoolType):
+        return isinstance(value, bool)
+    if isinstance(node, mi.NoneType):
+        return value is None
+    if isinstance(node, mi.StrType):
+        try:
+            msgspec.convert(value, type=_constrained_text(node))
+        except msgspec.ValidationError:
+            return False
+        return True
+    if isinstance(node, mi.IntType | mi.FloatType):
+        allowed: tuple[type, ...] = (int,) if isinstance(node, mi.IntType) else (int, float)
+        return isinstance(value, allowed) and not isinstance(value, bool) and _in_bounds(value, node)
+    return True  # msgspec itself is asked afterwards
+
+
+def _constrained_text(node: mi.StrType) -> Any:
+    from typing import Annotated
+
+    return Annotated[str, msgspec.Meta(min_length=node.min_length, max_length=node.max_length, pattern=node.pattern)]
+
+
+def _in_bounds(value: float, node: mi.IntType | mi.FloatType) -> bool:
+    return (
+        (node.gt is None or value > node.gt)
+        and (node.ge is None or value >= node.ge)
+        and (node.lt is None or value < node.lt)
+        and (node.le is None or value <= node.le)
+    )
+
+
+def _expected(node: mi.Type, description: str = "") -> str:
+    """What would be right for a type, in words: kind, bounds and the settings' own description with the unit."""
+    if isinstance(node, mi.Metadata):
+        return _expected(node.type, (node.extra_json_schema or {}).get("description", "") or description)
+    suffix = f": {description}" if description else ""
+    if isinstance(node, mi.UnionType):
+        options = [t for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]
+        structs = [s for s in map(_unwrap, options) if isinstance(s, mi.StructType)]
+        if len(structs) > 1:
+            return f"a section with `{structs[0].tag_field}`: {_one_of([str(s.tag) for s in structs])}"
+        return " or ".join(dict.fromkeys(_expected(t) for t in options)) + suffix
+    if isinstance(node, mi.StructType):
+        return f"a section with {', '.join(f.encode_name for f in node.fields)}{suffix}"
+    if isinstance(node, mi.DictType):
+        return f"a section of named entries{suffix}"
+    if isinstance(node, mi.TupleType):
+        return f"a list of {len(node.item_types)} values, each {_expected(node.item_types[0])}{suffix}"
+    if isinstance(node, mi.VarTupleType | mi.ListType):
+        count = f"at least {node.min_length} values" if node.min_length else "values"
+        return f"a list of {count}, each {_expected(node.item_type)}{suffix}"
+    if isinstance(node, mi.LiteralType):
+        return _one_of([str(v) for v in node.values]) + suffix
+    if isinstance(node, mi.EnumType):
+        return _one_of([str(member.value) for member in node.cls]) + suffix
+    if isinstance(node, mi.IntType | mi.FloatType):
+        return ("a whole number" if isinstance(node, mi.IntType) else "a number") + _bounds(node) + suffix
+    names = {mi.BoolType: "true or false", mi.StrType: "text", mi.NoneType: "nothing", mi.AnyType: "a value"}
+    return names.get(type(node), "a value of another type") + suffix
+
+
+def _bounds(node: mi.IntType | mi.FloatType) -> str:
+    limits = [(">", node.gt), (">=", node.ge), ("<", node.lt), ("<=", node.le)]
+    texts = [f"{sign} {limit:g}" for sign, limit in limits if limit is not None]
+    return f" {' and '.join(texts)}" if texts else ""
+
+
+def _one_of(options: list[str]) -> str:
+    return options[0] if len(options) == 1 else f"{', '.join(options[:-1])} or {options[-1]}"
+
+
+def _did_you_mean(name: str, known: list[str]) -> str:
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    return f", did you mean '{close[0]}'?" if close else ""
+
+
+def _show(value: Any) -> str:
+    if value is None:
+        return "empty"
+    if isinstance(value, dict):
+        return "a section"
+    if isinstance(value, list):
+        return "a list"
+    text = str(value).lower() if isinstance(value, bool) else str(value)
+    text = text if len(text) <= 60 else text[:57] + "..."
+    return f"'{text}'" if isinstance(value, str) else text
+
+
+def _unwrap(node: mi.Type) -> mi.Type:
+    return _unwrap(node.type) if isinstance(node, mi.Metadata) else node
+
+
+def _join(key: str, name: str) -> str:
+    return f"{key}.{name}" if key and name else key or name

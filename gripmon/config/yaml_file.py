@@ -1,0 +1,87 @@
+"""YAML as people mean it: duplicate keys refused, ``1e-3`` is a number, ``on`` and ``12:30`` are text."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gripmon.config.errors import ConfigError
+
+_TAG = "tag:yaml.org,2002:"
+
+
+class _Loader(yaml.SafeLoader):
+    """Scalars by the core schema of YAML 1.2 instead of 1.1."""
+
+
+_Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
+    ("null", r"~|null|Null|NULL|", "~nN"),
+    ("int", r"[-+]?[0-9]+", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+.0123456789"),
+):
+    _Loader.add_implicit_resolver(_TAG + _tag, re.compile(rf"^(?:{_pattern})$"), [*_first, ""] if _tag == "null" else list(_first))
+
+
+def _integer(_loader: _Loader, node: yaml.ScalarNode) -> int:
+    return int(node.value)  # 010 is ten, as in YAML 1.2
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: dict[Any, int] = {}
+    for key_node, _value in node.value:
+        key = loader.construct_object(key_node, deep=True)
+        line = key_node.start_mark.line + 1
+        if not isinstance(key, str):
+            raise _DuplicateOrStrangeKeyError(line, f"the key {key!r} is not text", "a name; quotes around it if it looks like a number")
+        if key in seen:
+            raise _DuplicateOrStrangeKeyError(line, f"the key '{key}' is there twice, first in line {seen[key]}", "each key once")
+        seen[key] = line
+    return dict(loader.construct_pairs(node, deep=True))
+
+
+_Loader.add_constructor(_TAG + "int", _integer)
+_Loader.add_constructor(_TAG + "map", _mapping)
+
+
+class _DuplicateOrStrangeKeyError(Exception):
+    def __init__(self, line: int, wrong: str, right: str):
+        super().__init__(wrong)
+        self.line, self.wrong, self.right = line, wrong, right
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file.  :class:`ConfigError` if it can't be read, isn't YAML, has a key twice or is no mapping."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(path, "", "there is no such file", "the path of a YAML file") from None
+    except IsADirectoryError:
+        raise ConfigError(path, "", "is a directory", "the path of a YAML file") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(path, "", f"is not text (byte {error.start} is not UTF-8)", "a YAML file") from None
+    except OSError as error:
+        raise ConfigError(path, "", f"can't be read ({error.strerror})", "a readable YAML file") from None
+    try:
+        value = yaml.load(text, _Loader)
+    except _DuplicateOrStrangeKeyError as error:
+        raise ConfigError(path, f"line {error.line}", error.wrong, error.right) from None
+    except yaml.MarkedYAMLError as error:
+        line = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
+        problem = error.problem or error.context or "malformed"
+        raise ConfigError(path, line, f"not YAML: {problem}", "`key: value` lines, indented with blanks") from None
+    except yaml.YAMLError as error:
+        raise ConfigError(path, "", f"not YAML: {error}", "`key: value` lines, indented with blanks") from None
+    if value is None:
+        raise ConfigError(path, "", "is empty", "`key: value` lines; see configs/demo.yaml")
+    if not isinstance(value, dict):
+        raise ConfigError(path, "", f"holds {_kind(value)}", "`key: value` lines; see configs/demo.yaml")
+    return value
+
+
+def _kind(value: object) -> str:
+    return {list: "a list", str: "a single text"}.get(type(value), f"a single value {value!r}")
