@@ -110,7 +110,7 @@ class BrownMap:
         r2 = np.where(r2 < self._max_r2, r2, np.nan)
         radial = _horner(self._numerator, r2)
         if self._rational:
-            radial = radial / _horner(self._denominator, r2)
+            radial = radial * (1.0 / _horner(self._denominator, r2))
         tangent = 2.0 * (self._p1 * y + self._p2 * x)
         q: Array = xy * (radial + tangent)
         q[0] += self._p2 * r2
