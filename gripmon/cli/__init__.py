@@ -1,0 +1,64 @@
+"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+from gripmon import __version__
+from gripmon.cli import check, demo, replay, run, simulate
+from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
+
+_COMMANDS = (demo, run, replay, simulate, check)
+
+_DESCRIPTION = """\
+gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the fingertips' corners, corrects
+the hand/eye calibration cam_T_grip, says whether it can still be trusted, and publishes it over Zenoh."""
+
+_EPILOG = """\
+first steps:
+  gripmon demo                                   everything at work on a simulated camera, 30 s
+  gripmon check configs/live_camera.yaml         is my configuration sound?
+  gripmon run configs/live_camera.yaml           the daemon
+
+exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what would be right);
+3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all subcommands; each sets ``handler``."""
+    parser = argparse.ArgumentParser(
+        prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--version", action="version", version=f"gripmon {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND")
+    for command in _COMMANDS:
+        command.add_parser(commands)
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command line (default: the process's own) and return the exit code.  Usage errors raise ``SystemExit(2)``."""
+    parser = build_parser()
+    chosen = parser.parse_args(arguments)
+    if not hasattr(chosen, "handler"):
+        parser.print_help()
+        return 0
+    # One thread: the matrices are tiny, and the same input then gives the same bytes on any machine.  Before NumPy is imported.
+    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    try:
+        code: int = chosen.handler(chosen)
+        sys.stdout.flush()
+    except CommandFailedError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("gripmon: interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:
+        # Whoever read our output has seen enough.  Python would complain once more at exit without this.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
+    return code

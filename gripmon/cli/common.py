@@ -1,0 +1,93 @@
+"""What several subcommands share.  Nothing heavy at the top: this is imported for ``--help``."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+
+EXIT_DONE = 0
+EXIT_USAGE = 2
+EXIT_FAILED = 3
+EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
+
+
+class CommandFailedError(Exception):
+    """A command ends here; ``str()`` is the one line for stderr."""
+
+    def __init__(self, text: str, exit_code: int = EXIT_FAILED):
+        super().__init__(text)
+        self.exit_code = exit_code
+
+
+def add_command(
+    commands: Any, name: str, handler: Callable[[argparse.Namespace], int], summary: str, description: str, examples: str
+) -> argparse.ArgumentParser:
+    """A subcommand's parser with its help texts."""
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name,
+        help=summary,
+        description=description,
+        epilog=f"examples:\n{examples}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def positive_number(text: str) -> float:
+    """An argument that is a finite number above zero."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number; a number above 0") from None
+    if not (math.isfinite(value) and value > 0.0):
+        raise argparse.ArgumentTypeError(f"{text} is not above 0; a number above 0")
+    return value
+
+
+def load(path: str, *, check_source: bool = True) -> Config:
+    """The checked configuration in a file; a fault ends the command with exit code 2."""
+    from gripmon.config import ConfigError, load_config
+
+    try:
+        return load_config(Path(path), check_source=check_source)
+    except ConfigError as error:
+        raise CommandFailedError(str(error), EXIT_USAGE) from None
+
+
+def make_directory(path: Path) -> Path:
+    """Create a directory for output; a fault ends the command with exit code 2."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CommandFailedError(f"--out {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE) from None
+    return path
+
+
+def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[[], object]]:
+    """A context that gives a function to call once for each step; it draws on stderr, and only for a person."""
+    if not sys.stderr.isatty():
+        return nullcontext(lambda: None)
+    return _TqdmSteps(total, unit)
+
+
+class _TqdmSteps(AbstractContextManager[Callable[[], object]]):
+    def __init__(self, total: int | None, unit: str):
+        from tqdm import tqdm
+
+        self._bar = tqdm(total=total, unit=unit, file=sys.stderr, dynamic_ncols=True)
+
+    def __enter__(self) -> Callable[[], object]:
+        return self._bar.update
+
+    def __exit__(self, *_exception: object) -> None:
+        self._bar.close()

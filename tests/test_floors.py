@@ -1,0 +1,117 @@
+"""Imports point downward only: the floors of the design, read from the source with ``ast``."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PACKAGE = ROOT / "gripmon"
+
+FLOORS = {
+    "records": 0, "geometry": 0, "lenses": 0, "camera": 0, "gripper": 0,
+    "corners": 1, "differential": 1, "recalibrate": 1, "policy": 1, "calibration": 1, "simulator": 1,
+    "monitor": 2,
+    "sources": 3, "publish": 3, "recording": 3, "report": 3, "client": 3,
+    "daemon": 4, "config": 4,
+    "cli": 5, "__main__": 6,
+}  # fmt: skip
+FOREIGN = {"zenoh": {"publish", "client"}, "rerun": {"recording", "report"}}
+HEAVY = ("numpy", "scipy", "cv2", "zenoh", "rerun", "yaml", "msgspec", "tqdm")
+
+
+def room_of(path: Path) -> str:
+    """``gripmon/corners/fit.py`` -> ``corners``; the package's own ``__init__`` -> ``gripmon``."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
+    return "gripmon" if parts == ("__init__",) else parts[0]
+
+
+def imported_modules(source: str, package: str = "gripmon") -> list[str]:
+    """Full names of everything that a file imports, wherever in the file (deferred imports count too)."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            prefix = node.module or ""
+            if node.level:
+                base = package.split(".")[: len(package.split(".")) - node.level + 1]
+                prefix = ".".join([*base, prefix]) if prefix else ".".join(base)
+            names += [f"{prefix}.{alias.name}" for alias in node.names]
+    return names
+
+
+def faults_of(room: str, modules: list[str]) -> list[str]:
+    """What a room's imports break, in words."""
+    faults = []
+    for module in modules:
+        top, _, rest = module.partition(".")
+        if top in FOREIGN and room not in FOREIGN[top]:
+            faults.append(f"{room} imports {top}; only {sorted(FOREIGN[top])} may")
+        other = rest.split(".")[0]
+        if top != "gripmon" or other in ("", "__version__", room):
+            continue
+        if other not in FLOORS:
+            faults.append(f"{room} imports gripmon.{other}, which is in no floor")
+        elif FLOORS[other] > FLOORS[room]:
+            faults.append(f"{room} (floor {FLOORS[room]}) imports {other} (floor {FLOORS[other]}) above it")
+        elif FLOORS[other] == FLOORS[room] == 1:
+            faults.append(f"{room} and {other} are both on floor 1; they meet only in monitor")
+    return faults
+
+
+def test_every_import_points_downward():
+    faults = []
+    for path in sorted(PACKAGE.rglob("*.py")):
+        room = room_of(path)
+        if room == "gripmon":
+            assert not [m for m in imported_modules(path.read_text()) if m.startswith("gripmon")], "the package imports no room"
+            continue
+        package = ".".join(path.relative_to(ROOT).parent.parts)
+        assert room in FLOORS, f"{path}: give the room a floor"
+        faults += [f"{path.relative_to(ROOT)}: {fault}" for fault in faults_of(room, imported_modules(path.read_text(), package))]
+    assert not faults, "\n".join(faults)
+
+
+@pytest.mark.parametrize(
+    ("room", "source", "expected"),
+    [
+        ("geometry", "from gripmon.records import Array", 0),
+        ("geometry", "from gripmon import monitor", 1),
+        ("corners", "import gripmon.policy", 1),
+        ("corners", "def f():\n    from gripmon.daemon import run", 1),
+        ("monitor", "import zenoh", 1),
+        ("publish", "import zenoh", 0),
+        ("daemon", "import rerun as rr", 1),
+        ("recording", "from rerun import log", 0),
+        ("policy", "from .corners import x", 1),
+        ("cli", "from gripmon import __version__", 0),
+        ("differential", "from gripmon.nowhere import x", 1),
+    ],
+)
+def test_the_rules_catch_what_they_should(room: str, source: str, expected: int):
+    assert len(faults_of(room, imported_modules(source))) == expected
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["demo", "--help"], ["replay", "--help"], []])
+def test_help_imports_nothing_heavy(arguments: list[str]):
+    code = (
+        "import sys\nfrom gripmon.cli import main\n"
+        f"try:\n    main({arguments!r})\nexcept SystemExit:\n    pass\n"
+        f"print('LOADED', sorted(set({HEAVY!r}) & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert "LOADED []" in done.stderr
+    assert "gripmon" in done.stdout
+
+
+def test_package_list_matches_the_tree():
+    """``packages`` in pyproject.toml is written by hand; a forgotten one would be missing from the wheel."""
+    listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
+    found = {".".join(p.parent.relative_to(ROOT).parts) for p in PACKAGE.rglob("__init__.py")}
+    assert listed - {"gripmon.configs"} == found
