@@ -128,6 +128,7 @@ class Gripper:
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
         self.faces = tuple(self._face(i, f, finger_index) for i, f in enumerate(model.faces))
+        self._face_first = np.array([f.points[:3] for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._corner_faces = self._adjacency()
         jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
         self.has_jaw = model.jaw is not None
@@ -153,24 +154,21 @@ class Gripper:
 
     def edge_view(self, points_grip_m: Array, eye_grip_m: Array) -> EdgeView:
         """Which edges show from ``eye_grip_m`` (3,), the camera's centre in the gripper frame."""
-        facing = np.array([self._faces_eye(f, points_grip_m, eye_grip_m) for f in self.faces], dtype=bool)
-        visible = np.ones(len(self.edge_ids), dtype=bool)
-        crease = self._edge_crease.copy()
+        facing = self._facing(points_grip_m, eye_grip_m)
+        seen = facing[self._edge_faces]
+        known = self._edge_faces >= 0
+        visible = ~known.any(axis=1) | seen.any(axis=1)
+        crease = np.where(known.all(axis=1), seen.all(axis=1), self._edge_crease)
         inside = np.full((len(self.edge_ids), 3), np.nan)
-        for i, faces in enumerate(self._edge_faces):
-            seen = [f for f in faces if facing[f]]
-            if faces:
-                visible[i] = bool(seen)
-            if len(faces) == 2:
-                crease[i] = len(seen) == 2
-            if len(seen) == 1:
-                inside[i] = points_grip_m[self.faces[seen[0]].points].mean(axis=0)
+        for i in np.flatnonzero(seen.sum(axis=1) == 1):
+            face = self.faces[self._edge_faces[i, 0 if seen[i, 0] else 1]]
+            inside[i] = points_grip_m[face.points].mean(axis=0)
         return EdgeView(visible, crease, inside)
 
     def corners_visible(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
         """(c,) whether a face at the corner looks at the camera; True for corners without faces."""
-        facing = [self._faces_eye(f, points_grip_m, eye_grip_m) for f in self.faces]
-        return np.array([not faces or any(facing[f] for f in faces) for faces in self._corner_faces], dtype=bool)
+        facing = self._facing(points_grip_m, eye_grip_m)
+        return ~self._corner_faces.any(axis=1) | (self._corner_faces & facing[:-1]).any(axis=1)
 
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
         """Indices of the edges that end in a corner (index into ``corner_ids``)."""
@@ -203,15 +201,26 @@ class Gripper:
             raise GripperError(f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside")
         return FaceLoop(finger_index[face.finger], loop)
 
-    def _adjacency(self) -> tuple[list[list[int]], list[list[int]]]:
+    def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+        """Faces at each edge (e, 2), -1 for none, and whether a face touches a corner (c, f)."""
         members = [set(f.points.tolist()) for f in self.faces]
-        edges = [[k for k, m in enumerate(members) if {int(i), int(j)} <= m] for i, j in self.edge_points]
-        return edges, [[k for k, m in enumerate(members) if int(c) in m] for c in self.corner_points]
+        edge_faces = np.full((len(self.edge_points), 2), -1, dtype=np.intp)
+        for i, (start, end) in enumerate(self.edge_points.tolist()):
+            faces = [k for k, m in enumerate(members) if {start, end} <= m]
+            if len(faces) > 2:
+                raise GripperError(f"edges.{self.edge_ids[i]}: {len(faces)} faces meet in it; at most two")
+            edge_faces[i, : len(faces)] = faces
+        corner_faces = np.array([[int(c) in m for m in members] for c in self.corner_points], dtype=bool)
+        return edge_faces, corner_faces.reshape(len(self.corner_points), len(members))
 
-    @staticmethod
-    def _faces_eye(face: FaceLoop, points_grip_m: Array, eye_grip_m: Array) -> bool:
-        loop = points_grip_m[face.points]
-        return bool(np.dot(_normal(loop), eye_grip_m - loop[0]) > 0.0)
+    def _facing(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
+        """(f + 1,) which faces look at the eye; the last is False and stands for "no face" (index -1)."""
+        out = np.zeros(len(self.faces) + 1, dtype=bool)
+        if self.faces:
+            first = points_grip_m[self._face_first]
+            normals = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
+            np.greater(np.einsum("ij,ij->i", normals, eye_grip_m - first[:, 0]), 0.0, out=out[:-1])
+        return out
 
     def _finger_motion(self, name: str, motion: dict[str, Any] | None) -> Array:
         """Table (rows, 4) of opening and offset; an axis becomes the table of its two ends."""

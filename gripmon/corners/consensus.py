@@ -1,0 +1,233 @@
+"""Step 4 of the corner measurement: one robust fit of all edge candidates in the six parameters of the motion.
+
+Lines that are fitted one by one lock onto straight edges of the background; a rigid gripper leaves only six ways to be wrong.
+Candidates vote with Tukey's biweight about a hypothesis; hypotheses come from the prediction or, after a jump, from a grid of starts.
+The residual of a candidate is its offset along the profile minus ``jacobian @ xi``, in px.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon.corners.prediction import Prediction
+from gripmon.corners.profiles import Candidates
+from gripmon.records import Array
+
+
+class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How edge candidates agree on one motion."""
+
+    start_width_px: Annotated[
+        float, Meta(ge=0.5, le=10.0, description="width of the robust weight at the prediction (px)")
+    ] = 2.5
+    point_floor_px: Annotated[
+        float, Meta(ge=0.005, le=1.0, description="standard deviation of an edge point that image noise does not explain (px)")
+    ] = 0.05
+    support_sigmas: Annotated[
+        float, Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen")
+    ] = 4.0
+    support_share: Annotated[
+        float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
+    ] = 0.3
+
+
+GATE_PX = 0.8
+"""A profile supports a fit if a candidate lies this close to it."""
+
+_TUKEY = 4.685
+_LARGEST_SCALE_PX = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Consensus:
+    """The common motion of the edge candidates.
+
+    ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in 1/px², zero for
+    those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper
+    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).
+    """
+
+    xi: Array
+    weight: Array
+    residual_px: Array
+    information: Array
+    scale_px: float
+    supported: NDArray[np.bool_]
+    edge_share: Array
+    edge_seen: NDArray[np.bool_]
+    profiles: int
+
+    @property
+    def score(self) -> float:
+        """Profiles that agree; comparable between fits of the same image and layout."""
+        return float(np.count_nonzero(self.supported))
+
+
+def base_weights(candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], bevel_m: Array, floor_px: float) -> Array:
+    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
+
+    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  A bevel moves a whole edge at once, so that n points on it are
+    worth no more than one with the bevel's spread (a uniform one, bevel / sqrt(12)).
+    """
+    edge = prediction.layout.edge[candidates.sample]
+    variance = candidates.sigma_px**2 + floor_px**2
+    if bevel_m.any():
+        points = np.bincount(prediction.layout.edge, minlength=len(bevel_m))
+        scale_px_per_m = np.sqrt(np.einsum("ni,ni->n", prediction.jacobian[:, :3], prediction.jacobian[:, :3]))
+        spread_px = bevel_m[edge] * scale_px_per_m[candidates.sample] / np.sqrt(12.0)
+        variance += points[edge] * spread_px**2
+    weight = 1.0 / variance
+    if polarity.any():
+        wanted = polarity[edge]
+        weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
+    return weight
+
+
+def agree(
+    candidates: Candidates,
+    prediction: Prediction,
+    weights: Array,
+    start_xi: Array,
+    prior_information: Array,
+    settings: ConsensusSettings,
+) -> Consensus:
+    """Robust fit from one start: iteratively re-weighted, the width shrinking from ``start_width_px`` to the measured scale.
+
+    ``weights`` (k,) from :func:`base_weights`; ``prior_information`` (m,) holds each unknown at zero by that much (1/m², 1/rad²), as
+    a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start and supports nothing.
+    """
+    jacobian = np.ascontiguousarray(prediction.jacobian[candidates.sample].T)
+    offset = candidates.offset_px
+    xi = start_xi
+    width = settings.start_width_px
+    scale = _LARGEST_SCALE_PX
+    for round_ in range(5):
+        residual = offset - xi @ jacobian
+        if round_ >= 2:
+            scale = _scale(residual, weights, width, settings.point_floor_px)
+            width = min(_TUKEY * scale, settings.start_width_px)
+        elif round_ == 1:
+            width = 0.5 * settings.start_width_px
+        step, information, weight = _step(jacobian, residual, weights, width, xi, prior_information)
+        xi = xi + step
+    residual = offset - xi @ jacobian
+    return _judge(candidates, prediction, weights, xi, weight, residual, information, scale, settings)
+
+
+def agree_from_grid(
+    candidates: Candidates,
+    prediction: Prediction,
+    weights: Array,
+    starts: Array,
+    prior_information: Array,
+    settings: ConsensusSettings,
+    refine: int = 6,
+) -> Consensus:
+    """Best fit from many starts (g, m): all are scored by the candidates near them, the best few refined."""
+    jacobian = prediction.jacobian[candidates.sample].T
+    active = weights > 0.0
+    distance = (candidates.offset_px - starts @ jacobian) * (1.0 / settings.start_width_px)
+    np.square(distance, out=distance)
+    np.subtract(1.0, distance, out=distance)
+    np.maximum(distance, 0.0, out=distance)
+    best = np.argsort(-(distance @ active.astype(float)), kind="stable")[:refine]
+    fits = [agree(candidates, prediction, weights, starts[i], prior_information, settings) for i in best]
+    return max(fits, key=lambda fit: fit.score)
+
+
+def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> Array:
+    """Starts (g, m) that shift the image by a grid of ``step_px``, turn it and scale it: the motions that a camera shows at first order.
+
+    Expressed as translations of the gripper across the axis, rotation about the optical axis, and translation along it.
+    """
+    middle = prediction.corners_cam_m.mean(axis=0)
+    pixels_per_m = float(np.median(np.sqrt(np.einsum("ni,ni->n", prediction.jacobian[:, :3], prediction.jacobian[:, :3]))))
+    span_px = float(np.abs(prediction.uv_px - prediction.uv_px.mean(axis=0)).max())
+    ticks = np.arange(-round(reach_px / step_px), round(reach_px / step_px) + 1) * step_px
+    turns = np.array([-1.0, 0.0, 1.0]) * 0.6 * reach_px / span_px
+    dx, dy, scale, turn = (a.ravel() for a in np.meshgrid(ticks, ticks, turns, turns, indexing="ij"))
+    starts = np.zeros((len(dx), prediction.jacobian.shape[1]))
+    starts[:, 0], starts[:, 1] = dx / pixels_per_m, dy / pixels_per_m
+    starts[:, 2] = scale * middle[2]
+    starts[:, 5] = turn
+    return starts
+
+
+def _step(
+    jacobian: Array, residual: Array, weights: Array, width: float, xi: Array, prior_information: Array
+) -> tuple[Array, Array, Array]:
+    """One weighted Gauss-Newton step: (m,) step, (m, m) information, (k,) weights."""
+    weight = residual * (1.0 / width)
+    np.square(weight, out=weight)
+    np.subtract(1.0, weight, out=weight)
+    np.maximum(weight, 0.0, out=weight)
+    np.square(weight, out=weight)
+    weight *= weights
+    weighted = jacobian * weight
+    information = weighted @ jacobian.T
+    normal = information.copy()
+    normal.flat[:: len(normal) + 1] += prior_information
+    step = np.linalg.solve(normal, weighted @ residual - prior_information * xi)
+    return step, information, weight
+
+
+def vague_prior(jaw_sigma_m: float) -> Array:
+    """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
+
+    With ``jaw_sigma_m`` > 0 the jaw opening is the seventh unknown and the reported one is worth that standard deviation.
+    """
+    pose = [1.0 / 0.1**2] * 3 + [1.0] * 3
+    return np.array([*pose, jaw_sigma_m**-2] if jaw_sigma_m > 0.0 else pose)
+
+
+def _scale(residual: Array, weights: Array, width: float, floor_px: float) -> float:
+    """Robust standard deviation (px) of the residuals inside the present width: 1.4826 times their median size."""
+    size = np.abs(residual[weights > 0.0])
+    size = size[size < width]
+    if len(size) < 12:
+        return _LARGEST_SCALE_PX
+    return float(min(max(1.4826 * np.partition(size, len(size) // 2)[len(size) // 2], floor_px), _LARGEST_SCALE_PX))
+
+
+def _judge(
+    candidates: Candidates,
+    prediction: Prediction,
+    weights: Array,
+    xi: Array,
+    weight: Array,
+    residual: Array,
+    information: Array,
+    scale_px: float,
+    settings: ConsensusSettings,
+) -> Consensus:
+    """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate anyway."""
+    edges = len(prediction.line_origin)
+    edge_of = prediction.layout.edge
+    close = (np.abs(residual) < GATE_PX) & (weights > 0.0)
+    supported = np.zeros(len(edge_of), dtype=bool)
+    supported[candidates.sample[close]] = True
+    profiles = np.bincount(edge_of[prediction.ok], minlength=edges)
+    agreeing = np.bincount(edge_of[supported], minlength=edges)
+    others = np.bincount(edge_of[candidates.sample[~close & (weights > 0.0)]], minlength=edges)
+    reach_px = _reach_px(prediction)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        density = others / (profiles * max(2.0 * (reach_px - GATE_PX), 1.0))
+        chance = 1.0 - np.exp(-2.0 * GATE_PX * density)
+        share = agreeing / profiles
+        needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
+    seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
+    return Consensus(
+        xi, weight, residual, information, scale_px, supported, share, seen, int(np.count_nonzero(prediction.ok))
+    )
+
+
+def _reach_px(prediction: Prediction) -> float:
+    if not len(prediction.uv_px):
+        return 1.0
+    return float(np.hypot(prediction.map_x[0, -1] - prediction.uv_px[0, 0], prediction.map_y[0, -1] - prediction.uv_px[0, 1]))

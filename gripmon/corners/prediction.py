@@ -1,0 +1,234 @@
+"""Steps 1 and 2 of the corner measurement: where the edges should be, and where to sample the image around them.
+
+All quantities are taken at one linearisation pose and stay as they are until the prediction has moved by more than a
+fraction of a pixel: in a standing scene they are computed once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.geometry import invert
+from gripmon.gripper import Gripper
+from gripmon.records import Array
+
+
+class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where the image is sampled around the predicted edges."""
+
+    samples: Annotated[int, Meta(ge=24, le=4096, description="profiles over all edges together")] = 320
+    reach_px: Annotated[float, Meta(ge=2.0, le=40.0, description="how far each profile reaches to both sides (px)")] = 7.0
+    end_margin_px: Annotated[
+        float, Meta(ge=0.0, le=40.0, description="part of an edge at each end that is left out: the neighbour edge shows there (px)")
+    ] = 4.0
+    creases: Annotated[bool, Meta(description="use edges between two visible faces too")] = True
+
+
+STEP_PX = 0.5
+"""Distance of samples along a profile, px."""
+
+CORNER_MARGIN_PX = 2.0
+"""A corner closer than this to the image's border counts as outside."""
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeLayout:
+    """Which part of which edge is sampled how densely; holds while the view changes by some pixels only.
+
+    ``edge`` (n,) ascending edge indices, ``fraction`` (n,) position between the edge's two ends, ``first`` (v,) index of each visible edge's
+    first sample and ``edges`` (v,) the visible edges themselves.
+    """
+
+    edge: NDArray[np.intp]
+    fraction: Array
+    edges: NDArray[np.intp]
+    first: NDArray[np.intp]
+    visible: NDArray[np.bool_]
+    crease: NDArray[np.bool_]
+    inside_point_m: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """The predicted edges at one pose; n samples, v visible edges, c corners.
+
+    ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking along the edge.
+    ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform and, where the jaw opening is an
+    unknown too, by the opening (px/m).
+    ``along`` (n,) and ``gain`` (n,): ideal coordinate along the edge's line, and ideal distance from the line for each px of offset along the
+    normal.  ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies in the image.
+    ``corner_at_start`` (c, e): the corner is the first end of the edge.
+    """
+
+    cam_T_grip: Array
+    jaw_opening_m: float
+    layout: EdgeLayout
+    uv_px: Array
+    normal: Array
+    jacobian: Array
+    along: Array
+    gain: Array
+    line_origin: Array
+    line_direction: Array
+    corners_cam_m: Array
+    corners_xy: Array
+    corners_uv_px: Array
+    corners_d_uv_d_xy: Array
+    corner_visible: NDArray[np.bool_]
+    corner_inside: NDArray[np.bool_]
+    corner_at_start: NDArray[np.bool_]
+    ok: NDArray[np.bool_]
+    map_x: NDArray[np.float32]
+    map_y: NDArray[np.float32]
+
+    def moved_px(self, xi: Array) -> float:
+        """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the linearisation pose."""
+        return float(np.abs(self.jacobian[:, : len(xi)] @ xi).max(initial=0.0))
+
+
+def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings) -> EdgeLayout:
+    """Choose the sampled part of each visible edge: inside the image, away from its ends, density by projected length."""
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
+    points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+    start, end = points_cam_m[gripper.edge_points[:, 0]], points_cam_m[gripper.edge_points[:, 1]]
+    wanted = view.visible & (settings.creases | ~view.crease)
+    coarse = np.linspace(0.0, 1.0, 65)
+    uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(-1, 65, 2)
+    inside = _inside(camera, uv, settings.reach_px)
+    step_px = np.linalg.norm(np.diff(uv, axis=1), axis=2)
+    ranges = [_sampled_range(coarse, inside[e], step_px[e], settings.end_margin_px) if wanted[e] else None for e in range(len(uv))]
+    lengths = np.array([r[2] if r else 0.0 for r in ranges])
+    counts = np.zeros(len(uv), dtype=int)
+    if lengths.sum() > 0.0:
+        # At most one profile a pixel: closer ones see the same pixels again.
+        counts = np.minimum(np.round(settings.samples * lengths / lengths.sum()), lengths).astype(int)
+    counts[counts < 4] = 0
+    edges = np.flatnonzero(counts)
+    fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges, counts, strict=True) if n and r]
+    first = np.concatenate([[0], np.cumsum(counts[edges])[:-1]]).astype(np.intp) if len(edges) else np.zeros(0, np.intp)
+    return EdgeLayout(
+        np.repeat(edges, counts[edges]),
+        np.concatenate(fraction) if fraction else np.zeros(0),
+        edges,
+        first,
+        view.visible,
+        view.crease,
+        view.inside_point_m,
+    )
+
+
+def _sampled_range(
+    coarse: Array, inside: NDArray[np.bool_], step_px: Array, margin_px: float
+) -> tuple[float, float, float] | None:
+    """First and last fraction and length in px of the longest run of an edge inside the image, less the margin; None if nothing is left."""
+    if not inside.any():
+        return None
+    change = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
+    starts, stops = change[::2], change[1::2] - 1
+    travelled = np.concatenate([[0.0], np.cumsum(np.nan_to_num(step_px))])
+    run = int(np.argmax(travelled[stops] - travelled[starts]))
+    low, high = travelled[starts[run]] + margin_px, travelled[stops[run]] - margin_px
+    if high - low < 8.0:
+        return None
+    fractions = np.interp([low, high], travelled, coarse)
+    return float(fractions[0]), float(fractions[1]), float(high - low)
+
+
+def _inside(camera: Camera, uv_px: Array, margin_px: float) -> NDArray[np.bool_]:
+    limit = np.array([camera.width_px - 1.0, camera.height_px - 1.0]) - margin_px
+    with np.errstate(invalid="ignore"):
+        return ((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1)
+
+
+def predict(
+    camera: Camera,
+    gripper: Gripper,
+    layout: EdgeLayout,
+    cam_T_grip: Array,
+    jaw_opening_m: float,
+    offsets_px: Array,
+    jaw_unknown: bool = False,
+) -> Prediction:
+    """Project the sample points of ``layout`` and set up the maps for ``offsets_px`` (s,) along the normals.
+
+    Points behind the camera or outside the lens model are marked in ``ok`` and never measured.
+    """
+    rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
+    levers = gripper.points_grip_m(jaw_opening_m) @ rotation.T
+    ends = levers[gripper.edge_points]
+    spans = ends[:, 1] - ends[:, 0]
+    edge = layout.edge
+    lever = ends[edge, 0] + layout.fraction[:, None] * spans[edge]
+    points_cam_m = lever + translation
+    uv, d_uv = camera.project_with_jacobian(points_cam_m)
+    tangent = np.einsum("nij,nj->ni", d_uv, spans[edge])
+    tangent /= np.sqrt(np.einsum("ni,ni->n", tangent, tangent))[:, None]
+    normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
+    gradient = np.einsum("ni,nij->nj", normal, d_uv)
+    jacobian = np.empty((len(edge), 7 if jaw_unknown else 6))
+    jacobian[:, :3] = gradient
+    jacobian[:, 3:6] = np.cross(lever, gradient)
+    if jaw_unknown:
+        motion = gripper.point_motion(jaw_opening_m)[gripper.edge_points[edge, 0]] @ rotation.T
+        jacobian[:, 6] = np.einsum("ni,ni->n", gradient, motion)
+    ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
+    along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
+    corners_cam_m = levers[gripper.corner_points] + translation
+    corners_uv, corners_d_uv = camera.project_with_jacobian(corners_cam_m)
+    corner_visible = gripper.corners_visible(gripper.points_grip_m(jaw_opening_m), -rotation.T @ translation)
+    corner_inside = _inside(camera, corners_uv, CORNER_MARGIN_PX)
+    offsets = offsets_px.astype(np.float32)
+    uv32, normal32 = uv.astype(np.float32), normal.astype(np.float32)
+    return Prediction(
+        cam_T_grip=cam_T_grip,
+        jaw_opening_m=jaw_opening_m,
+        layout=layout,
+        uv_px=uv,
+        normal=normal,
+        jacobian=jacobian,
+        along=along,
+        gain=gain,
+        line_origin=origin,
+        line_direction=direction,
+        corners_cam_m=corners_cam_m,
+        corners_xy=corners_cam_m[:, :2] / corners_cam_m[:, 2:],
+        corners_uv_px=corners_uv,
+        corners_d_uv_d_xy=corners_d_uv[:, :, :2] * corners_cam_m[:, 2][:, None, None],
+        corner_visible=corner_visible & corner_inside,
+        corner_inside=corner_inside,
+        corner_at_start=gripper.corner_points[:, None] == gripper.edge_points[None, :, 0],
+        ok=ok,
+        map_x=uv32[:, 0:1] + normal32[:, 0:1] * offsets,
+        map_y=uv32[:, 1:2] + normal32[:, 1:2] * offsets,
+    )
+
+
+def _ideal_lines(
+    points_cam_m: Array, normal: Array, d_uv: Array, layout: EdgeLayout, edge_count: int
+) -> tuple[Array, Array, Array, Array]:
+    """The edges as straight lines in ideal coordinates, and how an offset in px along the image normal moves a point off its line.
+
+    ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal coordinates.  Lines of
+    edges that are not sampled are NaN.
+    """
+    xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
+    last = np.append(layout.first[1:], len(xy)) - 1
+    origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)
+    origin[layout.edges] = 0.5 * (xy[layout.first] + xy[last])
+    span = xy[last] - xy[layout.first]
+    direction[layout.edges] = span / np.sqrt(np.einsum("ei,ei->e", span, span))[:, None]
+    edge = layout.edge
+    along = np.einsum("ni,ni->n", xy - origin[edge], direction[edge])
+    lens = d_uv[:, :, :2] * points_cam_m[:, 2][:, None, None]
+    determinant = lens[:, 0, 0] * lens[:, 1, 1] - lens[:, 0, 1] * lens[:, 1, 0]
+    step_x = (lens[:, 1, 1] * normal[:, 0] - lens[:, 0, 1] * normal[:, 1]) / determinant
+    step_y = (lens[:, 0, 0] * normal[:, 1] - lens[:, 1, 0] * normal[:, 0]) / determinant
+    return along, step_y * direction[edge, 0] - step_x * direction[edge, 1], origin, direction

@@ -1,0 +1,153 @@
+"""Step 3 of the corner measurement: sub-pixel edge candidates on the sampled profiles.
+
+The derivative of a Gaussian is applied to all profiles as one matrix product; every local extremum that stands out of the noise is a
+candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon.corners.prediction import STEP_PX
+from gripmon.records import Array, Image
+
+GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
+"""Luma weights of ITU-R BT.601 in OpenCV's channel order."""
+
+
+class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What counts as an edge candidate."""
+
+    blur_px: Annotated[float, Meta(ge=0.4, le=5.0, description="sigma of the derivative of Gaussian (px)")] = 0.8
+    noise_factor: Annotated[
+        float, Meta(ge=2.0, le=50.0, description="smallest edge response in standard deviations of its noise")
+    ] = 5.0
+    contrast_fraction: Annotated[
+        float, Meta(ge=0.0, le=0.5, description="smallest step in grey levels as a fraction of the image's full scale")
+    ] = 0.008
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal, ``step`` (k,) signed
+    height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px`` (k,) standard deviation from image
+    noise.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of the image's type.
+    """
+
+    sample: NDArray[np.intp]
+    offset_px: Array
+    step: Array
+    sigma_px: Array
+    noise: float
+    full_scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Kernel:
+    """Derivative of Gaussian as a matrix (s, r): r responses inside the profile, in grey levels of a step."""
+
+    matrix: NDArray[np.float32]
+    first_offset_px: float
+    response_noise: float
+    curvature_noise_px: float
+
+
+def profile_offsets_px(reach_px: float) -> Array:
+    """Sample positions (s,) of a profile along its normal, px, symmetric about the predicted edge."""
+    half = round(reach_px / STEP_PX)
+    return np.arange(-half, half + 1) * STEP_PX
+
+
+def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Interpolate the image at the maps (n, s): float32 grey levels; colour is reduced to grey here, so that cost grows with edges."""
+    values = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    if values.ndim == 3:
+        return values.astype(np.float32) @ GREY_BGR
+    return values.astype(np.float32)
+
+
+def full_scale(image: Image) -> float:
+    """Largest grey level of an image's type; 1 for float images."""
+    return float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else 1.0
+
+
+@lru_cache(maxsize=64)
+def _kernel(samples: int, blur_px: float) -> _Kernel:
+    half = math.ceil(3.0 * blur_px / STEP_PX)
+    if 2 * half + 5 > samples:
+        raise ValueError(f"a blur of {blur_px} px needs profiles of at least {(half + 2) * STEP_PX} px to both sides")
+    x = np.arange(-half, half + 1) * STEP_PX
+    taps = x * np.exp(-0.5 * (x / blur_px) ** 2)
+    # A unit step gives a response of one: the answer reads as the height of the step in grey levels.
+    taps /= taps[x > 0].sum() + 0.5 * taps[half]
+    responses = samples - 2 * half
+    matrix = np.zeros((samples, responses), dtype=np.float32)
+    for k in range(responses):
+        matrix[k : k + len(taps), k] = taps
+    # Pixels, not half-pixel samples, carry independent noise: bilinear interpolation spreads each over a triangle of one pixel.
+    triangle = np.array([0.5, 1.0, 0.5])
+    effective = np.convolve(taps, triangle)[::2]
+    slope = np.gradient(np.convolve(taps, triangle), STEP_PX)[::2]
+    response_noise = float(np.sqrt((effective**2).sum()))
+    # A step blurred by the lens (about 0.6 px) answers with a Gaussian of this width; its peak moves by noise' / curvature.
+    width_squared = blur_px**2 + 0.6**2
+    return _Kernel(matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared)
+
+
+def response_matrix(samples: int, blur_px: float) -> NDArray[np.float32]:
+    """Matrix (s, r) whose product with profiles (n, s) is the edge response (n, r), in grey levels of a step."""
+    return _kernel(samples, blur_px).matrix
+
+
+def find_candidates(
+    profiles: NDArray[np.float32], ok: NDArray[np.bool_], noise: float, grey_range: float, settings: EdgeSettings
+) -> Candidates:
+    """Local extrema of the edge response of profiles (n, s), refined by a parabola through three responses.
+
+    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`).  Nothing found is an empty result.
+    """
+    kernel = _kernel(profiles.shape[1], settings.blur_px)
+    response = profiles @ kernel.matrix
+    height = np.abs(response)
+    threshold = max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
+    middle = height[:, 1:-1]
+    peak = middle > height[:, :-2]
+    peak &= middle >= height[:, 2:]
+    peak &= middle > threshold
+    peak &= ok[:, None]
+    flat = np.flatnonzero(peak)
+    sample, column = np.divmod(flat, middle.shape[1])
+    at = flat + 2 * sample + 1
+    values = height.ravel()
+    left, centre, right = values[at - 1], values[at], values[at + 1]
+    shift = 0.5 * (left - right) / (left - 2.0 * centre + right)
+    offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
+    step = response.ravel()[at].astype(np.float64)
+    sigma_px = (noise * kernel.curvature_noise_px) / centre
+    return Candidates(sample, offset_px.astype(np.float64), step, sigma_px.astype(np.float64), noise, grey_range)
+
+
+def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:
+    """Standard deviation of the image noise, grey levels, from the quiet parts of the profiles (n, s).
+
+    Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that the lower
+    quartile is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29 of it.
+    """
+    whole = profiles[::2, ::2]
+    third = np.abs(whole[:, 3:] - whole[:, :-3] - 3.0 * (whole[:, 2:-1] - whole[:, 1:-2])).ravel()
+    floor = quantum / math.sqrt(12.0)
+    if not third.size:
+        return floor
+    quartile = float(np.partition(third, third.size // 4)[third.size // 4])
+    # Of a normal distribution a quarter lies within 0.3186 sigma; a third difference of white noise has variance 20, of which
+    # bilinear interpolation at a random phase leaves two thirds across each axis.
+    return max(quartile / (0.3186 * math.sqrt(20.0 * 4.0 / 9.0)), floor)

@@ -1,0 +1,90 @@
+"""The differential update: equation (17) of the self-viewing method, weighted and re-linearised on the manifold.
+
+With a corner predicted at ``(x, y, z)`` in the camera frame and measured at ``(X, Y)`` (undistorted), ``X z' = f x'`` and ``Y z' = f y'`` are linear
+in the motion ``(delta, d)`` of equations (11)-(13).  Here f = 1: image points are normalised.  The paper stops at the
+matrix ``I + Delta``, which is a rotation to first order only; the motion is applied as a rotation here and the equations set up again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gripmon.geometry import exp_rotation, log_rotation
+from gripmon.records import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """``xi`` (6,) = (rho, omega) of the transform; ``covariance`` (6, 6) of its error from the corners' covariances."""
+
+    xi: Array
+    covariance: Array
+
+
+class DegenerateGeometry(ValueError):
+    """The corners don't determine all six parameters."""
+
+
+def equation_17(points_cam_m: Array, measured_xy: Array) -> tuple[Array, Array]:
+    """Rows (n, 2, 6) and right sides (n, 2) for unknowns ``delta_x delta_y delta_z d_x d_y d_z`` (f = 1).
+
+    ``points_cam_m`` (n, 3): predicted corners in the camera frame; ``measured_xy`` (n, 2): measured ideal coordinates.
+    """
+    x, y, z = points_cam_m.T
+    image_x, image_y = measured_xy.T
+    rows = np.zeros((len(points_cam_m), 2, 6))
+    rows[:, 0, 0], rows[:, 0, 1], rows[:, 0, 2] = image_x * y, -(image_x * x + z), y
+    rows[:, 0, 3], rows[:, 0, 5] = -1.0, image_x
+    rows[:, 1, 0], rows[:, 1, 1], rows[:, 1, 2] = image_y * y + z, -image_y * x, -x
+    rows[:, 1, 4], rows[:, 1, 5] = -1.0, image_y
+    return rows, np.column_stack([x - image_x * z, y - image_y * z])
+
+
+def differential_update(
+    points_cam_m: Array, measured_xy: Array, covariance_xy: Array, tcp_cam_m: Array, iterations: int = 2
+) -> Update:
+    """Motion of the gripper in the camera frame from n >= 3 corners that are not collinear.
+
+    ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2) and ``covariance_xy`` (n, 2, 2): where they were
+    measured, ideal coordinates; ``tcp_cam_m`` (3,): the transform's translation.  Raises :class:`DegenerateGeometry` for fewer
+    than three corners or a singular system.
+    """
+    if len(points_cam_m) < 3:
+        raise DegenerateGeometry(f"{len(points_cam_m)} corners; the update needs at least 3")
+    rotation, tcp = np.eye(3), tcp_cam_m.copy()
+    weight_xy = np.linalg.inv(covariance_xy)
+    for _ in range(iterations):
+        points = (points_cam_m - tcp_cam_m) @ rotation.T + tcp
+        rows, sides = equation_17(points, measured_xy)
+        # A row is the image error times the depth, so its covariance is depth squared times the image's.
+        weight = weight_xy / (points[:, 2] ** 2)[:, None, None]
+        weighted = np.einsum("nki,nkl->nli", rows, weight)
+        normal = np.einsum("nli,nlj->ij", weighted, rows)
+        try:
+            motion = np.linalg.solve(normal, np.einsum("nli,nl->i", weighted, sides))
+        except np.linalg.LinAlgError:
+            raise DegenerateGeometry("the corners lie on a line") from None
+        turn = exp_rotation(motion[:3])
+        # (11): the motion turns about the camera's origin; the TCP goes along.
+        tcp = turn @ tcp + motion[3:]
+        rotation = turn @ rotation
+    covariance = _about_tcp(normal, tcp)
+    omega = log_rotation(rotation)
+    return Update(np.concatenate([tcp - tcp_cam_m, omega]), covariance)
+
+
+def _about_tcp(normal: Array, tcp_cam_m: Array) -> Array:
+    """Covariance of (rho, omega) at the TCP from the normal matrix of (delta, d) at the camera: rho = d + delta x tcp."""
+    try:
+        covariance = np.linalg.inv(normal)
+    except np.linalg.LinAlgError:
+        raise DegenerateGeometry("the corners lie on a line") from None
+    x, y, z = tcp_cam_m.tolist()
+    transfer = np.zeros((6, 6))
+    transfer[:3, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
+    transfer[:3, 3:] = np.eye(3)
+    transfer[3:, :3] = np.eye(3)
+    return transfer @ covariance @ transfer.T
+
