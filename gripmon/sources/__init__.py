@@ -1,0 +1,53 @@
+"""Where frames come from: a folder of images, a video file, a live camera.
+
+All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gripmon.sources.base import READ_TIMEOUT_S, Source, SourceError, Waiting
+from gripmon.sources.folder import FolderSettings, FolderSource
+from gripmon.sources.live import LiveCamera, LiveSettings
+from gripmon.sources.newest import NewestFrame
+from gripmon.sources.video import VideoSettings, VideoSource
+
+SourceSettings = FolderSettings | VideoSettings | LiveSettings
+
+__all__ = [
+    "READ_TIMEOUT_S",
+    "FolderSettings",
+    "FolderSource",
+    "LiveCamera",
+    "LiveSettings",
+    "NewestFrame",
+    "Source",
+    "SourceError",
+    "SourceSettings",
+    "VideoSettings",
+    "VideoSource",
+    "Waiting",
+    "open_source",
+    "settings_for_path",
+]
+
+
+def open_source(settings: SourceSettings, relative_to: Path = Path()) -> Source:
+    """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
+
+    Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
+    video, and a device of no known form.  A camera that is only absent at present is no error: the source waits for it.
+    """
+    match settings:
+        case FolderSettings():
+            return FolderSource(settings, relative_to)
+        case VideoSettings():
+            return VideoSource(settings, relative_to)
+        case LiveSettings():
+            return LiveCamera(settings)
+
+
+def settings_for_path(path: Path) -> FolderSettings | VideoSettings:
+    """Settings for a recorded input that a person named on the command line: a folder of images, else a video file."""
+    return FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))

@@ -1,0 +1,49 @@
+"""What every source of frames has in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from gripmon.records import Frame
+
+
+class SourceError(ValueError):
+    """A source that can't start: "key: what is wrong; what would be right", the key as in the source's settings."""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """No frame arrived within the time that ``read`` may take; ``reason`` says why, as far as is known."""
+
+    reason: str
+
+
+class Source(Protocol):
+    """Frames, one at a time.
+
+    ``read`` has one caller and three kinds of answers:
+
+    * a :class:`Frame`; one that could not be made has image None and says why in ``fault``;
+    * :class:`Waiting`: nothing arrived, ask again.  Only live sources say so, after at most ``READ_TIMEOUT_S``, so the
+      caller can stop, and can report that the camera is missing;
+    * None: finished, and so is every later answer.
+
+    A source with ``live`` true is a camera in real time: ``read`` gives the newest frame, older ones that nobody asked
+    for in time are counted in ``dropped`` (their ``seq`` is missing).  Otherwise ``read`` gives every frame in order,
+    at once, ``dropped`` stays 0 and ``connected`` true.  ``connected`` says whether the camera delivers at present.
+
+    ``close`` may be called from any thread and more than once; a ``read`` under way then returns None.
+    """
+
+    @property
+    def live(self) -> bool: ...
+    @property
+    def connected(self) -> bool: ...
+    @property
+    def dropped(self) -> int: ...
+    def read(self) -> Frame | Waiting | None: ...
+    def close(self) -> None: ...
+
+
+READ_TIMEOUT_S = 0.5
