@@ -34,7 +34,7 @@ class NewestFrame:
 
     live = True
 
-    def __init__(self, reader: FrameReader, *, name: str = "frames", close_within_s: float = 1.0) -> None:
+    def __init__(self, reader: FrameReader, *, name: str = "frames", close_within_s: float = 0.5) -> None:
         self._reader = reader
         self._close_within_s = close_within_s
         self._changed = threading.Condition()
