@@ -1,0 +1,235 @@
+"""The live camera against a real MJPEG server on loopback, which comes, hangs, goes and comes again."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gripmon.records import Frame
+from gripmon.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
+from gripmon.sources.live import Backoff, shown_name
+
+PERIOD_S = 0.02
+
+
+class MjpegServer:
+    """Serves grey frames whose brightness is their number; can fall silent with the connection open."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.stopping, self.silent = threading.Event(), threading.Event()
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
+                self.end_headers()
+                try:
+                    outer.stream(self.wfile.write)
+                except OSError:
+                    return  # the client went away
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        self._server.daemon_threads = True
+        self.port = int(self._server.server_address[1])
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(0.02,))
+        self._thread.start()
+
+    def stream(self, send: Callable[[bytes], object]) -> None:
+        count = 0
+        while not self.stopping.wait(PERIOD_S):
+            if self.silent.is_set():
+                continue
+            jpeg = cv2.imencode(".jpg", np.full((96, 128, 3), count % 250, np.uint8))[1].tobytes()
+            head = b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg)
+            send(head + jpeg + b"\r\n")
+            count += 1
+
+    def stop(self) -> None:
+        self.stopping.set()
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+@pytest.fixture
+def servers() -> Iterator[list[MjpegServer]]:
+    running: list[MjpegServer] = []
+    yield running
+    for server in running:
+        server.stop()
+
+
+def camera_at(port: int, **settings) -> LiveCamera:
+    source = open_source(
+        LiveSettings(
+            device=f"http://127.0.0.1:{port}/video",
+            retry_first_s=0.05,
+            retry_longest_s=0.2,
+            open_timeout_s=1.0,
+            **settings,
+        )
+    )
+    assert isinstance(source, LiveCamera)
+    return source
+
+
+def next_frame(camera: LiveCamera, within_s: float = 20.0) -> Frame:
+    end_s = time.monotonic() + within_s
+    while time.monotonic() < end_s:
+        if isinstance(item := camera.read(), Frame):
+            return item
+    raise AssertionError(f"no frame within {within_s} s")
+
+
+def next_waiting(camera: LiveCamera, what: str, within_s: float = 20.0) -> Waiting:
+    end_s = time.monotonic() + within_s
+    while time.monotonic() < end_s:
+        if isinstance(item := camera.read(), Waiting) and what in item.reason:
+            return item
+    raise AssertionError(f"never waiting because of '{what}' within {within_s} s")
+
+
+def test_frames_arrive_with_unix_stamps_and_the_newest_wins(servers: list[MjpegServer]):
+    servers.append(MjpegServer())
+    before_ns = time.time_ns()
+    camera = camera_at(servers[0].port)
+    try:
+        first = next_frame(camera)
+        assert camera.live and camera.connected
+        assert first.image is not None and first.image.shape == (96, 128, 3)
+        assert before_ns < first.stamp_ns < time.time_ns()
+        time.sleep(20 * PERIOD_S)
+        later = next_frame(camera)
+        assert later.seq - first.seq - 1 == camera.dropped > 3
+        assert later.stamp_ns > first.stamp_ns
+        assert later.image is not None
+        # the server counts in brightness what it sent: nothing is lost but what was counted as dropped
+        assert float(later.image.mean() - first.image.mean()) == pytest.approx(later.seq - first.seq, abs=2.0)
+    finally:
+        camera.close()
+    assert camera.read() is None and not camera.connected
+
+
+def test_the_camera_comes_back_after_its_server_was_gone(servers: list[MjpegServer]):
+    servers.append(MjpegServer())
+    port = servers[0].port
+    camera = camera_at(port)
+    try:
+        last = next_frame(camera)
+        servers.pop().stop()
+        waiting = next_waiting(camera, "next attempt")
+        assert str(port) in waiting.reason
+        assert not camera.connected
+        servers.append(MjpegServer(port))
+        back = next_frame(camera)
+        assert camera.connected and back.seq > last.seq and back.stamp_ns > last.stamp_ns
+    finally:
+        camera.close()
+
+
+def test_a_stream_that_falls_silent_is_opened_again(servers: list[MjpegServer]):
+    servers.append(MjpegServer())
+    camera = camera_at(servers[0].port, read_timeout_s=0.3)
+    try:
+        next_frame(camera)
+        servers[0].silent.set()
+        next_waiting(camera, "next attempt")
+        servers[0].silent.clear()
+        next_frame(camera)
+    finally:
+        camera.close()
+
+
+def test_without_a_camera_it_keeps_trying_and_says_so():
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))  # bound, but it doesn't listen: connections are refused
+        camera = camera_at(unused.getsockname()[1])
+        try:
+            assert "can't be opened; next attempt after 0.2 s" in next_waiting(camera, "0.2 s").reason
+            assert not camera.connected and camera.dropped == 0
+        finally:
+            camera.close()
+
+
+def test_a_missing_v4l2_device_is_no_error_at_the_start():
+    camera = open_source(LiveSettings(device="/dev/video_that_is_not_there", retry_first_s=0.05))
+    try:
+        assert isinstance(camera, LiveCamera)
+        next_waiting(camera, "can't be opened")
+    finally:
+        camera.close()
+
+
+def test_a_process_ends_at_once_while_the_camera_hangs_in_the_driver():
+    """A server that accepts and never answers: open() blocks for longer than the process may take to stop."""
+    code = (
+        "import sys, time\n"
+        "from gripmon.sources import LiveSettings, Waiting, open_source\n"
+        "camera = open_source(LiveSettings(device=sys.argv[1], open_timeout_s=60.0, read_timeout_s=60.0))\n"
+        "assert isinstance(camera.read(), Waiting)\n"
+        "time.sleep(0.3)\n"
+        "camera.close()\n"
+        "assert camera.read() is None\n"
+        "print('closed', flush=True)\n"
+    )
+    with socket.socket() as mute:
+        mute.bind(("127.0.0.1", 0))
+        mute.listen()
+        url = f"http://127.0.0.1:{mute.getsockname()[1]}/video"
+        done = subprocess.run(
+            [sys.executable, "-c", code, url],
+            capture_output=True,
+            text=True,
+            timeout=30.0,  # far below the driver's 60 s
+            cwd=Path(__file__).parent.parent,
+        )
+    assert (done.returncode, done.stdout) == (0, "closed\n"), done.stderr
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        (LiveSettings(device="video.mp4"), "has no known form"),
+        (LiveSettings(device=-1), "no index"),
+        (LiveSettings(device="0"), "without quotes"),
+        (LiveSettings(device=""), "has no known form"),
+    ],
+)
+def test_devices_of_no_known_form_are_refused(settings: LiveSettings, complaint: str):
+    with pytest.raises(SourceError, match=rf"^device: .*{complaint}"):
+        open_source(settings)
+
+
+@pytest.mark.skipif(cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), reason="this OpenCV has GStreamer")
+def test_a_pipeline_without_gstreamer_is_refused_with_the_reason():
+    with pytest.raises(SourceError, match=r"^device: needs the gstreamer backend.*; a build of OpenCV with it"):
+        open_source(LiveSettings(device="videotestsrc ! appsink"))
+
+
+def test_pauses_double_up_to_the_longest_and_start_again_after_success():
+    backoff = Backoff(0.5, 10.0)
+    assert [backoff.next_s() for _ in range(7)] == [0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0]
+    backoff.reset()
+    assert backoff.next_s() == 0.5
+    assert Backoff(5.0, 2.0).next_s() == 2.0
+
+
+def test_a_password_is_not_shown():
+    assert shown_name("rtsp://user:secret@10.0.0.3:554/s?x=1@2") == "rtsp://10.0.0.3:554/s?x=1@2"
+    assert shown_name("rtspsrc location=rtsp://u:p@host/a ! decodebin ! appsink").count("u:p") == 0
+    assert shown_name(0) == "camera 0"
+    assert shown_name("/dev/video0") == "/dev/video0"
