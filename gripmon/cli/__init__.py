@@ -7,14 +7,15 @@ import os
 import sys
 
 from gripmon import __version__
-from gripmon.cli import check, demo, replay, run, simulate
+from gripmon.cli import check, replay, run
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 
-_COMMANDS = (demo, run, replay, simulate, check)
+_COMMANDS = (check, replay, run)
 
 _DESCRIPTION = """\
-gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the fingertips' corners, corrects
-the hand/eye calibration cam_T_grip, says whether it can still be trusted, and publishes it over Zenoh."""
+gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the
+fingertips' corners, corrects the hand/eye calibration cam_T_grip, says whether it can still be
+trusted, and publishes it over Zenoh."""
 
 _EPILOG = """\
 first steps:
@@ -22,8 +23,8 @@ first steps:
   gripmon check configs/live_camera.yaml         is my configuration sound?
   gripmon run configs/live_camera.yaml           the daemon
 
-exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what would be right);
-3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
+exit codes: 0 done; 2 wrong usage or configuration (one line says file, key, what is wrong, what
+would be right); 3 the monitored thing failed (for example: no usable frame); 130 interrupted"""
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -39,13 +40,13 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command line (default: the process's own) and return the exit code.  Usage errors raise ``SystemExit(2)``."""
+    """Run a command line (default: the process's own) and return its exit code; wrong usage raises ``SystemExit(2)``."""
     parser = build_parser()
     chosen = parser.parse_args(arguments)
     if not hasattr(chosen, "handler"):
         parser.print_help()
         return 0
-    # One thread: the matrices are tiny, and the same input then gives the same bytes on any machine.  Before NumPy is imported.
+    # One thread: the matrices are tiny, and the same input then gives the same bytes.  Has to come before NumPy.
     for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     try:

@@ -29,7 +29,12 @@ class CommandFailedError(Exception):
 
 
 def add_command(
-    commands: Any, name: str, handler: Callable[[argparse.Namespace], int], summary: str, description: str, examples: str
+    commands: Any,
+    name: str,
+    handler: Callable[[argparse.Namespace], int],
+    summary: str,
+    description: str,
+    examples: str,
 ) -> argparse.ArgumentParser:
     """A subcommand's parser with its help texts."""
     parser: argparse.ArgumentParser = commands.add_parser(
@@ -69,7 +74,9 @@ def make_directory(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise CommandFailedError(f"--out {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE) from None
+        raise CommandFailedError(
+            f"--out {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE
+        ) from None
     return path
 
 

@@ -1,14 +1,14 @@
 """Parsed YAML -> typed settings, with errors that a person can act on.
 
-``msgspec`` does the conversion.  Where it refuses, its text names neither the entry of a mapping nor what would be right, so the first fault
-is searched for again here along the type, with the description and the bounds that stand in the settings.
+``msgspec`` does the conversion.  As its errors name neither the entry of a mapping nor what would be right, the first
+fault is searched for here, along the type, with the description and the bounds that stand in the settings.
 """
 
 from __future__ import annotations
 
 import difflib
 import math
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import inspect as mi
@@ -35,8 +35,8 @@ class SettingsError(ValueError):
 def to_settings(value: Any, settings_type: type[_T], key: str = "") -> _T:
     """Convert parsed YAML to a settings type (a ``msgspec.Struct`` or a tagged union of them).
 
-    Raises :class:`SettingsError` with the full dotted key (below ``key``) for an unknown, missing or wrong entry, and for numbers
-    that are not finite.
+    Raises :class:`SettingsError` with the full dotted key (below ``key``) for an unknown, missing or wrong entry, and
+    for numbers that are not finite.
     """
     node = mi.type_info(settings_type)
     fault = _find_fault(value, node, key)
@@ -71,12 +71,19 @@ def _union_fault(value: Any, node: mi.UnionType, key: str, description: str) -> 
         return None
     structs = [t for t in options if isinstance(t, mi.StructType)]
     if structs and (isinstance(value, dict) or len(structs) == len(options)):
-        return _tagged_fault(value, structs, key) if len(structs) > 1 else _struct_fault(value, structs[0], key, description)
+        return (
+            _tagged_fault(value, structs, key)
+            if len(structs) > 1
+            else _struct_fault(value, structs[0], key, description)
+        )
     faults = [_find_fault(value, t, key, description) for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]
     if any(fault is None for fault in faults):
         return None
-    same_shape = [f for f in faults if f is not None and f.key != key]
-    return (same_shape or [f for f in faults if f is not None])[0]
+    deeper = [f for f in faults if f is not None and f.key != key]
+    if deeper:
+        return deeper[0]
+    described = [f for f in faults if f is not None]
+    return described[0] if len(described) == 1 else Fault(key, f"is {_show(value)}", _expected(node, description))
 
 
 def _tagged_fault(value: Any, structs: list[mi.StructType], key: str) -> Fault | None:
@@ -88,7 +95,11 @@ def _tagged_fault(value: Any, structs: list[mi.StructType], key: str) -> Fault |
         return Fault(_join(key, tag_field), "is missing", _one_of(tags))
     chosen = [s for s in structs if s.tag == value[tag_field]]
     if not chosen:
-        return Fault(_join(key, tag_field), f"is {_show(value[tag_field])}{_did_you_mean(str(value[tag_field]), tags)}", _one_of(tags))
+        return Fault(
+            _join(key, tag_field),
+            f"is {_show(value[tag_field])}{_did_you_mean(str(value[tag_field]), tags)}",
+            _one_of(tags),
+        )
     return _struct_fault(value, chosen[0], key, "")
 
 
@@ -120,7 +131,9 @@ def _dict_fault(value: Any, node: mi.DictType, key: str, description: str) -> Fa
     return next((fault for fault in faults if fault is not None), None)
 
 
-def _sequence_fault(value: Any, node: mi.TupleType | mi.VarTupleType | mi.ListType, key: str, description: str) -> Fault | None:
+def _sequence_fault(
+    value: Any, node: mi.TupleType | mi.VarTupleType | mi.ListType, key: str, description: str
+) -> Fault | None:
     if not isinstance(value, list):
         return Fault(key, f"is {_show(value)}", _expected(node, description))
     if isinstance(node, mi.TupleType):
@@ -131,7 +144,9 @@ def _sequence_fault(value: Any, node: mi.TupleType | mi.VarTupleType | mi.ListTy
         if len(value) < (node.min_length or 0) or (node.max_length is not None and len(value) > node.max_length):
             return Fault(key, f"has {len(value)} values", _expected(node, description))
         types = (node.item_type,) * len(value)
-    faults = (_find_fault(item, t, f"{key}[{i}]", description) for i, (item, t) in enumerate(zip(value, types, strict=True)))
+    faults = (
+        _find_fault(item, t, f"{key}[{i}]", description) for i, (item, t) in enumerate(zip(value, types, strict=True))
+    )
     return next((fault for fault in faults if fault is not None), None)
 
 
@@ -142,10 +157,18 @@ def _leaf_fault(value: Any, node: mi.Type, key: str, description: str) -> Fault 
         return Fault(key, f"is {value}", _expected(node, description))
     if isinstance(node, mi.EnumType):
         options = [str(member.value) for member in node.cls]
-        return None if value in options else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+        return (
+            None
+            if value in options
+            else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+        )
     if isinstance(node, mi.LiteralType):
         options = [str(v) for v in node.values]
-        return None if value in node.values else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+        return (
+            None
+            if value in node.values
+            else Fault(key, f"is {_show(value)}{_did_you_mean(str(value), options)}", _one_of(options))
+        )
     if _fits_leaf(value, node):
         return None
     return Fault(key, f"is {_show(value)}", _expected(node, description))
@@ -169,8 +192,6 @@ def _fits_leaf(value: Any, node: mi.Type) -> bool:
 
 
 def _constrained_text(node: mi.StrType) -> Any:
-    from typing import Annotated
-
     return Annotated[str, msgspec.Meta(min_length=node.min_length, max_length=node.max_length, pattern=node.pattern)]
 
 

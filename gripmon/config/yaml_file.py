@@ -22,9 +22,15 @@ for _tag, _pattern, _first in (
     ("bool", r"true|True|TRUE|false|False|FALSE", "tTfF"),
     ("null", r"~|null|Null|NULL|", "~nN"),
     ("int", r"[-+]?[0-9]+", "-+0123456789"),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)", "-+.0123456789"),
+    (
+        "float",
+        r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+        "-+.0123456789",
+    ),
 ):
-    _Loader.add_implicit_resolver(_TAG + _tag, re.compile(rf"^(?:{_pattern})$"), [*_first, ""] if _tag == "null" else list(_first))
+    _Loader.add_implicit_resolver(
+        _TAG + _tag, re.compile(rf"^(?:{_pattern})$"), [*_first, ""] if _tag == "null" else list(_first)
+    )
 
 
 def _integer(_loader: _Loader, node: yaml.ScalarNode) -> int:
@@ -37,9 +43,13 @@ def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
         key = loader.construct_object(key_node, deep=True)
         line = key_node.start_mark.line + 1
         if not isinstance(key, str):
-            raise _DuplicateOrStrangeKeyError(line, f"the key {key!r} is not text", "a name; quotes around it if it looks like a number")
+            raise _DuplicateOrStrangeKeyError(
+                line, f"the key {key!r} is not text", "a name; quotes around it if it looks like a number"
+            )
         if key in seen:
-            raise _DuplicateOrStrangeKeyError(line, f"the key '{key}' is there twice, first in line {seen[key]}", "each key once")
+            raise _DuplicateOrStrangeKeyError(
+                line, f"the key '{key}' is there twice, first in line {seen[key]}", "each key once"
+            )
         seen[key] = line
     return dict(loader.construct_pairs(node, deep=True))
 
@@ -55,7 +65,7 @@ class _DuplicateOrStrangeKeyError(Exception):
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping in a YAML file.  :class:`ConfigError` if it can't be read, isn't YAML, has a key twice or is no mapping."""
+    """The mapping in a YAML file.  :class:`ConfigError` if unreadable, not YAML, no mapping, or with a key twice."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:

@@ -1,0 +1,223 @@
+"""``gripmon check``: is this configuration sound, and what does it expect to see?"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.sources import LiveSettings
+
+_DESCRIPTION = """\
+Validate a configuration, its gripper file and its source, and print what the calibration expects
+to see: where the fingertip corners are in the image (px), which of them and which edges are
+visible, and how far away the gripper is (mm)."""
+
+_EXAMPLES = """\
+  gripmon check configs/live_camera.yaml
+  gripmon check configs/folder.yaml --json | python3 -m json.tool
+
+exit codes: 0 sound; 2 a fault in the configuration (one line says file, key, what is wrong, what
+would be right); 3 the configuration is sound, but its camera can't be reached now"""
+
+_PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
+_CONNECT_S = 2.0
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands, "check", run, "validate a configuration and show what it expects to see", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument("config", metavar="CONFIG", help="configuration file (YAML)")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of text; metres, radians, px")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon check``."""
+    config = common.load(arguments.config)
+    report = {**expectation(config), "source": _source_report(config)}
+    print(json.dumps(report, indent=2) if arguments.json else _as_text(report))
+    return common.EXIT_FAILED if report["source"]["reachable"] is False else common.EXIT_DONE
+
+
+def expectation(config: Config) -> dict[str, Any]:
+    """What the calibration expects to see, as plain values for JSON: metres, radians, px."""
+    import numpy as np
+
+    from gripmon.geometry import rotation_angle
+
+    settings, camera, gripper = config.settings, config.camera, config.gripper
+    view = config.view()
+    cam_T_grip = config.cam_T_grip
+    corners = [
+        {
+            "id": name,
+            "uv_px": uv.round(2).tolist() if np.isfinite(uv).all() else None,
+            "distance_m": round(float(np.linalg.norm(point)), 6),
+            "visible": bool(visible),
+            "reason": None if visible else "outside" if not inside else "self_hidden",
+        }
+        for name, uv, point, visible, inside in zip(
+            gripper.corner_ids, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
+        )
+    ]
+    depth_m = float(cam_T_grip[2, 3])
+    return {
+        "config": str(config.path),
+        "robot": settings.robot,
+        "camera_name": settings.camera_name,
+        "camera": {
+            "model": type(settings.camera).__struct_config__.tag,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "fx_px": camera.fx_px,
+            "fy_px": camera.fy_px,
+            "field_of_view_rad": [
+                2.0 * math.atan(0.5 * camera.width_px / camera.fx_px),
+                2.0 * math.atan(0.5 * camera.height_px / camera.fy_px),
+            ],
+        },
+        "gripper": {
+            "file": str(config.gripper_path),
+            "name": gripper.name,
+            "corners": len(gripper.corner_ids),
+            "edges": len(gripper.edge_ids),
+            "faces": len(gripper.faces),
+            "jaw_m": [gripper.jaw_min_m, gripper.jaw_max_m] if gripper.has_jaw else None,
+        },
+        "reference": {
+            "id": config.reference.reference_id,
+            "translation_m": list(config.reference.cam_T_grip.translation_m),
+            "rotation_xyzw": list(config.reference.cam_T_grip.rotation_xyzw),
+            "distance_m": float(np.linalg.norm(cam_T_grip[:3, 3])),
+            "turn_rad": rotation_angle(cam_T_grip[:3, :3]),
+            "metres_per_px": depth_m / camera.fx_px,
+        },
+        "jaw": {"source": settings.jaw.source, "opening_m": config.jaw_opening_m},
+        "corners": corners,
+        "edges": [
+            {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
+        ],
+        "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
+        "recording": settings.recording.directory if settings.recording.enabled else None,
+    }
+
+
+def _source_report(config: Config) -> dict[str, Any]:
+    """Kind, whether frames can come from it now (None: can't be told without starting it), and a few words."""
+    from gripmon.sources import FolderSettings, LiveSettings, VideoSettings
+
+    source = config.settings.source
+    kind = type(source).__struct_config__.tag
+    if isinstance(source, FolderSettings | VideoSettings):
+        return {"kind": kind, "reachable": True, "detail": _first_frame(config)}
+    if isinstance(source, LiveSettings):
+        reachable, detail = _live_reachable(source)
+        return {"kind": kind, "reachable": reachable, "detail": detail}
+    return {"kind": kind, "reachable": True, "detail": "made by this program"}
+
+
+def _first_frame(config: Config) -> str:
+    """Describe the first frame of recorded input; one that doesn't fit the camera ends the command."""
+    from gripmon.records import Frame
+    from gripmon.sources import SourceError, open_source
+
+    try:
+        source = open_source(config.settings.source, config.directory)
+    except SourceError as error:
+        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
+    frame = source.read()
+    source.close()
+    if not isinstance(frame, Frame) or frame.image is None:
+        raise common.CommandFailedError(
+            f"{config.path}: source.path: its first frame can't be read; a readable image", common.EXIT_FAILED
+        )
+    height_px, width_px = frame.image.shape[:2]
+    if (width_px, height_px) != (config.camera.width_px, config.camera.height_px):
+        raise common.CommandFailedError(
+            f"{config.path}: camera.width_px: {config.camera.width_px} x {config.camera.height_px} px, but {frame.name} has "
+            f"{width_px} x {height_px}; the calibration that belongs to these images",
+            common.EXIT_USAGE,
+        )
+    count = f"{len(source)} frames, " if hasattr(source, "__len__") else ""
+    return f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
+
+
+def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
+    device = source.device
+    if isinstance(device, int) or device.isdecimal():
+        device = f"/dev/video{device}"
+    if device.startswith("/dev/"):
+        exists = Path(device).exists()
+        return exists, device if exists else f"{device} is not there now; run keeps trying"
+    address = urlsplit(device)
+    if address.scheme in _PORTS and address.hostname:
+        where = (address.hostname, address.port or _PORTS[address.scheme])
+        try:
+            with socket.create_connection(where, timeout=_CONNECT_S):
+                return True, f"{where[0]}:{where[1]} answers"
+        except OSError as error:
+            return False, f"{where[0]}:{where[1]} does not answer ({error.strerror or error}); run keeps trying"
+    return None, f"{device}: can't be told without starting it"
+
+
+def _as_text(report: dict[str, Any]) -> str:
+    source = report["source"]
+    edges = [edge["id"] for edge in report["edges"] if edge["visible"]]
+    seen = sum(corner["visible"] for corner in report["corners"])
+    sections = {
+        "camera": _camera_line(report["camera"]),
+        "gripper": _gripper_line(report["gripper"], report["jaw"]),
+        "reference": _reference_line(report["reference"]),
+        "edges": f"{len(edges)} of {len(report['edges'])} visible: {', '.join(edges)}",
+        "corners": f"{seen} of {len(report['corners'])} visible:",
+    }
+    outside = {
+        "source": f"{source['kind']}: {'NOT REACHABLE: ' if source['reachable'] is False else ''}{source['detail']}",
+        "Zenoh": report["keys"] or "off",
+        "recording": report["recording"] or "off",
+    }
+    lines = [f"{report['config']}: sound"]
+    lines += [f"{name:<10} {text}" for name, text in sections.items()]
+    lines += [_corner_line(corner) for corner in report["corners"]]
+    lines += [f"{name:<10} {text}" for name, text in outside.items()]
+    return "\n".join(lines)
+
+
+def _camera_line(camera: dict[str, Any]) -> str:
+    across, down = (math.degrees(angle) for angle in camera["field_of_view_rad"])
+    size = f"{camera['width_px']} x {camera['height_px']} px, f = {camera['fx_px']:g}, {camera['fy_px']:g} px"
+    return f"{size}, lens {camera['model']}, sees about {across:.0f}° x {down:.0f}°"
+
+
+def _gripper_line(gripper: dict[str, Any], jaw: dict[str, Any]) -> str:
+    name = f"{gripper['name']} ({gripper['file']})"
+    if gripper["jaw_m"] is None:
+        return f"{name}: no jaw"
+    low_mm, high_mm = (1e3 * v for v in gripper["jaw_m"])
+    opening = f"{1e3 * jaw['opening_m']:.1f} mm"
+    if jaw["source"] == "fixed":
+        return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, fixed at {opening}"
+    return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, opening from {jaw['source']}; the following at {opening}"
+
+
+def _reference_line(reference: dict[str, Any]) -> str:
+    x, y, z = (1e3 * v for v in reference["translation_m"])
+    place = f"{reference['id']}: TCP at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the camera frame"
+    turn = f"{math.degrees(reference['turn_rad']):.1f}° between camera and gripper"
+    return f"{place}, {turn}, 1 px is {1e3 * reference['metres_per_px']:.3f} mm at the TCP"
+
+
+def _corner_line(corner: dict[str, Any]) -> str:
+    reason = {None: "", "outside": "outside of the image", "self_hidden": "hidden by its own finger"}[corner["reason"]]
+    place = "       —       " if corner["uv_px"] is None else "({:6.1f}, {:6.1f})".format(*corner["uv_px"])
+    return f"           {corner['id']:<14} {place} px  {1e3 * corner['distance_m']:6.1f} mm  {reason}".rstrip()

@@ -1,0 +1,214 @@
+"""``gripmon replay``: recorded frames through the same core as the daemon's, one JSON line a frame."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.recording import Recorder
+    from gripmon.records import FrameRecord
+    from gripmon.sources import Source
+
+_DESCRIPTION = """\
+Run recorded frames through the monitor and write one JSON line for every input frame, in input
+order, refused ones included.  The same input gives the same bytes, except for latency_ns."""
+
+_EXAMPLES = """\
+  gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl
+  gripmon replay wrist.mp4 --config configs/live_camera.yaml --out - | head -1
+  gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl --recording story.rrd
+
+exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used; 130 interrupted (what
+was done until then is in FILE)"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands,
+        "replay",
+        run,
+        "recorded images or a video through the monitor, JSON lines out",
+        _DESCRIPTION,
+        _EXAMPLES,
+    )
+    parser.add_argument(
+        "input",
+        metavar="INPUT",
+        help="a folder of images, taken in the order of their names, or a video file; a timestamps.csv may lie in the "
+        "folder, with the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
+    )
+    parser.add_argument(
+        "--config", required=True, metavar="CONFIG", help="configuration (YAML); its source section is not used"
+    )
+    parser.add_argument("--out", required=True, metavar="FILE", help="JSON lines go here; - is standard output")
+    parser.add_argument(
+        "--recording", metavar="FILE.rrd", help="also write a rerun recording (open it with: rerun FILE.rrd)"
+    )
+    parser.add_argument(
+        "--fps",
+        type=common.positive_number,
+        metavar="HZ",
+        help="frames a second where the input has no time stamps (1/s)",
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon replay``."""
+    import cv2
+
+    config = common.load(arguments.config, check_source=False)
+    cv2.setNumThreads(1)
+    source = _open_input(Path(arguments.input), config, arguments.fps)
+    try:
+        with _output(arguments.out) as out, _recorder(arguments.recording, config) as recorder:
+            counts = _Counts()
+            try:
+                with common.progress_bar(len(source) if hasattr(source, "__len__") else None, "frame") as step:
+                    for line, record in replay(config, source, recorder):
+                        out.write(line)
+                        counts.add(record)
+                        step()
+            finally:
+                out.flush()
+                print(counts.summary(), file=sys.stderr)
+    finally:
+        source.close()
+    return common.EXIT_DONE if counts.usable else common.EXIT_FAILED
+
+
+def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple[bytes, FrameRecord]]:
+    """Process every frame of a source that isn't live: yields each record with its JSON line."""
+    import msgspec
+
+    from gripmon.monitor import Monitor
+    from gripmon.records import Frame, to_json
+
+    monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
+    recorder.reference(monitor.reference)
+    with_jaw = _jaw_of(config)
+    revision = monitor.reference.revision
+    while (frame := source.read()) is not None:
+        assert isinstance(frame, Frame), "only a live source waits"
+        frame = with_jaw(frame)
+        start_ns = time.perf_counter_ns()
+        record = monitor.process(frame)
+        record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
+        if record.revision != revision:
+            revision = record.revision
+            recorder.reference(monitor.reference)
+        recorder.offer(frame, record, monitor.trace())
+        yield to_json(record) + b"\n", record
+
+
+class _Counts:
+    """What became of the frames."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.usable = 0
+        self._verdicts: dict[str, int] = {}
+        self._reasons: dict[str, int] = {}
+        self._latencies_ns: list[int] = []
+
+    def add(self, record: FrameRecord) -> None:
+        from gripmon.records import Origin
+
+        self.frames += 1
+        self.usable += record.source is not Origin.HELD
+        self._verdicts[record.verdict] = self._verdicts.get(record.verdict, 0) + 1
+        if record.reason:
+            self._reasons[record.reason] = self._reasons.get(record.reason, 0) + 1
+        self._latencies_ns.append(record.latency_ns)
+
+    def summary(self) -> str:
+        if not self.frames:
+            return "replay: no frames"
+        verdicts = ", ".join(
+            f"{count} {verdict}" for verdict, count in sorted(self._verdicts.items(), key=lambda v: -v[1])
+        )
+        median_ms = 1e-6 * sorted(self._latencies_ns)[self.frames // 2]
+        text = f"replay: {self.frames} frames: {verdicts}; median {median_ms:.2f} ms a frame"
+        if not self.usable:
+            reason = max(self._reasons, key=self._reasons.__getitem__, default="no measurement")
+            text += f"; no frame could be used ({reason})"
+        return text
+
+
+def _jaw_of(config: Config) -> Callable[[Any], Any]:
+    """How a frame gets its jaw opening: from the configuration, or it keeps what it came with."""
+    if config.settings.jaw.source != "fixed":
+        return lambda frame: frame
+    warned = False
+
+    def with_fixed_jaw(frame: Any) -> Any:
+        nonlocal warned
+        if frame.jaw_opening_m is not None and not warned and config.gripper.has_jaw:
+            warned = True
+            print("replay: the frames bring jaw openings, but jaw.source is fixed: they are not used", file=sys.stderr)
+        return dataclasses.replace(frame, jaw_opening_m=config.jaw_opening_m)
+
+    return with_fixed_jaw
+
+
+def _open_input(path: Path, config: Config, fps: float | None) -> Source:
+    import msgspec
+
+    from gripmon.sources import SourceError, open_source, settings_for_path
+
+    if not path.exists():
+        raise common.CommandFailedError(
+            f"{path}: there is no such file or folder; a folder of images or a video", common.EXIT_USAGE
+        )
+    if path.suffix.lower() == ".rrd":
+        raise common.CommandFailedError(
+            f"{path}: replay of .rrd recordings is not supported yet; a folder of images or a video", common.EXIT_USAGE
+        )
+    settings = settings_for_path(path)
+    if fps is not None:
+        settings = msgspec.structs.replace(settings, fps=fps)
+    try:
+        return open_source(settings)
+    except SourceError as error:
+        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+
+
+@contextmanager
+def _output(name: str) -> Iterator[IO[bytes]]:
+    if name == "-":
+        yield sys.stdout.buffer
+        return
+    path = Path(name)
+    common.make_directory(path.parent)
+    try:
+        file = path.open("wb")
+    except OSError as error:
+        raise common.CommandFailedError(
+            f"--out {path}: can't be written ({error.strerror}); a file", common.EXIT_USAGE
+        ) from None
+    with file:
+        yield file
+
+
+@contextmanager
+def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
+    """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
+    from gripmon.recording import NullRecorder
+
+    recorder = NullRecorder() if name is None else common.open_one_recording(Path(name), config)
+    try:
+        yield recorder
+    finally:
+        recorder.close(timeout_s=60.0)
+        if recorder.dropped:
+            print(f"replay: {recorder.dropped} frames are missing in the recording", file=sys.stderr)

@@ -1,0 +1,162 @@
+"""A configuration file -> checked, typed settings with the camera, the gripper and the reference that they describe.
+
+Everything that can be wrong is found here, before anything starts, and said in one line: :class:`ConfigError`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import gripmon
+from gripmon.camera import Camera, make_camera
+from gripmon.config.checks import View, covariance_of, predict_view, reference_transform, view_fault
+from gripmon.config.errors import ConfigError
+from gripmon.config.settings import JawSettings, Settings
+from gripmon.config.typed import Fault, SettingsError, to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.geometry import from_record, to_record
+from gripmon.gripper import Gripper, GripperError, GripperModel
+from gripmon.records import Array, ReferenceRecord, to_json
+from gripmon.sources import FolderSettings, LiveSettings, VideoSettings
+
+__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "load_config"]
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """A configuration that holds together."""
+
+    path: Path
+    settings: Settings
+    camera: Camera
+    gripper: Gripper
+    gripper_path: Path
+    reference: ReferenceRecord
+
+    @property
+    def directory(self) -> Path:
+        """Where relative paths in the file count from."""
+        return self.path.parent
+
+    @property
+    def cam_T_grip(self) -> Array:
+        """The reference calibration (4, 4)."""
+        return from_record(self.reference.cam_T_grip)
+
+    @property
+    def jaw_opening_m(self) -> float | None:
+        """The fixed jaw opening, nominal where it comes from elsewhere, None for a gripper without jaw (m)."""
+        if not self.gripper.has_jaw:
+            return None
+        return self.gripper.jaw_nominal_m if self.settings.jaw.opening_m is None else self.settings.jaw.opening_m
+
+    def view(self) -> View:
+        """What the reference predicts to be seen at :attr:`jaw_opening_m`."""
+        return predict_view(self.camera, self.gripper, self.cam_T_grip, self.jaw_opening_m)
+
+
+def load_config(path: Path, *, check_source: bool = True) -> Config:
+    """Read and check a configuration file.  Raises :class:`ConfigError`.
+
+    ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input.
+    """
+    try:
+        settings = to_settings(read_yaml(path), Settings)
+    except SettingsError as error:
+        raise _error(path, error.fault) from None
+    camera = _camera(path, settings)
+    gripper_path = path.parent / settings.gripper
+    gripper = _gripper(path, gripper_path)
+    reference = _reference(path, settings)
+    config = Config(path, settings, camera, gripper, gripper_path, reference)
+    fault = _jaw_fault(settings.jaw, gripper, settings) or view_fault(config.view(), gripper, camera)
+    if fault is None and check_source:
+        fault = _source_fault(settings, path.parent)
+    if fault is not None:
+        raise _error(path, fault)
+    return config
+
+
+def builtin_config(name: str) -> Path:
+    """The path of a file in ``configs/``, in a checkout or in an installed wheel (there it lies in the package)."""
+    package = Path(gripmon.__file__).resolve().parent
+    for folder in (package / "configs", package.parent / "configs"):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"{name} is not among the installed configuration files")
+
+
+def _error(path: Path, fault: Fault) -> ConfigError:
+    return ConfigError(path, fault.key, fault.wrong, fault.right)
+
+
+def _camera(path: Path, settings: Settings) -> Camera:
+    try:
+        return make_camera(settings.camera)
+    except ValueError as error:
+        raise ConfigError(path, "", f"camera.{error}") from None
+
+
+def _gripper(path: Path, gripper_path: Path) -> Gripper:
+    if not gripper_path.is_file():
+        raise ConfigError(
+            path, "gripper", f"there is no file {gripper_path}", "a gripper file, its path relative to this file"
+        )
+    try:
+        return Gripper(to_settings(read_yaml(gripper_path), GripperModel))
+    except SettingsError as error:
+        raise _error(gripper_path, error.fault) from None
+    except GripperError as error:
+        raise ConfigError(gripper_path, "", str(error)) from None
+
+
+def _reference(path: Path, settings: Settings) -> ReferenceRecord:
+    cam_T_grip = reference_transform(settings.reference)
+    if isinstance(cam_T_grip, Fault):
+        raise _error(path, cam_T_grip)
+    covariance = covariance_of(settings.reference)
+    if isinstance(covariance, Fault):
+        raise _error(path, covariance)
+    transform = to_record(cam_T_grip)
+    name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
+    return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)
+
+
+def _jaw_fault(jaw: JawSettings, gripper: Gripper, settings: Settings) -> Fault | None:
+    if jaw.source != "fixed" and not gripper.has_jaw:
+        return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
+    if jaw.opening_m is not None:
+        if jaw.source != "fixed":
+            return Fault(
+                "jaw.opening_m", f"has no effect with jaw.source {jaw.source}", "jaw.source: fixed, or no opening_m"
+            )
+        if not gripper.has_jaw:
+            return Fault("jaw.opening_m", "the gripper file has no jaw", "no opening_m")
+        if not gripper.jaw_min_m <= jaw.opening_m <= gripper.jaw_max_m:
+            span = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+            return Fault("jaw.opening_m", f"{jaw.opening_m:g} m is outside the gripper's range", span)
+    if jaw.source == "frames" and isinstance(settings.source, LiveSettings | VideoSettings):
+        kind = "camera" if isinstance(settings.source, LiveSettings) else "video"
+        return Fault("jaw.source", f"is frames, but a {kind} brings no jaw opening", "fixed or zenoh")
+    if jaw.source == "zenoh" and not settings.publish.enabled:
+        return Fault(
+            "jaw.source", "is zenoh, but publish.enabled is false", "publish.enabled: true, or jaw.source: fixed"
+        )
+    return None
+
+
+def _source_fault(settings: Settings, directory: Path) -> Fault | None:
+    source = settings.source
+    if isinstance(source, FolderSettings) and not (directory / source.path).is_dir():
+        return Fault(
+            "source.path",
+            f"there is no folder {directory / source.path}",
+            "a folder with images, relative to this file",
+        )
+    if isinstance(source, VideoSettings) and not (directory / source.path).is_file():
+        return Fault(
+            "source.path", f"there is no file {directory / source.path}", "a video file, relative to this file"
+        )
+    return None

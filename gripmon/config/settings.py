@@ -1,0 +1,92 @@
+"""The settings of one monitor, assembled from the sections that the rooms define beside their algorithms."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.camera import LensSettings
+from gripmon.daemon import DaemonSettings
+from gripmon.monitor import MonitorSettings
+from gripmon.publish import PublishSettings
+from gripmon.recording import RecordingSettings
+from gripmon.sources import SourceSettings
+
+Name = Annotated[
+    str,
+    Meta(
+        pattern=r"^[^/*$#?@\s][^/*$#?\s]*$",
+        description="part of the Zenoh keys gripmon/<robot>/<camera>/…: no blank, none of / * $ # ?, no @ in front",
+    ),
+]
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class TransformSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``cam_T_grip``: where the gripper frame is in the camera frame."""
+
+    translation_m: Annotated[Vector, Meta(description="the TCP in the camera frame: x right, y down, z forward (m)")]
+    rotation_xyzw: Annotated[
+        Quaternion, Meta(description="unit quaternion x, y, z, w of the gripper's axes in the camera frame")
+    ]
+
+
+class ReferenceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The calibration that drift is measured against."""
+
+    cam_T_grip: TransformSettings
+    id: Annotated[str, Meta(min_length=1, description="name of this calibration in messages")] | None = None
+    position_sigma_m: Annotated[
+        float, Meta(gt=0.0, le=0.1, description="its standard deviation in position, each axis (m)")
+    ] = 0.001
+    rotation_sigma_rad: Annotated[
+        float, Meta(gt=0.0, le=0.5, description="its standard deviation in rotation, each axis (rad)")
+    ] = 0.01
+    covariance: (
+        Annotated[
+            tuple[float, ...],
+            Meta(
+                min_length=36,
+                max_length=36,
+                description="6x6 row by row, position (m²) then rotation (rad²); replaces both sigmas",
+            ),
+        ]
+        | None
+    ) = None
+
+
+class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where the jaw opening of a frame comes from."""
+
+    source: Annotated[
+        Literal["fixed", "frames", "zenoh"],
+        Meta(
+            description="fixed: opening_m; frames: comes with each frame (simulator, timestamps.csv); zenoh: key …/jaw"
+        ),
+    ] = "fixed"
+    opening_m: (
+        Annotated[
+            float,
+            Meta(ge=0.0, le=0.5, description="jaw opening with source fixed; the gripper's nominal if absent (m)"),
+        ]
+        | None
+    ) = None
+
+
+class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole configuration file."""
+
+    robot: Name
+    camera_name: Name
+    camera: LensSettings
+    gripper: Annotated[str, Meta(min_length=1, description="path of the gripper file, relative to this file")]
+    reference: ReferenceSettings
+    source: SourceSettings
+    jaw: JawSettings = JawSettings()
+    monitor: MonitorSettings = MonitorSettings()
+    publish: PublishSettings = PublishSettings()
+    recording: RecordingSettings = RecordingSettings()
+    daemon: DaemonSettings = DaemonSettings()
