@@ -5,7 +5,7 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 ``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested
 ``state``      once a second and on every change; late joiners get the last one
 ``reference``  on every new revision; late joiners get the last one
-``alert``      when there is one
+``alert``      when there is one; an advanced subscriber with history gets the last 32
 ``alive``      liveliness token, gone as soon as the process is
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
 
@@ -32,10 +32,10 @@ from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateReco
 _log = logging.getLogger(__name__)
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-_ENDPOINT_PATTERN = r"^[a-z0-9_-]+/[^\s]+$"
-_NAME = re.compile(r"^[^/*$#?@\s][^/*$#?\s]*$")
+_ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
+_NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
 _JSON = zenoh.Encoding.APPLICATION_JSON
-_ALERTS_KEPT = 32  # while there is no session yet
+_ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
 _JAW_READINGS_KEPT = 64  # between two frames; the newest win
 _HEARTBEAT_S = 1.0
 
@@ -75,21 +75,27 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """Key expressions of one monitor, or of several where a name is the wildcard ``*``."""
+    """The keys of one monitor: ``Keys("arm", "wrist")["state"]``.  For readers a name may be ``*``: any."""
 
     robot: str
     camera: str
 
     def __post_init__(self) -> None:
         for role, name in (("robot", self.robot), ("camera", self.camera)):
-            if name != "*" and not _NAME.match(name):
-                raise ValueError(
-                    f"{role} name {name!r} can't be part of a Zenoh key; give at least one character, none of them a "
-                    "space or one of / * $ # ?, and no @ in front"
-                )
+            if name != "*":
+                check_name(role, name)
 
     def __getitem__(self, leaf: str) -> str:
         return f"gripmon/{self.robot}/{self.camera}/{leaf}"
+
+
+def check_name(role: str, name: str) -> None:
+    """Raise ValueError unless the name can be one chunk of a Zenoh key."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{role} name {name!r} can't be part of a Zenoh key; give at least one character, none of them a space or "
+            "one of / * $ # ?, and no @ in front"
+        )
 
 
 class Publisher(Protocol):
@@ -105,20 +111,11 @@ class Publisher(Protocol):
 class NullPublisher:
     """Says nothing."""
 
-    def transform(self, record: FrameRecord) -> None:
-        """Do nothing."""
-
-    def state(self, record: StateRecord) -> None:
-        """Do nothing."""
-
-    def alert(self, record: AlertRecord) -> None:
-        """Do nothing."""
-
-    def reference(self, record: ReferenceRecord) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
+    def transform(self, record: FrameRecord) -> None: ...
+    def state(self, record: StateRecord) -> None: ...
+    def alert(self, record: AlertRecord) -> None: ...
+    def reference(self, record: ReferenceRecord) -> None: ...
+    def close(self) -> None: ...
 
 
 class JawReading(msgspec.Struct, frozen=True):
@@ -170,7 +167,7 @@ class ZenohJaw:
             try:
                 self._newest = self._decode(sample.payload.to_bytes())
                 self._arrival_s = now_s
-            except msgspec.MsgspecError as error:
+            except msgspec.DecodeError as error:
                 self.malformed += 1
                 if self.malformed == 1:
                     _log.warning("malformed message on %s: %s", sample.key_expr, error)
@@ -185,7 +182,11 @@ class ZenohPublisher:
     """
 
     def __init__(self, settings: PublishSettings, robot: str, camera: str, *, subscribe_jaw: bool = False) -> None:
-        """Raises :class:`PublishError` for a configuration that can't work and for an address that is already taken."""
+        """Raises ValueError for a name that can't be part of a key, and :class:`PublishError` for a configuration that
+        can't work or an address that is already taken.
+        """
+        check_name("robot", robot)
+        check_name("camera", camera)
         self.keys = Keys(robot, camera)
         self.jaw = ZenohJaw(settings.jaw_max_age_s)
         self.unsent = 0
@@ -287,23 +288,30 @@ class ZenohPublisher:
             return
 
 
+def _keeping_publisher(
+    session: zenoh.Session, key: str, priority: zenoh.Priority, kept: int
+) -> zenoh.ext.AdvancedPublisher:
+    """A publisher whose last ``kept`` samples an advanced subscriber with history gets when it comes later."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        encoding=_JSON,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=priority,
+        cache=zenoh.ext.CacheConfig(kept),
+        # Sequence numbers instead of timestamps: the cache then works whatever the session's timestamping setting.
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+        publisher_detection=True,
+    )
+
+
 class _LastValue:
     """A key whose last value is there for whoever comes later."""
 
     def __init__(self, session: zenoh.Session, key: str) -> None:
         self._key = key
         self._last: bytes | None = None
-        self._publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            key,
-            encoding=_JSON,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.DATA_HIGH,
-            cache=zenoh.ext.CacheConfig(1),
-            # Sequence numbers instead of timestamps: the cache then works whatever the session's timestamping setting.
-            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
-            publisher_detection=True,
-        )
+        self._publisher = _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1)
         self._queryable = session.declare_queryable(key, self._answer, complete=True)
 
     def put(self, payload: bytes) -> None:
@@ -331,12 +339,7 @@ class _Wire:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self.alert = session.declare_publisher(
-            keys["alert"],
-            encoding=_JSON,
-            congestion_control=zenoh.CongestionControl.DROP,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-        )
+        self.alert = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.state = _LastValue(session, keys["state"])
         self.reference = _LastValue(session, keys["reference"])
         self._alive = session.liveliness().declare_token(keys["alive"])
@@ -384,14 +387,12 @@ def _open(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        text = str(error)
-        own = settings.zenoh_config is None
-        taken = re.search(r"bound to (\S+?): .*Address already in use", text)
-        if taken:
-            key = "publish.listen" if own else "publish.zenoh_config"
+        keys = [f"publish.{key}" for key in ("listen", "connect") if getattr(settings, key)]
+        key = " or ".join(keys) if settings.zenoh_config is None else "publish.zenoh_config"
+        if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
+            key = key.split(" or ")[0]
             remedy = "stop the program that has it, or choose another port"
             raise PublishError(f"{key}: {taken[1]} is already in use; {remedy}") from error
-        key = "publish.listen" if own and "listener" in text else "publish" if own else "publish.zenoh_config"
         raise PublishError(f"{key}: can't open a Zenoh session: {_short(error)}") from error
 
 

@@ -1,0 +1,272 @@
+"""The publisher against plain Zenoh sessions that know only the contract's keys and JSON."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import zenoh
+from loopback import (
+    alert_record,
+    ask,
+    can_bind,
+    frame_record,
+    free_endpoint,
+    plain_session,
+    reference_record,
+    state_record,
+    wait_until,
+)
+
+from gripmon.publish import Keys, NullPublisher, PublishError, PublishSettings, ZenohPublisher
+from gripmon.records import Verdict
+
+PREFIX = "gripmon/arm/wrist"
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint: str) -> Iterator[ZenohPublisher]:
+    made = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist", subscribe_jaw=True)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def session(publisher: ZenohPublisher, endpoint: str) -> Iterator[zenoh.Session]:
+    with plain_session(connect=endpoint) as opened:
+        yield opened
+
+
+def received(subscriber: zenoh.Subscriber, put: object) -> zenoh.Sample:
+    """The first sample after ``put()``, which is repeated until the subscription has reached the publisher."""
+    samples: list[zenoh.Sample] = []
+
+    def arrived() -> bool:
+        put()  # type: ignore[operator]
+        while (sample := subscriber.try_recv()) is not None:
+            samples.append(sample)
+        return bool(samples)
+
+    wait_until(arrived, "a sample")
+    return samples[0]
+
+
+def test_transform_on_the_wire(publisher: ZenohPublisher, session: zenoh.Session):
+    record = frame_record()
+    sample = received(session.declare_subscriber(f"{PREFIX}/transform"), lambda: publisher.transform(record))
+    message = json.loads(sample.payload.to_bytes())
+    assert message["cam_T_grip"] == {
+        "translation_m": [0.011, -0.022, 0.133],
+        "rotation_xyzw": [0.1, -0.2, 0.3, 0.9273618495495703],
+    }
+    assert message["stamp_ns"] == 1_700_000_000_123_456_796
+    assert message["covariance"] == [1e-9 * (i + 1) for i in range(36)]
+    assert message["verdict"] == "valid" and message["source"] == "update"
+    fields = (
+        "seq stamp_ns verdict state source cam_T_grip covariance smoothed drift reference_id revision rms_px "
+        "jaw_opening_m corners alerts latency_ns"
+    )
+    assert set(message) >= set(fields.split())
+    assert message["corners"] == [
+        {"id": "L_in_near", "uv_px": [12.5, 34.25], "sigma_px": 0.05, "used": True, "reason": None}
+    ]
+    assert sample.express and sample.priority == zenoh.Priority.REAL_TIME
+    assert sample.congestion_control == zenoh.CongestionControl.DROP
+    assert str(sample.encoding) == "application/json"
+
+
+def test_alert_on_the_wire(publisher: ZenohPublisher, session: zenoh.Session):
+    sample = received(session.declare_subscriber(f"{PREFIX}/alert"), lambda: publisher.alert(alert_record("it moved")))
+    message = json.loads(sample.payload.to_bytes())
+    assert (message["kind"], message["cause"], message["text"]) == ("drift", "camera_mount_moved", "it moved")
+
+
+@pytest.mark.parametrize("leaf", ["state", "reference"])
+def test_late_joiners_get_the_last_one(publisher: ZenohPublisher, endpoint: str, leaf: str):
+    records = [state_record(i) for i in (1, 2)] if leaf == "state" else [reference_record(i) for i in (1, 2)]
+    for record in records:
+        getattr(publisher, leaf)(record)
+    expected = json.loads(msgspec.json.encode(records[-1]))
+    with plain_session(connect=endpoint) as session:
+        assert ask(session, f"{PREFIX}/{leaf}") == [expected]
+        assert ask(session, f"gripmon/*/*/{leaf}") == [expected]
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            session, f"{PREFIX}/{leaf}", history=zenoh.ext.HistoryConfig(max_samples=10, detect_late_publishers=True)
+        )
+        samples: list[zenoh.Sample] = []
+        wait_until(lambda: (sample := subscriber.try_recv()) is not None and not samples.append(sample), "history")
+        assert [json.loads(sample.payload.to_bytes()) for sample in samples] == [expected]
+        getattr(publisher, leaf)(records[0])
+        wait_until(lambda: (sample := subscriber.try_recv()) is not None and not samples.append(sample), "the next one")
+        assert json.loads(samples[-1].payload.to_bytes()) == json.loads(msgspec.json.encode(records[0]))
+
+
+def test_a_question_before_the_first_state_is_answered_in_words(session: zenoh.Session):
+    replies = list(session.get(f"{PREFIX}/state", timeout=5.0))
+    assert [reply.err.payload.to_string() for reply in replies] == ["nothing published on this key yet"]
+
+
+def test_close_frees_token_port_and_threads(endpoint: str):
+    before = set(threading.enumerate())
+    publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist", subscribe_jaw=True)
+    with plain_session(connect=endpoint) as session:
+        tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
+        assert tokens.recv().kind == zenoh.SampleKind.PUT
+        assert not can_bind(endpoint)
+        publisher.close()
+        publisher.close()
+        assert tokens.recv().kind == zenoh.SampleKind.DELETE
+    wait_until(lambda: can_bind(endpoint), "the port to be free")
+    wait_until(lambda: set(threading.enumerate()) <= before, f"threads to end: {threading.enumerate()}")
+
+
+def test_a_port_that_is_taken_is_said_with_its_key(publisher: ZenohPublisher, endpoint: str):
+    with pytest.raises(PublishError) as caught:
+        ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "other")
+    assert (
+        str(caught.value)
+        == f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
+    )
+
+
+def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str):
+    settings = PublishSettings(mode="client", connect=(endpoint,), retry_first_s=0.02, retry_max_s=0.1)
+    publisher = ZenohPublisher(settings, "arm", "wrist")
+    try:
+        assert not publisher.connected
+        for record in (frame_record(1), frame_record(2)):
+            publisher.transform(record)
+        publisher.state(state_record(1))
+        publisher.state(state_record(2))
+        publisher.reference(reference_record(4))
+        publisher.alert(alert_record("first"))
+        publisher.alert(alert_record("second"))
+        assert publisher.unsent == 2
+        with plain_session(listen=endpoint, mode="router") as router:
+            wait_until(lambda: publisher.connected, "the session")
+            wait_until(lambda: ask(router, f"{PREFIX}/state"), "the state")
+            assert ask(router, f"{PREFIX}/state")[0]["seq"] == 2
+            assert ask(router, f"{PREFIX}/reference")[0]["revision"] == 4
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            alerts = zenoh.ext.declare_advanced_subscriber(router, f"{PREFIX}/alert", history=history)
+            assert [json.loads(alerts.recv().payload.to_bytes())["text"] for _ in range(2)] == ["first", "second"]
+            transforms = router.declare_subscriber(f"{PREFIX}/transform")
+            received(transforms, lambda: publisher.transform(frame_record(3)))
+        assert publisher.unsent == 2
+    finally:
+        publisher.close()
+
+
+def test_a_client_that_never_finds_its_router_closes(endpoint: str):
+    before = set(threading.enumerate())
+    publisher = ZenohPublisher(PublishSettings(mode="client", connect=(endpoint,)), "arm", "wrist")
+    publisher.close()
+    wait_until(lambda: set(threading.enumerate()) <= before, "the opening thread to end")
+
+
+@pytest.mark.parametrize("suffix", [".json5", ".yaml"])
+def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str):
+    path = tmp_path / f"zenoh{suffix}"
+    text = {
+        ".json5": "{mode: 'peer', listen: {endpoints: ['HERE']}, scouting: {multicast: {enabled: false}}} // json5",
+        ".yaml": "mode: peer\nlisten:\n  endpoints: [HERE]\nscouting:\n  multicast:\n    enabled: false\n",
+    }[suffix].replace("HERE", endpoint)
+    path.write_text(text)
+    publisher = ZenohPublisher(PublishSettings(zenoh_config=str(path)), "arm", "wrist")
+    try:
+        publisher.state(state_record(5))
+        with plain_session(connect=endpoint) as session:
+            assert ask(session, f"{PREFIX}/state")[0]["seq"] == 5
+        with pytest.raises(PublishError, match=rf"^publish.zenoh_config: {endpoint} is already in use"):
+            ZenohPublisher(PublishSettings(zenoh_config=str(path)), "arm", "other")
+    finally:
+        publisher.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"mode": "client"}, "publish.connect: a client needs a router"),
+        ({"connect": ("nonsense",)}, "publish.connect: "),
+        ({"zenoh_config": "/nowhere.json5"}, "publish.zenoh_config: no file /nowhere.json5"),
+        ({"zenoh_config": __file__}, "publish.zenoh_config: "),
+        ({"zenoh_config": __file__, "connect": ("tcp/127.0.0.1:1",)}, "publish.connect: has no effect beside"),
+        ({"listen": ("tcp/256.1.1.1:5",)}, "publish.listen: can't open a Zenoh session"),
+    ],
+)
+def test_bad_settings_name_their_key(changes: dict[str, object], text: str):
+    with pytest.raises(PublishError) as caught:
+        ZenohPublisher(PublishSettings(**changes), "arm", "wrist")  # type: ignore[arg-type]
+    assert str(caught.value).startswith(text)
+    assert "\n" not in str(caught.value) and ".rs:" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "*", "a*", "$x", "a#b", "a?b", "@adv", "a b", "a\n"])
+def test_names_that_would_break_a_key_are_refused(name: str):
+    for robot, camera in ((name, "wrist"), ("arm", name)):
+        with pytest.raises(ValueError, match=r"name .* can't be part of a Zenoh key"):
+            ZenohPublisher(PublishSettings(listen=()), robot, camera)
+
+
+@pytest.mark.parametrize("name", ["arm", "arm-1", "Größe", "a@b", "ur10.left"])
+def test_names_that_zenoh_takes_are_taken(name: str):
+    assert zenoh.KeyExpr(Keys(name, name)["state"])
+
+
+def test_the_newest_jaw_opening_wins(publisher: ZenohPublisher, session: zenoh.Session):
+    assert publisher.jaw.opening_m() is None
+    assert publisher.jaw.fault() == "no jaw opening received"
+    for stamp_ns, opening_m in ((1, 0.010), (3, 0.020), (2, 0.030)):
+        session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": stamp_ns, "opening_m": opening_m, "more": 1}))
+    wait_until(lambda: publisher.jaw.opening_m() == 0.030, "the jaw opening that was sent last")
+    assert publisher.jaw.fault() == ""
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"",
+        b"0.02",
+        b"\xff\xfe",
+        b'{"opening_m": 0.02}',
+        b'{"stamp_ns": 1, "opening_m": NaN}',
+        b'{"stamp_ns": 1, "opening_m": "2"}',
+    ],
+)
+def test_a_malformed_jaw_message_is_counted_and_said(publisher: ZenohPublisher, session: zenoh.Session, message: bytes):
+    session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": 1, "opening_m": 0.02}))
+    session.put(f"{PREFIX}/jaw", message)
+    wait_until(lambda: publisher.jaw.opening_m() is not None and publisher.jaw.malformed == 1, "the malformed message")
+    assert publisher.jaw.opening_m() == 0.02
+    assert publisher.jaw.fault() == "1 malformed jaw message"
+
+
+def test_an_old_jaw_opening_is_not_used(endpoint: str):
+    settings = PublishSettings(listen=(endpoint,), jaw_max_age_s=0.2)
+    publisher = ZenohPublisher(settings, "arm", "wrist", subscribe_jaw=True)
+    try:
+        with plain_session(connect=endpoint) as session:
+            session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": 1, "opening_m": 0.02}))
+            wait_until(lambda: publisher.jaw.opening_m() == 0.02, "the jaw opening")
+            wait_until(lambda: publisher.jaw.opening_m() is None, "the jaw opening to grow old")
+            assert publisher.jaw.fault() == "no jaw opening for 0.2 s or longer"
+    finally:
+        publisher.close()
+
+
+def test_the_null_publisher_takes_everything():
+    publisher = NullPublisher()
+    publisher.transform(frame_record(verdict=Verdict.UNKNOWN))
+    publisher.state(state_record())
+    publisher.alert(alert_record())
+    publisher.reference(reference_record())
+    publisher.close()
