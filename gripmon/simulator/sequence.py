@@ -1,0 +1,111 @@
+"""The simulator: frame i of a scenario, with its truth, for any i in any order."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.gripper import Gripper
+from gripmon.records import Array, Frame
+from gripmon.simulator import disturbance
+from gripmon.simulator.bodies import Bodies
+from gripmon.simulator.render import Renderer
+from gripmon.simulator.scenario import Scenario
+from gripmon.simulator.scene import Scene
+from gripmon.simulator.sensor import SensorModel
+from gripmon.simulator.truth import FrameTruth, Hidden
+
+
+class Simulator:
+    """A wrist camera that looks at its own fingertips.
+
+    Frame i is a pure function of camera, gripper, calibration, scenario, seed and i.  Not for several threads at once.
+    Raises ValueError when the scenario doesn't fit the gripper, or the gripper has no closed convex fingers.
+    """
+
+    def __init__(
+        self, camera: Camera, gripper: Gripper, nominal_cam_T_grip: Array, scenario: Scenario, seed: int = 0
+    ) -> None:
+        self.camera, self.gripper, self.scenario, self.seed = camera, gripper, scenario, seed
+        self.nominal_cam_T_grip = np.array(nominal_cam_T_grip, dtype=float)
+        self._scene = Scene(camera, gripper, self.nominal_cam_T_grip, scenario, seed)
+        self._bodies = Bodies(gripper, scenario, self._scene.view_half[1])
+        self._painting: tuple[Renderer, SensorModel] | None = None
+
+    @property
+    def frame_count(self) -> int:
+        """Frames in ``scenario.duration_s``; later ones can be asked for, too."""
+        return max(round(self.scenario.duration_s * self.scenario.fps), 1)
+
+    def time_s(self, index: int) -> float:
+        """Middle of the exposure of a frame, from that of the first."""
+        if index < 0:
+            raise IndexError(f"there is no frame {index}; frames count from 0")
+        return index / self.scenario.fps
+
+    def truth(self, index: int) -> FrameTruth:
+        """Truth of a frame, without rendering it."""
+        time_s = self.time_s(index)
+        scenario, state = self.scenario, self._scene.at(time_s)
+        cam_T_grip = state.cam_T_grip
+        corners_cam = state.points_grip_m[self.gripper.corner_points] @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+        uv = self.camera.project(corners_cam)
+        hidden = self._bodies.hidden_corners(state, corners_cam)
+        for k in np.flatnonzero(~self._inside(uv)).tolist():
+            hidden[k] = Hidden.OUTSIDE
+        return FrameTruth(
+            index=index,
+            time_s=time_s,
+            stamp_ns=self._stamp_ns(index),
+            cam_T_grip=cam_T_grip,
+            reference_cam_T_grip=state.reference_cam_T_grip,
+            tcp_shift_m=cam_T_grip[:3, 3] - state.reference_cam_T_grip[:3, 3],
+            jaw_opening_m=state.jaw_opening_m,
+            jaw_reported_m=self._reported(index, state.jaw_opening_m),
+            corner_ids=self.gripper.corner_ids,
+            corner_uv_px=uv,
+            hidden=tuple(hidden),
+            finger_bend=state.bend,
+            events=self._scene.events(time_s),
+            exposure=disturbance.exposure(scenario.light, time_s),
+            defocus_px=disturbance.defocus_sigma_px(scenario.defocus, time_s),
+        )
+
+    def render(self, index: int) -> NDArray[np.uint8]:
+        """Image (height, width) of a frame."""
+        if self._painting is None:
+            scenario, nominal = self.scenario, self.nominal_cam_T_grip
+            renderer = Renderer(self.camera, self._bodies, self._scene, scenario, nominal, self.seed)
+            self._painting = renderer, SensorModel(renderer.rays, scenario, self.seed)
+        renderer, sensor = self._painting
+        time_s = self.time_s(index)
+        return sensor.expose(renderer.render(time_s), index, time_s)
+
+    def frame(self, index: int) -> Frame:
+        """A frame as a camera would hand it over, with the jaw opening that the robot reports."""
+        opening_m = disturbance.jaw_opening_m(self.scenario.jaw, self.gripper.jaw_nominal_m, self.time_s(index))
+        return Frame(
+            seq=index,
+            stamp_ns=self._stamp_ns(index),
+            image=self.render(index),
+            jaw_opening_m=self._reported(index, opening_m),
+            name=self.scenario.name,
+        )
+
+    def _stamp_ns(self, index: int) -> int:
+        return self.scenario.start_ns + round(index * 1e9 / self.scenario.fps)
+
+    def _reported(self, index: int, opening_m: float) -> float | None:
+        """What the robot says: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
+        jaw = self.scenario.jaw
+        if not jaw.reported or not self.gripper.has_jaw:
+            return None
+        noise_m = float(np.random.default_rng([self.seed, 6, index]).normal(0.0, jaw.reported_noise_m))
+        reported_m = opening_m + jaw.reported_offset_m + noise_m
+        return min(max(reported_m, self.gripper.jaw_min_m), self.gripper.jaw_max_m)
+
+    def _inside(self, uv_px: Array) -> NDArray[np.bool_]:
+        with np.errstate(invalid="ignore"):
+            low = (uv_px >= -0.5).all(axis=1)
+            return low & (uv_px[:, 0] < self.camera.width_px - 0.5) & (uv_px[:, 1] < self.camera.height_px - 0.5)

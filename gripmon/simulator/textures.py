@@ -1,0 +1,245 @@
+"""Surfaces of the simulated world, drawn once from a seed: brushed metal, print, skin, and tables full of clutter.
+
+Textures of solids are float32 factors with mean near 1; tables are uint8 grey values that tile without a seam.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.simulator.scenario import Background
+
+Factor = NDArray[np.float32]
+Grey = NDArray[np.uint8]
+Rng = np.random.Generator
+
+
+def even(height_px: int, width_px: int) -> Factor:
+    """A surface without any texture."""
+    return np.ones((height_px, width_px), np.float32)
+
+
+def metal(rng: Rng, height_px: int, width_px: int, px_per_m: float, strength: float) -> Factor:
+    """Metal brushed along the rows, with clouds, grain and a few scratches; ``strength`` is about their contrast."""
+    if strength == 0.0:
+        return even(height_px, width_px)
+    mm = px_per_m * 1e-3
+    brushed = _noise(rng, height_px, width_px, 4.0 * mm, 0.5)
+    clouds = _noise(rng, height_px, width_px, 3.0 * mm, 2.0 * mm)
+    grain = _noise(rng, height_px, width_px, 0.7, 0.7)
+    out = 1.0 + strength * (0.45 * brushed + 0.35 * clouds + 0.2 * grain)
+    for _ in range(int(rng.poisson(height_px * width_px / mm**2 / 60.0))):
+        start = rng.uniform((0, 0), (width_px, height_px))
+        turn = rng.uniform(0.0, 2.0 * math.pi)
+        end = start + rng.uniform(1.0, 6.0) * mm * np.array([math.cos(turn), math.sin(turn)])
+        line = np.zeros_like(out)
+        cv2.line(line, _fixed(start), _fixed(end), 1.0, 1, cv2.LINE_8, 4)
+        out += strength * float(rng.choice([-1.2, 1.0, 1.8])) * cv2.GaussianBlur(line, (0, 0), 0.6)
+    fall_off = np.linspace(0.5, -0.5, width_px, dtype=np.float32)
+    return np.maximum(out + 0.8 * strength * fall_off, 0.2).astype(np.float32)
+
+
+def printed(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
+    """Cardboard with print: frames, bars, lines of text-like blobs, speckles."""
+    grey = np.full((height_px, width_px), 205, np.uint8)
+    mm = max(px_per_m * 1e-3, 0.5)
+    for _ in range(3 + int(height_px * width_px / (mm * 14.0) ** 2)):
+        x, y = rng.integers(0, width_px), rng.integers(0, height_px)
+        _print_block(rng, grey, int(x), int(y), mm)
+    speckle = _noise(rng, height_px, width_px, 0.8, 0.8)
+    out = cv2.GaussianBlur(grey.astype(np.float32) / 180.0, (0, 0), 0.6) + 0.05 * speckle
+    return out.astype(np.float32)
+
+
+def skin(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
+    """Soft blotches, creases across the fingers, shading towards the borders."""
+    mm = px_per_m * 1e-3
+    blotches = _noise(rng, height_px, width_px, 4.0 * mm, 4.0 * mm)
+    out = 1.0 + 0.06 * blotches + 0.03 * _noise(rng, height_px, width_px, 0.3 * mm, 1.0)
+    across = np.abs(np.linspace(-1.0, 1.0, height_px, dtype=np.float32))[:, None]
+    for _ in range(14):
+        x = int(rng.integers(0, width_px))
+        y = int(rng.integers(0, height_px))
+        crease = np.zeros_like(out)
+        axes = (max(int(0.3 * mm), 1), max(int(4 * mm), 2))
+        cv2.ellipse(crease, (x, y), axes, float(rng.uniform(-25, 25)), 0, 360, 1.0, -1)
+        out -= 0.25 * cv2.GaussianBlur(crease, (0, 0), 0.5 * mm)
+    return np.maximum(out - 0.12 * across, 0.2).astype(np.float32)
+
+
+def table(rng: Rng, settings: Background, size_px: int, px_per_m: float) -> Grey:
+    """A tile (size_px, size_px) of the table's pattern with its cables; repeats without a seam."""
+    painters: dict[str, Callable[[Rng, int, float], NDArray[np.float32]]] = {
+        "plain": lambda r, n, s: 0.15 * _tile_noise(r, n, 20e-3 * s),
+        "chequer": _chequer,
+        "printed": _papers,
+        "stripes": _stripes,
+        "speckle": lambda r, n, s: _threshold(r, n, 0.9e-3 * s),
+        "blobs": _blobs,
+    }
+    pattern = painters[settings.kind](rng, size_px, px_per_m)
+    pattern = pattern + 0.06 * _tile_noise(rng, size_px, 0.8) + 0.08 * _tile_noise(rng, size_px, 12e-3 * px_per_m)
+    grey = settings.level_dn * (1.0 + settings.contrast * pattern)
+    out = np.clip(grey, 0.0, 255.0).astype(np.uint8)
+    for _ in range(settings.cables):
+        _cable(rng, out, px_per_m)
+    return out
+
+
+def _noise(rng: Rng, height_px: int, width_px: int, sigma_x_px: float, sigma_y_px: float) -> Factor:
+    """Smoothed Gaussian noise of variance 1."""
+    white = rng.standard_normal((height_px, width_px), np.float32)
+    smooth = cv2.GaussianBlur(white, (0, 0), max(sigma_x_px, 0.3), sigmaY=max(sigma_y_px, 0.3))
+    return (smooth - smooth.mean()) / max(float(smooth.std()), 1e-6)
+
+
+def _tile_noise(rng: Rng, size_px: int, sigma_px: float) -> Factor:
+    """As ``_noise`` but without a seam; coarse noise is made small and enlarged."""
+    shrink = max(int(sigma_px / 3.0), 1)
+    small = size_px // shrink
+    white = rng.standard_normal((small, small), np.float32)
+    pad = min(4 * math.ceil(sigma_px / shrink) + 2, small)
+    smooth = cv2.GaussianBlur(np.pad(white, pad, mode="wrap"), (0, 0), max(sigma_px / shrink, 0.3))
+    smooth = (smooth - smooth.mean()) / smooth.std()
+    if shrink == 1:
+        return smooth[pad:-pad, pad:-pad]
+    crop = smooth[pad - 2 : small + pad + 2, pad - 2 : small + pad + 2]
+    large = cv2.resize(crop, None, fx=size_px / small, fy=size_px / small, interpolation=cv2.INTER_CUBIC)
+    edge = (large.shape[0] - size_px) // 2
+    return large[edge : edge + size_px, edge : edge + size_px]
+
+
+def _chequer(rng: Rng, size_px: int, px_per_m: float) -> Factor:
+    squares = max(2 * round(size_px / px_per_m / (2.0 * 0.035)), 2)
+    index = (np.arange(size_px) * squares) // size_px
+    board = (index[:, None] + index[None, :]) % 2
+    wear = _tile_noise(rng, size_px, 8e-3 * px_per_m)
+    return cv2.GaussianBlur((board * 1.3 - 0.65).astype(np.float32), (0, 0), 0.6) + 0.1 * wear
+
+
+def _stripes(rng: Rng, size_px: int, px_per_m: float) -> Factor:
+    row = np.zeros(size_px, np.float32)
+    x = 0
+    while x < size_px:
+        width = int(rng.uniform(2e-3, 18e-3) * px_per_m) + 1
+        row[x : x + width] = rng.uniform(-0.9, 0.9)
+        x += width
+    shift = ((np.arange(size_px) * int(rng.integers(1, 3))) % size_px)[:, None]
+    return cv2.GaussianBlur(row[(np.arange(size_px)[None, :] + shift) % size_px], (0, 0), 0.6)
+
+
+def _threshold(rng: Rng, size_px: int, sigma_px: float) -> Factor:
+    fine = _tile_noise(rng, size_px, sigma_px)
+    coarse = _tile_noise(rng, size_px, 14.0 * sigma_px)
+    value = fine + 0.9 * coarse
+    return (0.55 * np.tanh(4.0 * (value - 0.6)) + 0.3 * np.tanh(4.0 * (value + 0.9))).astype(np.float32)
+
+
+def _blobs(rng: Rng, size_px: int, px_per_m: float) -> Factor:
+    """Scattered offcuts and washers: discs, rings and rectangles in all greys."""
+    canvas = np.full((size_px, size_px), 128, np.uint8)
+    mm = px_per_m * 1e-3
+    for _ in range(int(0.9 * (size_px / (11.0 * mm)) ** 2)):
+        centre = rng.uniform(0, size_px, 2)
+        grey = int(rng.integers(10, 246))
+        radius = float(rng.uniform(2.0, 8.0)) * mm
+        if rng.random() < 0.45:
+            thickness = -1 if rng.random() < 0.7 else max(int(0.35 * radius), 1)
+            _everywhere(canvas, centre, radius, lambda img, c, r=radius, g=grey, w=thickness: _disc(img, c, r, g, w))
+        else:
+            corners = _rectangle(rng, radius)
+            reach = float(np.abs(corners).max())
+            _everywhere(canvas, centre, reach, lambda img, c, k=corners, g=grey: _fill(img, c + k, g))
+    return (canvas.astype(np.float32) - 128.0) / 128.0
+
+
+def _papers(rng: Rng, size_px: int, px_per_m: float) -> Factor:
+    """Printed sheets and labels that lie on each other."""
+    canvas = np.full((size_px, size_px), 95, np.uint8)
+    mm = px_per_m * 1e-3
+    for _ in range(int(1.4 * (size_px / (55.0 * mm)) ** 2)):
+        w, h = (rng.uniform(30.0, 80.0, 2) * mm).astype(int)
+        sheet = (printed(rng, int(h), int(w), px_per_m) * 160.0 * rng.uniform(0.75, 1.1)).clip(0, 255).astype(np.uint8)
+        turn = rng.uniform(0.0, 360.0)
+        centre = rng.uniform(0, size_px, 2)
+        reach = 0.5 * math.hypot(w, h)
+        _everywhere(canvas, centre, reach, lambda img, c, s=sheet, a=turn: _paste(img, s, c, a))
+    return (canvas.astype(np.float32) - 128.0) / 128.0
+
+
+def _everywhere(canvas: Grey, centre: NDArray[np.float64], reach: float, draw: Callable[..., None]) -> None:
+    """Draw at a centre and at its images beyond the seams."""
+    size = canvas.shape[0]
+    for dx in (-size, 0, size):
+        for dy in (-size, 0, size):
+            moved = centre + np.array([dx, dy])
+            if (moved > -reach - 2).all() and (moved < size + reach + 2).all():
+                draw(canvas, moved)
+
+
+def _disc(image: Grey, centre: NDArray[np.float64], radius: float, grey: int, thickness: int) -> None:
+    cv2.circle(image, _fixed(centre), round(radius * 16), grey, thickness, cv2.LINE_AA, 4)
+
+
+def _fill(image: Grey, corners: NDArray[np.float64], grey: int) -> None:
+    cv2.fillPoly(image, [np.round(corners * 16).astype(np.int32)], grey, cv2.LINE_AA, 4)
+
+
+def _rectangle(rng: Rng, size: float) -> NDArray[np.float64]:
+    half = np.array([size, size * rng.uniform(0.3, 1.6)])
+    turn = rng.uniform(0.0, math.pi)
+    c, s = math.cos(turn), math.sin(turn)
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half @ np.array([[c, s], [-s, c]])
+
+
+def _paste(image: Grey, sheet: Grey, centre: NDArray[np.float64], turn_deg: float) -> None:
+    height, width = sheet.shape
+    matrix = cv2.getRotationMatrix2D((0.5 * width, 0.5 * height), turn_deg, 1.0)
+    matrix[:, 2] += centre - (0.5 * width, 0.5 * height)
+    mask = cv2.warpAffine(np.full_like(sheet, 255), matrix, image.shape[::-1], flags=cv2.INTER_LINEAR)
+    warped = cv2.warpAffine(sheet, matrix, image.shape[::-1], flags=cv2.INTER_LINEAR)
+    np.copyto(image, warped, where=mask > 127)
+
+
+def _cable(rng: Rng, image: Grey, px_per_m: float) -> None:
+    """A cable or bar: a bright and a dark line on a smooth path, the path closed over the seam along one axis."""
+    size = image.shape[0]
+    width = rng.uniform(2.0, 7.0) * 1e-3 * px_per_m
+    along = np.linspace(0.0, size, 65)
+    wave = rng.uniform(0.0, 0.05) * size * np.sin(2.0 * np.pi * (int(rng.integers(1, 4)) * along / size + rng.random()))
+    path = np.stack([along, rng.uniform(0.1, 0.9) * size + wave], axis=1)
+    if rng.random() < 0.5:
+        path = path[:, ::-1]
+    level = float(rng.uniform(20.0, 200.0))
+    layers = ((1.0, 0.35 * level, 0.0), (0.82, level, 0.0), (0.35, min(1.5 * level + 20.0, 255.0), -0.18))
+    for share, grey, shift in layers:
+        points = np.round((path + shift * width) * 16).astype(np.int32)
+        cv2.polylines(image, [points], False, round(grey), max(round(share * width), 1), cv2.LINE_AA, 4)
+
+
+def _print_block(rng: Rng, grey: Grey, x: int, y: int, mm: float) -> None:
+    """One piece of print at (x, y): text-like rows, a bar code, or a frame."""
+    ink = int(rng.integers(10, 90))
+    kind = int(rng.integers(0, 4))
+    if kind == 0:
+        for k in range(12):
+            width = max(int(rng.uniform(0.3, 1.2) * mm), 1)
+            left = x + int(k * 1.4 * mm)
+            cv2.rectangle(grey, (left, y), (left + width, y + int(9 * mm)), ink, -1)
+    elif kind == 1:
+        end = x + int(rng.uniform(6, 22) * mm), y + int(rng.uniform(4, 14) * mm)
+        cv2.rectangle(grey, (x, y), end, ink, max(int(0.6 * mm), 1))
+    else:
+        text = "".join(rng.choice(list("ABEHKLMNRSTUXZ0123456789"), int(rng.integers(3, 9))).tolist())
+        size, width = float(rng.uniform(0.12, 0.3)) * mm, max(int(0.7 * mm), 1)
+        cv2.putText(grey, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, ink, width, cv2.LINE_AA)
+
+
+def _fixed(point: NDArray[np.float64]) -> tuple[int, int]:
+    """A point in 1/16 px, for drawing functions with ``shift=4``."""
+    return round(float(point[0]) * 16), round(float(point[1]) * 16)
