@@ -1,0 +1,13 @@
+"""The black box: everything that was seen and decided, as ``.rrd`` files that tell their story when opened.
+
+The loop's thread only appends to a bounded queue (:meth:`Recorder.offer`).  A thread of the daemon hands the queue over
+to a process of its own, which encodes the images, logs to rerun and looks after the files; so neither JPEG, rerun nor a
+slow disk ever hold the interpreter that the loop runs in.  The daemon itself never imports rerun.
+"""
+
+from __future__ import annotations
+
+from gripmon.recording.feed import NullRecorder, ProcessRecorder, Recorder, open_recorder
+from gripmon.recording.settings import RecordingSettings
+
+__all__ = ["NullRecorder", "ProcessRecorder", "Recorder", "RecordingSettings", "open_recorder"]

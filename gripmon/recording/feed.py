@@ -1,0 +1,319 @@
+"""The daemon's side: take frames without blocking, hand them over to the recording process."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import msgspec
+
+from gripmon.camera import Camera
+from gripmon.gripper import Gripper
+from gripmon.recording.process import WorkerProcess
+from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.wire import Batch, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
+from gripmon.records import AlertRecord, Frame, FrameRecord, Image, MeasurementTrace, ReferenceRecord, State, Verdict
+
+_log = logging.getLogger(__name__)
+
+HANDOVER_PERIOD_S = 0.05
+BATCH_FRAMES = 16
+LONGEST_RESTART_PAUSE_S = 30.0
+_EVENTS_KEPT = 256
+
+Vector = tuple[float, float, float]
+_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, Vector | None]
+_T = TypeVar("_T")
+
+
+class Recorder(Protocol):
+    """Takes frames without ever blocking; what it could not take is counted.
+
+    ``dropped`` are frames that are not in the recording, ``failure`` says why nothing is being written, None when all
+    is well.
+    """
+
+    @property
+    def dropped(self) -> int: ...
+    @property
+    def failure(self) -> str | None: ...
+
+    def offer(
+        self,
+        frame: Frame,
+        record: FrameRecord,
+        trace: MeasurementTrace | None,
+        truth_tcp_shift_m: Vector | None = None,
+    ) -> None: ...
+    def alert(self, alert: AlertRecord) -> None: ...
+    def reference(self, reference: ReferenceRecord) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> None: ...
+
+
+class NullRecorder:
+    """Records nothing."""
+
+    dropped = 0
+    failure: str | None = None
+
+    def offer(
+        self,
+        frame: Frame,
+        record: FrameRecord,
+        trace: MeasurementTrace | None,
+        truth_tcp_shift_m: Vector | None = None,
+    ) -> None:
+        pass
+
+    def alert(self, alert: AlertRecord) -> None:
+        pass
+
+    def reference(self, reference: ReferenceRecord) -> None:
+        pass
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        pass
+
+
+def open_recorder(
+    settings: RecordingSettings,
+    *,
+    robot: str,
+    camera_name: str,
+    camera: Camera,
+    gripper: Gripper,
+    reference: ReferenceRecord,
+    directory: Path | None = None,
+    name: str | None = None,
+) -> Recorder:
+    """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
+
+    ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  Raises OSError
+    when the directory can't be made.
+    """
+    if not settings.enabled:
+        return NullRecorder()
+    folder = Path(settings.directory) if directory is None else directory
+    folder.mkdir(parents=True, exist_ok=True)
+    if name is None:
+        name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
+    scene = make_scene(settings, str(folder.resolve()), name, robot, camera_name, camera, gripper, reference)
+    return ProcessRecorder(scene)
+
+
+class ProcessRecorder:
+    """Records through a process of its own.
+
+    ``offer`` costs the same for every image size: it keeps a reference to the frame's array (which nobody changes after
+    hand-over) and leaves copying to a thread that wakes every 50 ms.  That thread moves images into shared memory and
+    everything else, a batch at a time, into a pipe.  When the recording process can't follow, first images and then
+    frames are dropped and counted.  When it dies, it is started again and begins a new file.
+    """
+
+    def __init__(self, scene: Scene):
+        settings = scene.settings
+        self._scene = scene
+        self._queue_frames = settings.queue_frames
+        self._queue_images = settings.queue_images
+        self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
+        # Written by the loop's thread only.
+        self._not_queued = 0
+        self._images_offered = 0
+        self._images_not_queued = 0
+        self._image_stamp_ns: int | None = None
+        self._shown: tuple[State, Verdict, str, int] | None = None
+        # Appended to by the loop's thread, emptied by the hand-over thread.
+        self._frames: deque[_Waiting] = deque()
+        self._alerts: deque[AlertRecord] = deque(maxlen=_EVENTS_KEPT)
+        self._references: deque[ReferenceRecord] = deque(maxlen=_EVENTS_KEPT)
+        # Written by the hand-over thread only.
+        self._images_taken = 0
+        self._images_without_slot = 0
+        self._lost_earlier = 0
+        self._written_earlier = 0
+        self._newest_reference = scene.reference
+        self._own_failure: str | None = None
+        self._restart_pause_s = 1.0
+        self._restart_at = 0.0
+        self._encode = msgspec.msgpack.Encoder().encode
+        self._ring = ImageRing.for_camera(scene.width_px, scene.height_px, settings.queue_images)
+        self._worker: WorkerProcess | None = WorkerProcess(scene, self._ring)
+        self._status = self._worker.status
+        self._closing = threading.Event()
+        self._close_before = 0.0
+        self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
+        self._thread.start()
+
+    @property
+    def dropped(self) -> int:
+        """Frames that are not in the recording: the queue was full, the process died, or nothing could be written."""
+        return self._not_queued + self._lost_earlier + self._status.frames_lost
+
+    @property
+    def images_dropped(self) -> int:
+        """Images that were due but had no room; their frames are recorded without image and overlay."""
+        return self._images_not_queued + self._images_without_slot
+
+    @property
+    def frames_written(self) -> int:
+        """Frames that are on disk."""
+        return self._written_earlier + self._status.frames
+
+    @property
+    def failure(self) -> str | None:
+        return self._own_failure or self._status.failure
+
+    @property
+    def path(self) -> Path | None:
+        """The file that is being written, None before the first and while recording fails."""
+        return None if self._status.path is None else Path(self._status.path)
+
+    @property
+    def process_id(self) -> int | None:
+        worker = self._worker
+        return None if worker is None else worker.pid
+
+    def offer(
+        self,
+        frame: Frame,
+        record: FrameRecord,
+        trace: MeasurementTrace | None,
+        truth_tcp_shift_m: Vector | None = None,
+    ) -> None:
+        """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
+        if len(self._frames) >= self._queue_frames:
+            self._not_queued += 1
+            return
+        shown = (record.state, record.verdict, record.reference_id, record.revision)
+        due = self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
+        self._shown = shown
+        if due and self._images_offered - self._images_taken < self._queue_images:
+            self._images_offered += 1
+            self._image_stamp_ns = record.stamp_ns
+            self._frames.append((record, True, frame.image, trace, truth_tcp_shift_m))
+        else:
+            self._images_not_queued += bool(due)
+            self._frames.append((record, False, None, None, truth_tcp_shift_m))
+
+    def alert(self, alert: AlertRecord) -> None:
+        """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
+        self._alerts.append(alert)
+
+    def reference(self, reference: ReferenceRecord) -> None:
+        """Record a new reference; the first one was given at the start."""
+        self._references.append(reference)
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
+        if self._closing.is_set():
+            return
+        self._close_before = time.monotonic() + timeout_s
+        self._closing.set()
+        self._thread.join()
+
+    def _image_is_due(self, stamp_ns: int) -> bool:
+        if self._image_interval_ns is None:
+            return False
+        # A capture time that jumps backwards starts a new count.
+        return self._image_stamp_ns is None or not 0 <= stamp_ns - self._image_stamp_ns < self._image_interval_ns
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.wait(HANDOVER_PERIOD_S):
+                self._hand_over()
+            self._finish()
+        except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
+            _log.exception("recording stopped")
+            self._own_failure = f"internal error: {error!r}"
+            if self._worker is not None:
+                self._worker.reap(1.0)
+
+    def _hand_over(self) -> None:
+        worker = self._running_worker()
+        if worker is None:
+            return
+        worker.pump()
+        worker.read_reports()
+        self._status = worker.status
+        while worker.ready and (self._frames or self._alerts or self._references):
+            worker.send(self._encode(self._next_batch(worker)))
+        if worker.gone:
+            self._bury(worker, worker.reap(0.0) or "the recording process ended by itself")
+
+    def _running_worker(self) -> WorkerProcess | None:
+        if self._worker is None and time.monotonic() >= self._restart_at:
+            scene = msgspec.structs.replace(self._scene, reference=self._newest_reference)
+            self._worker = WorkerProcess(scene, self._ring)
+        elif self._worker is not None and self._own_failure is not None and self._worker.status.frames > 0:
+            self._own_failure = None
+            self._restart_pause_s = 1.0
+            _log.warning("recording goes on: %s", self._worker.status.path)
+        return self._worker
+
+    def _bury(self, worker: WorkerProcess, failure: str) -> None:
+        """Count what a dead process took with it and plan the next one."""
+        self._lost_earlier += worker.frames_sent - worker.status.frames
+        self._written_earlier += worker.status.frames
+        self._status = msgspec.structs.replace(worker.status, path=None, failure=None, frames=0, frames_lost=0)
+        self._own_failure = failure
+        self._worker = None
+        self._restart_at = time.monotonic() + self._restart_pause_s
+        _log.error("recording failed: %s; next try in %.0f s", failure, self._restart_pause_s)
+        self._restart_pause_s = min(2.0 * self._restart_pause_s, LONGEST_RESTART_PAUSE_S)
+
+    def _next_batch(self, worker: WorkerProcess) -> Batch:
+        frames: list[FrameNote] = []
+        while self._frames and len(frames) < BATCH_FRAMES:
+            record, shown, image, trace, truth_tcp_shift_m = self._frames.popleft()
+            self._images_taken += shown
+            note = None if image is None else self._share(worker, image)
+            packed = None if trace is None else pack_trace(trace)
+            frames.append(FrameNote(record, note, packed, truth_tcp_shift_m))
+        worker.frames_sent += len(frames)
+        references = _drain(self._references)
+        if references:
+            self._newest_reference = references[-1]
+        return Batch(frames, _drain(self._alerts), references)
+
+    def _share(self, worker: WorkerProcess, image: Image) -> ImageNote | None:
+        if not self._ring.takes(image):
+            return None  # a refused frame: its record says why
+        if worker.images_sent - worker.status.images_done >= self._ring.slots:
+            worker.read_reports()
+        if worker.images_sent - worker.status.images_done >= self._ring.slots:
+            self._images_without_slot += 1
+            return None
+        note = self._ring.put(worker.images_sent % self._ring.slots, image)
+        worker.images_sent += 1
+        return note
+
+    def _finish(self) -> None:
+        self._hand_over()
+        worker = self._worker
+        while worker is not None and self._frames and not worker.gone and time.monotonic() < self._close_before:
+            time.sleep(0.002)
+            self._hand_over()
+            worker = self._worker
+        if worker is not None:
+            failure = worker.finish(self._close_before)
+            self._status = worker.status
+            self._lost_earlier += worker.frames_sent - worker.status.frames - worker.status.frames_lost
+            self._own_failure = failure
+            if failure is not None:
+                _log.error("recording incomplete: %s", failure)
+        self._lost_earlier += len(self._frames)
+        self._frames.clear()
+        self._worker = None
+        self._ring.close()
+
+
+def _drain(waiting: deque[_T]) -> list[_T]:
+    out: list[_T] = []
+    while waiting:
+        out.append(waiting.popleft())
+    return out

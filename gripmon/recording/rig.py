@@ -1,0 +1,155 @@
+"""Camera, gripper and reference in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import rerun as rr
+
+from gripmon.recording import palette
+from gripmon.recording.wire import Scene
+from gripmon.records import Array, FrameRecord, ReferenceRecord, Verdict
+
+if TYPE_CHECKING:
+    from gripmon.recording.rows import Row, Sender
+
+_IMAGE_PLANE_SHARE = 1.35  # of the distance to the TCP: the image is a backdrop for the fingers
+_AXIS_M = 0.012
+_LINE_M = 0.0004
+_SMALLEST_JAW_STEP_M = 2e-5
+
+
+class RigWriter:
+    """The fingers as solids at the newest estimate, the reference as a wire frame, the TCP's shift as an arrow."""
+
+    def __init__(self, send: Sender, scene: Scene):
+        self._send = send
+        self._openings_m = np.array(scene.jaw_openings_m)
+        self._points_m = np.array(scene.points_m, dtype=float)
+        self._nominal_m = scene.jaw_nominal_m
+        self._edges = np.array(scene.edges, dtype=np.intp).reshape(-1, 2)
+        self._triangles, self._face_points = _triangulate(scene.faces)
+        self._drawn: tuple[float, Verdict] | None = None
+        self._reference_tcp_m: Array | None = None
+        distance_m = float(np.linalg.norm(scene.reference.cam_T_grip.translation_m))
+        send.static("rig", rr.ViewCoordinates.RDF)
+        send.static(
+            "rig/camera",
+            rr.Pinhole(
+                resolution=[scene.width_px, scene.height_px],
+                focal_length=scene.focal_px,
+                principal_point=scene.centre_px,
+                image_plane_distance=_IMAGE_PLANE_SHARE * distance_m,
+                camera_xyz=rr.ViewCoordinates.RDF,
+                color=palette.IDLE,
+                line_width=0.3 * _LINE_M,
+            ),
+            rr.TransformAxes3D(_AXIS_M),
+        )
+        send.static("rig/gripper", rr.TransformAxes3D(_AXIS_M))
+        if len(self._triangles):
+            send.static("rig/gripper/faces", _static_mesh(self._triangles))
+
+    def write(self, rows: Sequence[Row]) -> None:
+        posed = [row for row in rows if row.record.cam_T_grip is not None]
+        if posed:
+            transforms = [row.record.cam_T_grip for row in posed if row.record.cam_T_grip is not None]
+            columns = rr.Transform3D.columns(
+                translation=[t.translation_m for t in transforms], quaternion=[t.rotation_xyzw for t in transforms]
+            )
+            self._send.frames("rig/gripper", posed, columns)
+        for row in rows:
+            self._write_fingers(row)
+        pictured = [row for row in rows if row.picture is not None or row.record.reason is not None]
+        if pictured:
+            self._write_shift(pictured)
+
+    def write_references(self, references: Sequence[ReferenceRecord], rows: Sequence[Row]) -> None:
+        """Where the gripper was calibrated to be, from the frame that is being written on."""
+        for reference in references:
+            stamp_ns, seq = (rows[0].record.stamp_ns, rows[0].record.seq) if rows else (reference.stamp_ns, 0)
+            columns = rr.Transform3D.columns(
+                translation=[reference.cam_T_grip.translation_m], quaternion=[reference.cam_T_grip.rotation_xyzw]
+            )
+            self._send.columns("rig/reference", [stamp_ns], [seq], columns)
+            self._reference_tcp_m = np.array(reference.cam_T_grip.translation_m)
+
+    def _write_fingers(self, row: Row) -> None:
+        """Redraw the fingers when the jaws moved or the verdict changed; without estimate there is nothing to show."""
+        record = row.record
+        opening_m = self._nominal_m if record.jaw_opening_m is None else record.jaw_opening_m
+        verdict = record.verdict if record.cam_T_grip is not None else Verdict.UNKNOWN
+        if self._drawn is not None:
+            same_opening = abs(opening_m - self._drawn[0]) < _SMALLEST_JAW_STEP_M
+            if same_opening and verdict == self._drawn[1]:
+                return
+        self._drawn = (opening_m, verdict)
+        points_m = self._points_at(opening_m)
+        strips = points_m[self._edges] if record.cam_T_grip is not None else np.empty((0, 2, 3))
+        colours = [palette.VERDICTS[verdict]] * len(strips)
+        at = [record.stamp_ns], [record.seq]
+        edges = rr.LineStrips3D.columns(strips=list(strips), colors=colours, radii=[_LINE_M] * len(strips))
+        self._send.columns("rig/gripper/edges", *at, edges.partition([len(strips)]))
+        ghost = points_m[self._edges]
+        wires = rr.LineStrips3D.columns(
+            strips=list(ghost), colors=[palette.REFERENCE] * len(ghost), radii=[0.7 * _LINE_M] * len(ghost)
+        )
+        self._send.columns("rig/reference/edges", *at, wires.partition([len(ghost)]))
+        if len(self._triangles):
+            vertices = points_m[self._face_points] if record.cam_T_grip is not None else np.empty((0, 3))
+            normals = _face_normals(vertices, self._triangles) if len(vertices) else vertices
+            mesh = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals)
+            self._send.columns("rig/gripper/faces", *at, mesh.partition([len(vertices)]))
+
+    def _write_shift(self, rows: Sequence[Row]) -> None:
+        """An arrow from the reference's TCP to the estimated one, true to scale."""
+        arrows = [_arrow(row.record) for row in rows]
+        known = [arrow for arrow in arrows if arrow is not None]
+        columns = rr.Arrows3D.columns(
+            origins=[origin for origin, _ in known],
+            vectors=[vector for _, vector in known],
+            colors=[palette.SHIFT] * len(known),
+            radii=[_LINE_M] * len(known),
+        )
+        self._send.frames("rig/tcp_shift", rows, columns.partition([int(arrow is not None) for arrow in arrows]))
+
+    def _points_at(self, opening_m: float) -> Array:
+        """(p, 3) in the gripper frame; a picture, so an opening outside the jaw's range shows the end of it."""
+        if len(self._openings_m) == 1:
+            return self._points_m[0]
+        position = float(np.interp(opening_m, self._openings_m, np.arange(len(self._openings_m))))
+        low = min(int(position), len(self._openings_m) - 2)
+        share = position - low
+        return (1.0 - share) * self._points_m[low] + share * self._points_m[low + 1]
+
+
+def _arrow(record: FrameRecord) -> tuple[Array, Array] | None:
+    if record.cam_T_grip is None or record.drift is None:
+        return None
+    shift_m = np.array(record.drift.tcp_shift_m)
+    return np.array(record.cam_T_grip.translation_m) - shift_m, shift_m
+
+
+def _triangulate(faces: Sequence[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (t, 3) into a vertex list that repeats the points for each face, and that list's points (v,)."""
+    triangles: list[tuple[int, int, int]] = []
+    points: list[int] = []
+    for face in faces:
+        first = len(points)
+        points += face
+        triangles += [(first, first + i, first + i + 1) for i in range(1, len(face) - 1)]
+    return np.array(triangles, np.uint32).reshape(-1, 3), np.array(points, np.intp)
+
+
+def _face_normals(vertices: Array, triangles: np.ndarray) -> Array:
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    out = np.zeros_like(vertices)
+    out[triangles.ravel()] = np.repeat(normals / np.linalg.norm(normals, axis=1, keepdims=True), 3, axis=0)
+    return out
+
+
+def _static_mesh(triangles: np.ndarray) -> rr.Mesh3D:
+    return rr.Mesh3D.from_fields(triangle_indices=triangles, albedo_factor=palette.GRIPPER_FACE)

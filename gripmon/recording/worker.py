@@ -1,0 +1,134 @@
+"""The recording process: reads batches from the daemon, encodes images, writes files; ends when its input does."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import time
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.recording.files import FileSeries
+from gripmon.recording.rows import Picture, Row
+from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
+
+_NICENESS = 10  # the loop goes first when both want the same core
+_STDIN = 0
+
+
+def main(status_descriptor: int, memory_descriptor: int) -> None:
+    """Entry of the process; standard input carries the messages."""
+    # The end of the input is the one sign to end: a Ctrl-C is meant for the daemon, which then closes its end.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)
+    os.nice(_NICENESS)
+    cv2.setNumThreads(1)
+    RecordingLoop(status_descriptor, memory_descriptor).run()
+
+
+class RecordingLoop:
+    def __init__(self, status_descriptor: int, memory_descriptor: int):
+        self._status_descriptor = status_descriptor
+        self._memory_descriptor = memory_descriptor
+        self._unframer = Unframer()
+        self._scene: Scene | None = None
+        self._files: FileSeries
+        self._ring: ImageRing
+        self._decode = msgspec.msgpack.Decoder(Batch).decode
+        self._encode = msgspec.json.Encoder().encode
+        self._images_done = 0
+        self._flush_period_s = 0.1
+        self._parent_listens = True
+
+    def run(self) -> None:
+        next_flush = time.monotonic() + self._flush_period_s
+        ended = False
+        while not ended:
+            readable, _, _ = select.select((_STDIN,), (), (), max(next_flush - time.monotonic(), 0.0))
+            if readable:
+                part = os.read(_STDIN, 1 << 20)
+                ended = not part
+                for payload in self._unframer.feed(part):
+                    self._take(payload)
+            if self._scene is not None and (ended or time.monotonic() >= next_flush):
+                self._files.write()
+                self._report()
+                next_flush = time.monotonic() + self._flush_period_s
+        if self._scene is not None:
+            self._files.close()
+            self._report()
+
+    def _take(self, payload: bytes) -> None:
+        if self._scene is None:
+            self._scene = scene = msgspec.msgpack.decode(payload, type=Scene)
+            self._flush_period_s = scene.settings.flush_period_s
+            self._ring = ImageRing.for_camera(
+                scene.width_px, scene.height_px, scene.settings.queue_images, self._memory_descriptor
+            )
+            self._files = FileSeries(scene)
+            return
+        batch = self._decode(payload)
+        self._files.add_references(batch.references)
+        self._files.add_alerts(batch.alerts)
+        self._files.add_frames([self._row(note) for note in batch.frames])
+        if any(note.image is not None for note in batch.frames):
+            self._report()
+
+    def _row(self, note: FrameNote) -> Row:
+        assert self._scene is not None
+        picture = None
+        if note.image is not None:
+            picture = encode_picture(self._ring.get(note.image), self._scene.settings)
+            self._images_done += 1
+        return Row(note.record, picture, note.trace, note.truth_tcp_shift_m)
+
+    def _report(self) -> None:
+        files = self._files
+        status = Status(
+            path=files.path,
+            failure=files.failure,
+            frames=files.frames_written,
+            frames_lost=files.frames_lost,
+            images_done=self._images_done,
+        )
+        if self._parent_listens:
+            try:
+                os.write(self._status_descriptor, self._encode(status) + b"\n")
+            except BrokenPipeError:
+                self._parent_listens = False
+
+
+def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> Picture:
+    """Compress an image and measure what tells of its quality (on 8-bit grey values)."""
+    shown = to_8_bit(image)
+    if settings.image_format == "png":
+        exact = image.astype(np.uint16, copy=False) if image.dtype == np.uint16 else shown
+        _, blob = cv2.imencode(".png", exact, (cv2.IMWRITE_PNG_COMPRESSION, 1))
+    else:
+        _, blob = cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
+    grey = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY)
+    mean, deviation = cv2.meanStdDev(grey)
+    laplacian = cv2.Laplacian(grey, cv2.CV_16S)
+    return Picture(
+        blob=blob.tobytes(),
+        media_type=f"image/{settings.image_format}",
+        mean_grey=float(mean[0, 0]),
+        contrast_grey=float(deviation[0, 0]),
+        saturated_percent=100.0 * float(np.count_nonzero(grey >= 254)) / grey.size,
+        sharpness=float(cv2.meanStdDev(laplacian)[1][0, 0]),
+    )
+
+
+def to_8_bit(image: NDArray[np.generic]) -> NDArray[np.uint8]:
+    """uint16 by its upper byte, float from 0..1; for looking only, so values beyond the range, NaN too, are clipped."""
+    if image.dtype == np.uint8:
+        return image.astype(np.uint8, copy=False)
+    if image.dtype == np.uint16:
+        return (image.astype(np.uint16, copy=False) >> 8).astype(np.uint8)
+    scaled = np.nan_to_num(image.astype(np.float32, copy=False) * np.float32(255.0), nan=0.0)
+    return np.clip(np.rint(scaled), 0.0, 255.0).astype(np.uint8)
