@@ -1,0 +1,158 @@
+"""For programs that use the corrected transform, such as servo controllers: a typed reader of one monitor.
+
+    with Client("arm1") as monitor:
+        record = monitor.latest()
+        if record is not None and record.verdict == "valid":
+            cam_T_grip = record.cam_T_grip
+
+Nothing here waits for the monitor to start: a client that comes first is connected when the monitor is there.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple, Self, TypeVar
+
+import msgspec
+import zenoh
+
+from gripmon.publish import DEFAULT_ENDPOINT, Keys, PublishSettings, zenoh_config
+from gripmon.records import FrameRecord, ReferenceRecord, StateRecord
+
+_T = TypeVar("_T")
+
+
+class MonitorName(NamedTuple):
+    """Whose messages: the second and third part of every key."""
+
+    robot: str
+    camera: str
+
+    def __str__(self) -> str:
+        return f"{self.robot}/{self.camera}"
+
+
+class Client:
+    """Reads one monitor's messages.  Not for several threads at once, except for :meth:`close`.
+
+    A slow reader never holds anybody up: the newest ``depth`` records wait for it, older ones are dropped.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        camera: str | None = None,
+        *,
+        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        zenoh_config_file: str | None = None,
+        depth: int = 16,
+    ) -> None:
+        """``camera`` may be left out while the robot has one; messages of a second one then raise LookupError.
+
+        ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
+        Raises ValueError for a name that can't be part of a key, and :class:`gripmon.publish.PublishError` for a bad
+        configuration.
+        """
+        self.keys = Keys(robot, camera if camera is not None else "*")
+        if zenoh_config_file is not None:
+            settings = PublishSettings(zenoh_config=zenoh_config_file)
+        else:
+            settings = PublishSettings(listen=(), connect=tuple(connect))
+        self._session = zenoh.open(zenoh_config(settings))
+        self._decode = msgspec.json.Decoder(FrameRecord).decode
+        self._depth = depth
+        self._heard: MonitorName | None = None
+        self._newest: FrameRecord | None = None
+        self._samples = self._subscribe()
+        self._threads: list[threading.Thread] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def latest(self) -> FrameRecord | None:
+        """The newest record, at once; the same one again while no newer one came; None before the first.
+
+        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises msgspec.DecodeError for a message that is no
+        record.
+        """
+        newest: zenoh.Sample | None = None
+        while (sample := self._samples.try_recv()) is not None:
+            newest = sample
+        if newest is not None:
+            self._newest = self._record(newest)
+        return self._newest
+
+    def __iter__(self) -> Iterator[FrameRecord]:
+        """Every record as it comes, waiting for the next; ends when the client is closed."""
+        return self._records(self._samples)
+
+    def on_transform(self, callback: Callable[[FrameRecord], None]) -> None:
+        """Call back with every record, in a thread of its own, until the client is closed.
+
+        An exception in the callback ends its thread and goes to ``threading.excepthook``.
+        """
+        samples = self._subscribe()
+
+        def pump() -> None:
+            for record in self._records(samples):
+                callback(record)
+
+        self._threads.append(threading.Thread(target=pump, name="gripmon-client", daemon=True))
+        self._threads[-1].start()
+
+    def state(self, timeout_s: float = 1.0) -> StateRecord | None:
+        """The monitor's last state message; None if no monitor answers in time."""
+        return self._get("state", StateRecord, timeout_s)
+
+    def reference(self, timeout_s: float = 1.0) -> ReferenceRecord | None:
+        """The calibration that drift is measured against now; None if no monitor answers in time."""
+        return self._get("reference", ReferenceRecord, timeout_s)
+
+    def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
+        """The monitors of this name that run now, in order; all on the network for ``Client("*")``."""
+        replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
+        return tuple(sorted({_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
+
+    def close(self) -> None:
+        """Leave the network; iterations and callbacks end."""
+        self._session.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
+
+    def _subscribe(self) -> zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]:
+        return self._session.declare_subscriber(self.keys["transform"], zenoh.handlers.RingChannel(self._depth))
+
+    def _records(self, samples: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]) -> Iterator[FrameRecord]:
+        for sample in samples:
+            yield self._record(sample)
+
+    def _record(self, sample: zenoh.Sample) -> FrameRecord:
+        self._check_name(sample.key_expr)
+        return self._decode(sample.payload.to_bytes())
+
+    def _get(self, leaf: str, record_type: type[_T], timeout_s: float) -> _T | None:
+        answer: _T | None = None
+        for reply in self._session.get(self.keys[leaf], timeout=timeout_s):
+            if reply.ok is not None:
+                self._check_name(reply.ok.key_expr)
+                answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=record_type)
+        return answer
+
+    def _check_name(self, key: zenoh.KeyExpr) -> None:
+        name = _name(key)
+        if self._heard is None:
+            self._heard = name
+        elif name != self._heard:
+            raise LookupError(
+                f"{self.keys['*']} is more than one monitor ({self._heard}, {name}): name the one to follow"
+            )
+
+
+def _name(key: zenoh.KeyExpr) -> MonitorName:
+    _, robot, camera, _ = str(key).split("/")
+    return MonitorName(robot, camera)

@@ -1,0 +1,131 @@
+"""The live monitor: newest frame in, transform out, everything supervised, a clean stop.
+
+:func:`run` is what ``gripmon run`` calls.  One thread does all of it; the source reads ahead, Zenoh sends and the
+recording writes in threads and processes of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, Daemon, JawFeed, MonitorLike, StopRequest
+from gripmon.daemon.settings import DaemonSettings
+from gripmon.publish import Publisher
+from gripmon.recording import Recorder
+from gripmon.sources import Source
+
+__all__ = [
+    "EXIT_DONE",
+    "EXIT_FAILED",
+    "EXIT_INTERRUPTED",
+    "Daemon",
+    "DaemonSettings",
+    "EstimatesFile",
+    "JawFeed",
+    "MonitorLike",
+    "StopRequest",
+    "log_to_stderr",
+    "run",
+]
+
+EXIT_INTERRUPTED = 130
+_UNHURRIED_S = 10.0  # for the recording, when nobody asked for a stop
+_SHORTEST_CLOSE_S = 0.5
+_SWITCH_INTERVAL_S = 0.0005
+
+
+def run(
+    monitor: MonitorLike,
+    source: Source,
+    publisher: Publisher,
+    recorder: Recorder,
+    settings: DaemonSettings,
+    *,
+    robot: str,
+    camera: str,
+    estimates: Path | None = None,
+    jaw: JawFeed | None = None,
+    duration_s: float | None = None,
+) -> int:
+    """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
+
+    In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
+    frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  The logger
+    ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
+
+    Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
+    or internal errors persisted; 130 SIGINT.
+    """
+    stop = StopRequest()
+    with _signals(stop), contextlib.ExitStack() as closing:
+        # Whatever happens, all of these run, the last one first; a second signal no longer disturbs them.
+        closing.callback(publisher.close)
+        closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
+        closing.callback(source.close)
+        lines = closing.enter_context(contextlib.closing(EstimatesFile(estimates)))
+        daemon = Daemon(
+            monitor, source, publisher, recorder, settings, stop, robot=robot, camera=camera, estimates=lines, jaw=jaw
+        )
+        with _steady_interpreter():
+            return daemon.run(duration_s)
+
+
+def log_to_stderr(*, verbose: bool = False) -> None:
+    """Let the ``gripmon`` loggers write lines for people on stderr; ``verbose`` adds tracebacks of survived errors."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger = logging.getLogger("gripmon")
+    logger.handlers = [handler]
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+    logger.propagate = False
+
+
+def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
+    if stop.requested_s is None:
+        return _UNHURRIED_S
+    return max(_SHORTEST_CLOSE_S, stop.requested_s + settings.stop_within_s - time.monotonic())
+
+
+@contextlib.contextmanager
+def _signals(stop: StopRequest) -> Iterator[None]:
+    """SIGINT and SIGTERM ask for a stop.  Python allows that in the main thread only; elsewhere they are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        stop.request(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_DONE)
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _steady_interpreter() -> Iterator[None]:
+    """No pauses that the loop doesn't choose: it collects garbage itself, and other threads give way sooner."""
+    interval_s, collected = sys.getswitchinterval(), gc.isenabled()
+    gc.collect()
+    gc.freeze()  # what start-up has built stays: no later collection walks through it
+    gc.disable()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval_s)
+        gc.unfreeze()
+        if collected:
+            gc.enable()

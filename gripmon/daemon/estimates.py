@@ -1,0 +1,57 @@
+"""One JSON line a frame, in a file."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from pathlib import Path
+from typing import IO
+
+from gripmon.records import FrameRecord, to_json
+
+_log = logging.getLogger(__name__)
+_BUFFER_BYTES = 1 << 16
+
+
+class EstimatesFile:
+    """Begins a new file, also where an old one was.  Without a path it takes records and writes none.
+
+    A disk that fails later must not stop the monitor: ``failure`` then says what is wrong, and writing ends.
+    """
+
+    def __init__(self, path: Path | None) -> None:
+        """Raises OSError if the file can't be opened."""
+        self.failure: str | None = None
+        self._path = path
+        self._file: IO[bytes] | None = None if path is None else path.open("wb", buffering=_BUFFER_BYTES)
+
+    def write(self, record: FrameRecord) -> None:
+        """Add a line; it is on disk after the next :meth:`flush`."""
+        if self._file is not None:
+            try:
+                self._file.write(to_json(record) + b"\n")
+            except OSError as error:
+                self._give_up(error)
+
+    def flush(self) -> None:
+        if self._file is not None:
+            try:
+                self._file.flush()
+            except OSError as error:
+                self._give_up(error)
+
+    def close(self) -> None:
+        if self._file is not None:
+            file, self._file = self._file, None
+            try:
+                file.close()
+            except OSError as error:
+                self._give_up(error)
+
+    def _give_up(self, error: OSError) -> None:
+        self.failure = f"{self._path} can't be written: {error.strerror}"
+        _log.error("%s", self.failure)
+        file, self._file = self._file, None
+        if file is not None:
+            with contextlib.suppress(OSError):  # the same fault once more; said above
+                file.close()

@@ -1,0 +1,30 @@
+"""What a person may set about the loop itself."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+
+class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When the loop says that something is wrong, and when it gives up."""
+
+    state_period_s: Annotated[float, msgspec.Meta(gt=0.0, description="pause between unchanged state messages (s)")] = (
+        1.0
+    )
+    stale_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="no frame for this long: state stale, to half a second (s)")
+    ] = 0.5
+    no_camera_alert_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="no frame for this long: an alert (s)")
+    ] = 3.0
+    image_alert_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="only refused frames for this long: an alert (s)")
+    ] = 2.0
+    give_up_after_errors: Annotated[
+        int, msgspec.Meta(ge=1, description="internal errors in so many frames in a row: stop, exit code 3")
+    ] = 50
+    stop_within_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="from a signal to the end, the recording completed (s)")
+    ] = 1.8

@@ -1,0 +1,117 @@
+"""What there is to say besides the frames' own records: silence, refused frames that go on, internal errors."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from gripmon.daemon.settings import DaemonSettings
+from gripmon.records import Alert, AlertKind, Cause, CornerFault, FrameRecord, Origin, Severity, State, Verdict
+
+_RATE_OVER_FRAMES = 64
+
+
+class Watch:
+    """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
+
+    ``state``, ``verdict`` and ``message`` are what the state message says now.  Each fault gives one alert when it has
+    lasted, and one when it is over.
+    """
+
+    def __init__(self, settings: DaemonSettings, now_s: float) -> None:
+        self._settings = settings
+        self.state = State.ACQUIRING
+        self.verdict = Verdict.UNKNOWN
+        self.message = "no frame yet"
+        self.frames = 0
+        self.frames_refused = 0
+        self.frames_usable = 0
+        self.errors_in_a_row = 0
+        self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
+        self._last_frame_s = now_s
+        self._silence_alerted = False
+        self._refused_since_s: float | None = None
+        self._image_alerted = False
+
+    def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
+        """A frame was judged; the alerts that are due beside the record's own."""
+        alerts = self._end_of_silence(now_s)
+        self.frames += 1
+        self.frames_usable += record.source is not Origin.HELD
+        self._frame_times_s.append(now_s)
+        self._last_frame_s = now_s
+        self.state, self.verdict = record.state, record.verdict
+        if is_refused(record):
+            self.frames_refused += 1
+            self.message = f"frames refused: {record.reason}"
+            alerts += self._refused(record, now_s)
+        else:
+            self.message = ""
+            alerts += self._end_of_refusals(now_s)
+        return alerts
+
+    def no_frame(self, reason: str, now_s: float) -> list[Alert]:
+        """The source waits, for the reason that it gives."""
+        silence_s = now_s - self._last_frame_s
+        if silence_s >= self._settings.stale_after_s:
+            self.state, self.verdict = State.STALE, Verdict.UNKNOWN
+            self.message = f"no frames: {reason}"
+        if self._silence_alerted or silence_s < self._settings.no_camera_alert_after_s:
+            return []
+        self._silence_alerted = True
+        text = f"no frame for {silence_s:.1f} s: {reason}"
+        return [Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, text)]
+
+    def error(self, text: str) -> list[Alert]:
+        """Handling a frame failed here, not in the camera."""
+        self.errors_in_a_row += 1
+        self.state, self.verdict = State.LOST, Verdict.UNKNOWN
+        self.message = f"internal error: {text}"
+        if self.errors_in_a_row > 1:
+            return []
+        return [Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, self.message)]
+
+    @property
+    def gives_up(self) -> bool:
+        """Have errors persisted for as long as the settings allow?"""
+        return self.errors_in_a_row >= self._settings.give_up_after_errors
+
+    def frames_per_s(self, now_s: float) -> float:
+        """The rate of the last frames; 0 while they are missing."""
+        times_s = self._frame_times_s
+        if len(times_s) < 2 or now_s - times_s[-1] >= self._settings.stale_after_s or times_s[-1] <= times_s[0]:
+            return 0.0
+        return (len(times_s) - 1) / (times_s[-1] - times_s[0])
+
+    def _end_of_silence(self, now_s: float) -> list[Alert]:
+        if now_s - self._last_frame_s >= self._settings.stale_after_s:
+            self._frame_times_s.clear()
+        if not self._silence_alerted:
+            return []
+        self._silence_alerted = False
+        text = f"frames again after {now_s - self._last_frame_s:.1f} s"
+        return [Alert(AlertKind.RECOVERED, Cause.NO_CAMERA, Severity.INFO, text)]
+
+    def _refused(self, record: FrameRecord, now_s: float) -> list[Alert]:
+        if self._refused_since_s is None:
+            self._refused_since_s = now_s
+        lasted_s = now_s - self._refused_since_s
+        if any(alert.kind is AlertKind.IMAGE for alert in record.alerts):
+            self._image_alerted = True  # the monitor said it
+        if self._image_alerted or lasted_s < self._settings.image_alert_after_s:
+            return []
+        self._image_alerted = True
+        text = f"every frame refused for {lasted_s:.1f} s: {record.reason}"
+        return [Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text)]
+
+    def _end_of_refusals(self, now_s: float) -> list[Alert]:
+        since_s, self._refused_since_s = self._refused_since_s, None
+        if since_s is None or not self._image_alerted:
+            return []
+        self._image_alerted = False
+        text = f"frames can be used again after {now_s - since_s:.1f} s"
+        return [Alert(AlertKind.RECOVERED, Cause.IMAGE_BAD, Severity.INFO, text)]
+
+
+def is_refused(record: FrameRecord) -> bool:
+    """Could the frame not be measured at all?  Then every corner says so."""
+    return bool(record.corners) and record.corners[0].reason is CornerFault.FRAME_REFUSED
