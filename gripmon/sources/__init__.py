@@ -1,4 +1,4 @@
-"""Where frames come from: a folder of images, a video file, a live camera.
+"""Where frames come from: a folder of images, a video file, a live camera, a simulated one.
 
 All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
 """
@@ -11,9 +11,10 @@ from gripmon.sources.base import READ_TIMEOUT_S, Source, SourceError, Waiting
 from gripmon.sources.folder import FolderSettings, FolderSource
 from gripmon.sources.live import LiveCamera, LiveSettings
 from gripmon.sources.newest import NewestFrame
+from gripmon.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.sources.video import VideoSettings, VideoSource
 
-SourceSettings = FolderSettings | VideoSettings | LiveSettings
+SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings
 
 __all__ = [
     "READ_TIMEOUT_S",
@@ -22,24 +23,34 @@ __all__ = [
     "LiveCamera",
     "LiveSettings",
     "NewestFrame",
+    "SimulatedScene",
+    "SimulatedSettings",
     "Source",
     "SourceError",
     "SourceSettings",
     "VideoSettings",
     "VideoSource",
     "Waiting",
+    "make_simulator",
     "open_source",
     "settings_for_path",
 ]
 
 
-def open_source(settings: SourceSettings, relative_to: Path = Path()) -> Source:
+def open_source(settings: SourceSettings, relative_to: Path = Path(), *, scene: SimulatedScene | None = None) -> Source:
     """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
+
+    Only the simulator needs a ``scene``.  Its real-time camera starts another Python process by ``multiprocessing``, so
+    a script that opens one must keep its own start behind ``if __name__ == "__main__"``.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
     video, and a device of no known form.  A camera that is only absent at present is no error: the source waits for it.
     """
     match settings:
+        case SimulatedSettings():
+            if scene is None:
+                raise SourceError("kind: simulator has no scene here; a camera, a gripper and a calibration to render")
+            return open_simulated(settings, scene, relative_to)
         case FolderSettings():
             return FolderSource(settings, relative_to)
         case VideoSettings():
