@@ -55,6 +55,8 @@ class TableView:
         self._blocks = self._place_blocks(rng)
         for block in self._blocks:
             self._cast_shadow(block)
+        # Two periods wide, so that a view rarely crosses the seam.
+        self._tile = np.pad(self._tile, _TILE_PX // 2, mode="wrap")
         self._path = _Path(rng, settings)
 
     def cam_T_table(self, cam_T_grip: Array, t_s: float) -> Array:
@@ -76,37 +78,25 @@ class TableView:
     def _floor(self, cam_T_table: Array) -> NDArray[np.uint8]:
         x, y = self._rays.plane_coordinates(cam_T_table, self._px_per_m)
         centre = x.shape[0] // 2, x.shape[1] // 2
-        maps = [self._rays.enlarge(m - _TILE_PX * math.floor(m[centre] / _TILE_PX)) for m in (x, y)]
+        half = 0.5 * _TILE_PX
+        maps = [self._rays.enlarge(m - _TILE_PX * math.floor(m[centre] / _TILE_PX) + half) for m in (x, y)]
         image = cv2.remap(self._tile, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         return np.asarray(image, dtype=np.uint8)
 
     def _smear(self, image: NDArray[np.uint8], cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[np.uint8]:
-        """Uniform motion over the exposure: eight shifted copies by three halvings."""
-        ends = [self._centre_px(self.cam_T_table(cam_T_grip, t_s + k * exposure_s)) for k in (-0.5, 0.5)]
+        """Uniform motion over the exposure, as a small kernel."""
+        x, y, _, height_m = self._path.at(t_s)
+        below = np.array([x, y, 0.0])  # the table point below the TCP at the middle of the exposure
+        ends = []
+        for share in (-0.5, 0.5):
+            cam_T_table = self.cam_T_table(cam_T_grip, t_s + share * exposure_s)
+            point = cam_T_table[:3, :3] @ below + cam_T_table[:3, 3]
+            ends.append(np.array([self._camera.fx_px, self._camera.fy_px]) * point[:2] / max(point[2], height_m))
         step = ends[1] - ends[0]
         if not float(np.hypot(*step)) > _SMEAR_FROM_PX:
             return image
-        out: NDArray[np.uint8] = image
-        size = (image.shape[1], image.shape[0])
-        for share in (0.25, 0.125, 0.0625):
-            halves = [
-                cv2.warpAffine(
-                    out,
-                    np.array([[1.0, 0.0, k * share * step[0]], [0.0, 1.0, k * share * step[1]]]),
-                    size,
-                    flags=cv2.INTER_LINEAR,
-                    borderMode=cv2.BORDER_REPLICATE,
-                )
-                for k in (-1.0, 1.0)
-            ]
-            out = np.asarray(cv2.addWeighted(halves[0], 0.5, halves[1], 0.5, 0.0), dtype=np.uint8)
-        return out
-
-    def _centre_px(self, cam_T_table: Array) -> Array:
-        """Where the table point below the middle of the view at the nominal height goes."""
-        middle = invert(cam_T_table) @ np.array([0.0, 0.0, 0.0, 1.0])
-        point = cam_T_table[:3, :3] @ np.array([round(middle[0], 1), round(middle[1], 1), 0.0]) + cam_T_table[:3, 3]
-        return np.array([self._camera.fx_px, self._camera.fy_px]) * point[:2] / max(point[2], 1e-3)
+        smeared = cv2.filter2D(image, -1, _smear_kernel(step), borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(smeared, dtype=np.uint8)
 
     def _place_blocks(self, rng: np.random.Generator) -> list[_Block]:
         """Boxes at random places that don't overlap."""
@@ -242,6 +232,19 @@ class _Path:
         share = 0.5 - 0.5 * math.cos(math.pi * min(2.0 * rest, 1.0))
         total = done * legs.sum(axis=0) + legs[:part].sum(axis=0) + share * legs[part]
         return float(total[0]), float(total[1])
+
+
+def _smear_kernel(step_px: Array) -> NDArray[np.float32]:
+    """Kernel of a straight motion (2,): many points on it, each shared among its four pixels."""
+    half = math.ceil(0.5 * float(np.abs(step_px).max()) + 0.5)
+    points = half + (np.linspace(-0.5, 0.5, 8 * half + 1)[:, None] * step_px)
+    kernel = np.zeros((2 * half + 2, 2 * half + 2), np.float32)
+    whole = np.floor(points).astype(np.intp)
+    rest = points - whole
+    for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        share = np.abs(1 - du - rest[:, 0]) * np.abs(1 - dv - rest[:, 1])
+        np.add.at(kernel, (whole[:, 1] + dv, whole[:, 0] + du), share)
+    return kernel[:-1, :-1] / kernel.sum()
 
 
 def _outline(block: _Block) -> Array:

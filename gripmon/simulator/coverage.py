@@ -23,7 +23,7 @@ from gripmon.records import Array
 
 _PHASES = 2048
 _REACH_SIGMAS = 3.3
-_STEP_SIGMAS = 1.2
+_STEP_SIGMAS = 1.6
 _GAUSS_POINTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 _VIEW_MARGIN = 1.06
 
@@ -48,6 +48,7 @@ class CoverageRaster:
         self._reach = math.ceil(0.5 + _REACH_SIGMAS * psf_sigma_px)
         self._rows, self._columns = _kernel_tables(psf_sigma_px, self._reach)
         self._view_planes = _view_planes(camera)
+        self._where, self._what = np.empty((0, 0, 0), dtype=np.intp), np.empty((0, 0, 0))
 
     def masks(self, polygons_cam_m: list[Array]) -> list[Coverage | None]:
         """One mask a polygon (k, 3), planar, counter-clockwise seen from the camera; None for what is out of sight."""
@@ -76,13 +77,21 @@ class CoverageRaster:
         stride = right - left + 2 * pad
         first = (row.astype(np.intp) + (pad - reach + 1)) * stride + (column.astype(np.intp) + (pad - reach + 1))
         patch = np.arange(2 * reach)[:, None] * stride + np.arange(2 * reach + 1)
-        where = first[:, None, None] + patch
-        weights_v = weights_v * dy[:, None]
-        what = weights_v[:, :, None] * weights_u[:, None, :]
+        where, what = self._scratch(len(first))
+        np.add(first[:, None, None], patch, out=where)
+        np.multiply((weights_v * dy[:, None])[:, :, None], weights_u[:, None, :], out=what)
         rows = bottom - top + 2 * pad
         slopes = np.bincount(where.ravel(), what.ravel(), minlength=rows * stride).reshape(rows, stride)
-        mask = slopes[pad : rows - pad, : stride - pad].cumsum(axis=1)[:, pad:]
-        return Coverage(left, top, mask.astype(np.float32))
+        inside = slopes[pad : rows - pad, : stride - pad]
+        np.cumsum(inside, axis=1, out=inside)
+        return Coverage(left, top, inside[:, pad:].astype(np.float32))
+
+    def _scratch(self, count: int) -> tuple[NDArray[np.intp], Array]:
+        """Index and weight arrays (count, rows, columns) of patches; kept, because fresh memory costs more than the sums."""
+        if len(self._where) < count:
+            shape = (count + count // 2, 2 * self._reach, 2 * self._reach + 1)
+            self._where, self._what = np.empty(shape, dtype=np.intp), np.empty(shape)
+        return self._where[:count], self._what[:count]
 
 
 def _kernel_tables(sigma_px: float, reach: int) -> tuple[Array, Array]:

@@ -31,7 +31,7 @@ _SKIN_LEVEL_DN = 150.0
 _SHEET_LEVEL_DN = 205.0
 _COVER_BLUR_PX = 1.0
 _SMEAR_FROM_PX = 0.25
-_SMEAR_STEP_PX = 0.6
+_SMEAR_STEP_PX = 1.0
 _MOST_SUB_EXPOSURES = 8
 
 
@@ -87,23 +87,23 @@ class Renderer:
         if len(states) == 1:
             return self._compose(background, middle)
         total = np.zeros_like(background)
-        for state in states:
-            cv2.accumulate(self._compose(background.copy(), state), total)
-        total /= len(states)
+        for state, share in states:
+            cv2.scaleAdd(self._compose(background.copy(), state), share, total, total)
         return total
 
-    def _sub_exposures(self, middle: SceneState, exposure_s: float) -> list[SceneState]:
-        """States within the exposure: several only if the gripper moves in the image meanwhile."""
+    def _sub_exposures(self, middle: SceneState, exposure_s: float) -> list[tuple[SceneState, float]]:
+        """States within the exposure and their shares: several (Gauss's) only if the gripper moves in the image."""
         if exposure_s == 0.0 or self._scenario.pairs is not None:
-            return [middle]
+            return [(middle, 1.0)]
         ends = [self._scene.at(max(middle.time_s + k * exposure_s, 0.0)) for k in (-0.5, 0.5)]
         way = np.abs(self._tip_pixels(ends[1]) - self._tip_pixels(ends[0]))
         longest = float(np.nanmax(way, initial=0.0))
         if longest < _SMEAR_FROM_PX:
-            return [middle]
+            return [(middle, 1.0)]
         count = min(math.ceil(longest / _SMEAR_STEP_PX) + 1, _MOST_SUB_EXPOSURES)
-        shares = (np.arange(count) + 0.5) / count - 0.5
-        return [self._scene.at(max(middle.time_s + float(k) * exposure_s, 0.0)) for k in shares]
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        times = np.maximum(middle.time_s + 0.5 * exposure_s * nodes, 0.0)
+        return [(self._scene.at(t), 0.5 * w) for t, w in zip(times.tolist(), weights.tolist(), strict=True)]
 
     def _tip_pixels(self, state: SceneState) -> Array:
         points = state.points_grip_m @ state.cam_T_grip[:3, :3].T + state.cam_T_grip[:3, 3]

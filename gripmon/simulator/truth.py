@@ -28,9 +28,9 @@ class FrameTruth:
     """Truth of one frame, at the middle of its exposure.
 
     ``reference_cam_T_grip`` is what a perfect calibration gave before; ``tcp_shift_m`` (3,) the TCP's displacement
-    since, camera axes.  ``corner_uv_px`` (c, 2), in the gripper's order, lie in the distorted image, NaN behind the camera;
-    ``hidden`` (c,) is None where visible.  ``finger_bend`` (f, 4, 4) maps a finger's points at nominal opening to where its
-    bending takes them, gripper frame.
+    since, camera axes.  ``corner_uv_px`` (c, 2), in the gripper's order, lie in the distorted image, NaN behind the
+    camera; ``hidden`` (c,) is None where visible.  ``finger_bend`` (f, 4, 4) maps a finger's points at nominal opening
+    to where its bending takes them, gripper frame.
     """
 
     index: int
