@@ -70,11 +70,16 @@ def test_every_import_points_downward():
     for path in sorted(PACKAGE.rglob("*.py")):
         room = room_of(path)
         if room == "gripmon":
-            assert not [m for m in imported_modules(path.read_text()) if m.startswith("gripmon")], "the package imports no room"
+            assert not [m for m in imported_modules(path.read_text()) if m.startswith("gripmon")], (
+                "the package imports no room"
+            )
             continue
         package = ".".join(path.relative_to(ROOT).parent.parts)
         assert room in FLOORS, f"{path}: give the room a floor"
-        faults += [f"{path.relative_to(ROOT)}: {fault}" for fault in faults_of(room, imported_modules(path.read_text(), package))]
+        faults += [
+            f"{path.relative_to(ROOT)}: {fault}"
+            for fault in faults_of(room, imported_modules(path.read_text(), package))
+        ]
     assert not faults, "\n".join(faults)
 
 
@@ -113,5 +118,5 @@ def test_help_imports_nothing_heavy(arguments: list[str]):
 def test_package_list_matches_the_tree():
     """``packages`` in pyproject.toml is written by hand; a forgotten one would be missing from the wheel."""
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
-    found = {".".join(p.parent.relative_to(ROOT).parts) for p in PACKAGE.rglob("__init__.py")}
+    found = {".".join(p.parent.relative_to(ROOT).parts) for p in PACKAGE.rglob("*.py")}
     assert listed - {"gripmon.configs"} == found

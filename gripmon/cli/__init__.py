@@ -7,10 +7,10 @@ import os
 import sys
 
 from gripmon import __version__
-from gripmon.cli import check, replay, run
+from gripmon.cli import check, demo, replay, run, simulate
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 
-_COMMANDS = (check, replay, run)
+_COMMANDS = (demo, run, replay, simulate, check)
 
 _DESCRIPTION = """\
 gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the
@@ -40,7 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command line (default: the process's own) and return its exit code; wrong usage raises ``SystemExit(2)``."""
+    """Run a command line (default: the process's own) return its exit code; wrong usage raises ``SystemExit(2)``."""
     parser = build_parser()
     chosen = parser.parse_args(arguments)
     if not hasattr(chosen, "handler"):

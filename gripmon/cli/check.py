@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import socket
+from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
@@ -144,11 +145,11 @@ def _first_frame(config: Config) -> str:
     height_px, width_px = frame.image.shape[:2]
     if (width_px, height_px) != (config.camera.width_px, config.camera.height_px):
         raise common.CommandFailedError(
-            f"{config.path}: camera.width_px: {config.camera.width_px} x {config.camera.height_px} px, but {frame.name} has "
-            f"{width_px} x {height_px}; the calibration that belongs to these images",
+            f"{config.path}: camera.width_px: {config.camera.width_px} x {config.camera.height_px} px; {frame.name} "
+            f"is {width_px} x {height_px}; the calibration that belongs to these images",
             common.EXIT_USAGE,
         )
-    count = f"{len(source)} frames, " if hasattr(source, "__len__") else ""
+    count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
     return f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -69,6 +70,13 @@ def load(path: str, *, check_source: bool = True) -> Config:
         raise CommandFailedError(str(error), EXIT_USAGE) from None
 
 
+def load_demo_or(path: str | None) -> Config:
+    """The configuration in a file, or that of the demo."""
+    from gripmon.config import builtin_config
+
+    return load(str(builtin_config("demo.yaml")) if path is None else path, check_source=False)
+
+
 def make_directory(path: Path) -> Path:
     """Create a directory for output; a fault ends the command with exit code 2."""
     try:
@@ -77,24 +85,29 @@ def make_directory(path: Path) -> Path:
         raise CommandFailedError(
             f"--out {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE
         ) from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise CommandFailedError(f"--out {path}: may not be written to; a directory of your own", EXIT_USAGE)
     return path
 
 
-def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[[], object]]:
+def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[[], None]]:
     """A context that gives a function to call once for each step; it draws on stderr, and only for a person."""
     if not sys.stderr.isatty():
         return nullcontext(lambda: None)
     return _TqdmSteps(total, unit)
 
 
-class _TqdmSteps(AbstractContextManager[Callable[[], object]]):
+class _TqdmSteps(AbstractContextManager[Callable[[], None]]):
     def __init__(self, total: int | None, unit: str):
         from tqdm import tqdm
 
         self._bar = tqdm(total=total, unit=unit, file=sys.stderr, dynamic_ncols=True)
 
-    def __enter__(self) -> Callable[[], object]:
-        return self._bar.update
+    def __enter__(self) -> Callable[[], None]:
+        return self._step
 
     def __exit__(self, *_exception: object) -> None:
         self._bar.close()
+
+    def _step(self) -> None:
+        self._bar.update()

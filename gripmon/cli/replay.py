@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
@@ -74,7 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
         with _output(arguments.out) as out, _recorder(arguments.recording, config) as recorder:
             counts = _Counts()
             try:
-                with common.progress_bar(len(source) if hasattr(source, "__len__") else None, "frame") as step:
+                with common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame") as step:
                     for line, record in replay(config, source, recorder):
                         out.write(line)
                         counts.add(record)
@@ -95,7 +96,6 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
     from gripmon.records import Frame, to_json
 
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
-    recorder.reference(monitor.reference)
     with_jaw = _jaw_of(config)
     revision = monitor.reference.revision
     while (frame := source.read()) is not None:
@@ -203,12 +203,36 @@ def _output(name: str) -> Iterator[IO[bytes]]:
 @contextmanager
 def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
     """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
-    from gripmon.recording import NullRecorder
+    import msgspec
 
-    recorder = NullRecorder() if name is None else common.open_one_recording(Path(name), config)
-    try:
-        yield recorder
-    finally:
-        recorder.close(timeout_s=60.0)
-        if recorder.dropped:
-            print(f"replay: {recorder.dropped} frames are missing in the recording", file=sys.stderr)
+    from gripmon.recording import NullRecorder, open_recorder
+
+    if name is None:
+        yield NullRecorder()
+        return
+    path = Path(name)
+    # Replay outruns any camera: queues long enough that nothing is dropped, and one file whatever its length.
+    settings = msgspec.structs.replace(
+        config.settings.recording, enabled=True, queue_frames=100_000, queue_images=64, max_file_bytes=2**62
+    )
+    common.make_directory(path.parent)
+    with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as scratch:
+        recorder = open_recorder(
+            settings,
+            robot=config.settings.robot,
+            camera_name=config.settings.camera_name,
+            camera=config.camera,
+            gripper=config.gripper,
+            reference=config.reference,
+            directory=Path(scratch),
+            name=path.stem,
+        )
+        try:
+            yield recorder
+        finally:
+            recorder.close(timeout_s=60.0)
+            for written in Path(scratch).glob("*.rrd"):
+                written.replace(path)
+        if recorder.dropped or recorder.failure:
+            reason = f" ({recorder.failure})" if recorder.failure else ""
+            print(f"replay: {recorder.dropped} frames are missing in {path}{reason}", file=sys.stderr)

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.daemon import JawFeed
+    from gripmon.publish import Publisher
+    from gripmon.recording import Recorder
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -43,4 +52,109 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
     config = common.load(arguments.config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
-    return common.run_daemon(config, out=out, duration_s=arguments.duration, verbose=arguments.verbose)
+    return run_daemon(config, out=out, duration_s=arguments.duration, verbose=arguments.verbose)
+
+
+def run_daemon(
+    config: Config,
+    *,
+    out: Path | None,
+    duration_s: float | None = None,
+    verbose: bool = False,
+    recording_name: str | None = None,
+    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
+    on_network: Callable[[], None] = lambda: None,
+) -> int:
+    """Open everything that a configuration names and run the daemon on it; returns the exit code.
+
+    ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
+    goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
+    """
+    import cv2
+
+    from gripmon import daemon
+    from gripmon.monitor import Monitor
+    from gripmon.sources import SourceError, open_source
+
+    settings = config.settings
+    cv2.setNumThreads(1)
+    daemon.log_to_stderr(verbose=verbose)
+    monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
+    with contextlib.ExitStack() as opened:
+        publisher, jaw = _open_publisher(config)
+        opened.callback(publisher.close)
+        on_network()
+        recorder = _open_recorder(config, out, recording_name, truth_tcp_m)
+        opened.callback(recorder.close)
+        try:
+            source = open_source(settings.source, config.directory, scene=config.scene)
+        except SourceError as error:
+            raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
+        opened.pop_all()  # from here on the daemon closes them
+        return daemon.run(
+            monitor,
+            source,
+            publisher,
+            recorder,
+            settings.daemon,
+            robot=settings.robot,
+            camera=settings.camera_name,
+            estimates=None if out is None else out / "estimates.jsonl",
+            jaw=jaw,
+            duration_s=duration_s,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _FixedJaw:
+    """A jaw that never moves, in the form that the daemon asks for; None for a gripper without jaw."""
+
+    fixed_m: float | None
+
+    def opening_m(self) -> float | None:
+        return self.fixed_m
+
+    def fault(self) -> str:
+        return ""
+
+
+def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None]:
+    """The publisher and where the jaw opening comes from; None: with the frames."""
+    from gripmon.publish import NullPublisher, PublishError, ZenohPublisher
+
+    settings = config.settings
+    fixed = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
+    if not settings.publish.enabled:
+        return NullPublisher(), fixed
+    from_network = settings.jaw.source == "zenoh"
+    try:
+        publisher = ZenohPublisher(settings.publish, settings.robot, settings.camera_name, subscribe_jaw=from_network)
+    except PublishError as error:
+        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+    return publisher, publisher.jaw if from_network else fixed
+
+
+def _open_recorder(
+    config: Config, out: Path | None, name: str | None, truth_tcp_m: Callable[[int], tuple[float, float, float]] | None
+) -> Recorder:
+    from gripmon.recording import open_recorder
+
+    settings = config.settings
+    try:
+        return open_recorder(
+            settings.recording,
+            robot=settings.robot,
+            camera_name=settings.camera_name,
+            camera=config.camera,
+            gripper=config.gripper,
+            reference=config.reference,
+            directory=out,
+            name=name,
+            truth_tcp_m=truth_tcp_m,
+        )
+    except OSError as error:
+        raise common.CommandFailedError(
+            f"{config.path}: recording.directory: {settings.recording.directory} can't be made ({error.strerror}); "
+            "a folder that may be written",
+            common.EXIT_USAGE,
+        ) from None

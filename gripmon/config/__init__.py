@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import gripmon
 from gripmon.camera import Camera, make_camera
@@ -17,11 +18,14 @@ from gripmon.config.settings import JawSettings, Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.geometry import from_record, to_record
-from gripmon.gripper import Gripper, GripperError, GripperModel
+from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
 from gripmon.records import Array, ReferenceRecord, to_json
-from gripmon.sources import FolderSettings, LiveSettings, VideoSettings
+from gripmon.sources import FolderSettings, LiveSettings, SimulatedScene, SimulatedSettings, VideoSettings
 
-__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "load_config"]
+if TYPE_CHECKING:
+    from gripmon.simulator import Scenario
+
+__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "load_config", "load_scenario"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +56,11 @@ class Config:
             return None
         return self.gripper.jaw_nominal_m if self.settings.jaw.opening_m is None else self.settings.jaw.opening_m
 
+    @property
+    def scene(self) -> SimulatedScene:
+        """What a simulated camera renders: undisturbed, it stands as the reference says."""
+        return SimulatedScene(self.camera, self.gripper, self.cam_T_grip)
+
     def view(self) -> View:
         """What the reference predicts to be seen at :attr:`jaw_opening_m`."""
         return predict_view(self.camera, self.gripper, self.cam_T_grip, self.jaw_opening_m)
@@ -74,6 +83,8 @@ def load_config(path: Path, *, check_source: bool = True) -> Config:
     fault = _jaw_fault(settings.jaw, gripper, settings) or view_fault(config.view(), gripper, camera)
     if fault is None and check_source:
         fault = _source_fault(settings, path.parent)
+        if isinstance(settings.source, SimulatedSettings) and settings.source.scenario.endswith((".yaml", ".yml")):
+            load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
         raise _error(path, fault)
     return config
@@ -105,7 +116,13 @@ def _gripper(path: Path, gripper_path: Path) -> Gripper:
             path, "gripper", f"there is no file {gripper_path}", "a gripper file, its path relative to this file"
         )
     try:
-        return Gripper(to_settings(read_yaml(gripper_path), GripperModel))
+        model = to_settings(read_yaml(gripper_path), GripperModel)
+        # Before anything is made of them: points in millimetres break most other rules, too.
+        for name, point in model.points.items():
+            if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:
+                wrong = f"{max(map(abs, point.xyz_m)):g} m from the TCP"
+                raise ConfigError(gripper_path, f"points.{name}.xyz_m", wrong, "metres (millimetres were meant?)")
+        return Gripper(model)
     except SettingsError as error:
         raise _error(gripper_path, error.fault) from None
     except GripperError as error:
@@ -160,3 +177,13 @@ def _source_fault(settings: Settings, directory: Path) -> Fault | None:
             "source.path", f"there is no file {directory / source.path}", "a video file, relative to this file"
         )
     return None
+
+
+def load_scenario(path: Path) -> Scenario:
+    """A simulator scenario from a YAML file.  Raises :class:`ConfigError`."""
+    from gripmon.simulator import Scenario
+
+    try:
+        return to_settings(read_yaml(path), Scenario)
+    except SettingsError as error:
+        raise _error(path, error.fault) from None

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.config.settings import ReferenceSettings
@@ -33,9 +34,9 @@ class View:
 
     corners_cam_m: Array
     corners_px: Array
-    in_image: np.ndarray
-    visible: np.ndarray
-    edges_visible: np.ndarray
+    in_image: NDArray[np.bool_]
+    visible: NDArray[np.bool_]
+    edges_visible: NDArray[np.bool_]
 
 
 def reference_transform(settings: ReferenceSettings) -> Array | Fault:
@@ -92,7 +93,8 @@ def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_openin
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     corners_cam_m = points_cam_m[gripper.corner_points]
     corners_px = camera.project(corners_cam_m)
-    in_image = ((corners_px >= 0.0) & (corners_px <= [camera.width_px - 1.0, camera.height_px - 1.0])).all(axis=1)
+    last_px = np.array([camera.width_px - 1.0, camera.height_px - 1.0])
+    in_image: NDArray[np.bool_] = np.all((corners_px >= 0.0) & (corners_px <= last_px), axis=1)
     eye_grip_m = invert(cam_T_grip)[:3, 3]
     return View(
         corners_cam_m,
@@ -118,7 +120,7 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
         return Fault(
             key,
             f"puts all corners outside of the image, {where}",
-            f"fingertips in {camera.width_px} x {camera.height_px} px (x right, y down, z forward; rotation x, y, z, w)",
+            f"fingertips in {camera.width_px} x {camera.height_px} px (x right, y down, z forward; x, y, z, w)",
         )
     seen = int(view.visible.sum())
     if seen < FEWEST_CORNERS_IN_VIEW:

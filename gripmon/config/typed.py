@@ -186,8 +186,9 @@ def _fits_leaf(value: Any, node: mi.Type) -> bool:
             return False
         return True
     if isinstance(node, mi.IntType | mi.FloatType):
-        allowed: tuple[type, ...] = (int,) if isinstance(node, mi.IntType) else (int, float)
-        return isinstance(value, allowed) and not isinstance(value, bool) and _in_bounds(value, node)
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return False
+        return (isinstance(value, int) or isinstance(node, mi.FloatType)) and _in_bounds(value, node)
     return True  # msgspec itself is asked afterwards
 
 
@@ -245,7 +246,8 @@ def _one_of(options: list[str]) -> str:
 
 
 def _did_you_mean(name: str, known: list[str]) -> str:
-    close = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
+    longer = [candidate for candidate in known if len(name) > 1 and candidate.startswith(name)]
+    close = longer or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f", did you mean '{close[0]}'?" if close else ""
 
 

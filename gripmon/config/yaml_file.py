@@ -13,7 +13,7 @@ from gripmon.config.errors import ConfigError
 _TAG = "tag:yaml.org,2002:"
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """Scalars by the core schema of YAML 1.2 instead of 1.1."""
 
 
@@ -94,4 +94,4 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _kind(value: object) -> str:
-    return {list: "a list", str: "a single text"}.get(type(value), f"a single value {value!r}")
+    return "a list" if isinstance(value, list) else f"a single value {value!r}"

@@ -1,0 +1,346 @@
+"""Configuration: what is right loads to what it says; what is wrong is one line that names file, key and remedy."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from msgspec import Meta
+
+from gripmon.config import ConfigError, builtin_config, load_config, load_scenario
+from gripmon.config.typed import SettingsError, to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.gripper import load_gripper
+
+ROOT = Path(__file__).resolve().parent.parent
+GRIPPERS = ROOT / "configs" / "grippers"
+
+SOUND = """\
+robot: arm1
+camera_name: wrist
+gripper: gripper.yaml
+camera:
+  model: paper
+  width_px: 768
+  height_px: 576
+  fx_px: 962
+  fy_px: 962
+  cx_px: 383.5
+  cy_px: 287.5
+  kappa_per_px2: 1.9e-7
+reference:
+  cam_T_grip:
+    translation_m: [0.0, 0.0014, 0.1188]
+    rotation_xyzw: [0.25881905, 0.0, 0.0, 0.96592583]
+source: {kind: live, device: 0}
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "gripper.yaml").write_text((GRIPPERS / "two_box_fingers.yaml").read_text())
+    (tmp_path / "config.yaml").write_text(SOUND)
+    return tmp_path
+
+
+def edited(folder: Path, pattern: str, replacement: str, file: str = "config.yaml") -> Path:
+    path = folder / file
+    text = path.read_text()
+    changed = re.sub(pattern, replacement, text, count=1, flags=re.MULTILINE)
+    assert changed != text, "the edit has to change something"
+    path.write_text(changed)
+    return folder / "config.yaml"
+
+
+def test_a_sound_configuration_means_what_it_says(folder: Path):
+    config = load_config(folder / "config.yaml")
+    assert (config.settings.robot, config.settings.camera_name) == ("arm1", "wrist")
+    assert config.camera.fx_px == 962.0
+    assert config.jaw_opening_m == config.gripper.jaw_nominal_m == 0.034
+    half = math.radians(30.0) / 2.0
+    assert math.isclose(config.reference.cam_T_grip.rotation_xyzw[0], math.sin(half), rel_tol=1e-7)
+    turn = np.array(
+        [[1, 0, 0], [0, math.cos(2 * half), -math.sin(2 * half)], [0, math.sin(2 * half), math.cos(2 * half)]]
+    )
+    np.testing.assert_allclose(config.cam_T_grip[:3, :3], turn, atol=1e-7)
+    np.testing.assert_allclose(config.cam_T_grip[:3, 3], [0.0, 0.0014, 0.1188])
+
+
+def test_prediction_agrees_with_the_pinhole_by_hand(folder: Path):
+    """One corner through rotation, projection and the lens's cubic (equation 4), without the package's own code."""
+    config = load_config(folder / "config.yaml")
+    view = config.view()
+    i = config.gripper.corner_ids.index("R_in_near")
+    c, s = math.cos(math.radians(30)), math.sin(math.radians(30))
+    x, y, z = 0.017, 0.0014 + c * -0.008, 0.1188 + s * -0.008
+    ideal = 962.0 * np.array([x / z, y / z])
+    radius = np.linalg.norm(ideal)
+    distorted_radius = next(r.real for r in np.roots([1.9e-7, 0.0, 1.0, -radius]) if abs(r.imag) < 1e-9)
+    np.testing.assert_allclose(view.corners_px[i], [383.5, 287.5] + ideal * distorted_radius / radius, atol=1e-6)
+    assert view.visible[i]
+    assert not view.visible[config.gripper.corner_ids.index("R_out_far")], "its own finger hides it"
+
+
+FAULTS = [
+    # pattern, replacement, key, what must be said
+    ("^robot:", "robbot:", "robbot", "did you mean 'robot'"),
+    ("^robot: arm1", "robot: a/b", "robot", "none of / "),
+    ("^robot: arm1", "robot: a*", "robot", "none of / "),
+    ("^robot: arm1", "robot: ''", "robot", "none of / "),
+    ("^robot: arm1", "robot: 7", "robot", "text"),
+    ("^robot: arm1", "robot: a\nrobot: b", "line 2", "twice"),
+    ("^camera_name: .*\n", "", "camera_name", "is missing"),
+    ("fx_px: 962", "fx_px: 0.9", "camera.fx_px", "metres"),
+    ("fx_px: 962", "fx_px: nine", "camera.fx_px", "a number > 0"),
+    ("fx_px: 962", "fx_px: .nan", "camera.fx_px", "a number > 0"),
+    ("fx_px: 962", "fx_px: -962", "camera.fx_px", "a number > 0"),
+    ("  fx_px: 962\n", "", "camera.fx_px", "is missing"),
+    ("fx_px: 962", "fx: 962", "camera.fx", "did you mean 'fx_px'"),
+    ("fx_px: 962", "fx_px: 962\n  fx_px: 963", "line 9", "twice"),
+    ("model: paper", "model: papper", "camera.model", "did you mean 'paper'"),
+    ("  model: paper\n", "", "camera.model", "paper, brown_conrady or fisheye"),
+    ("kappa_per_px2: 1.9e-7", "kappa_per_px2: 0.2", "camera.kappa_per_px2", "right would be"),
+    ("cx_px: 383.5", "cx_px: 38350", "camera.cx_px", "right would be"),
+    ("gripper: gripper.yaml", "gripper: missing.yaml", "gripper", "there is no file"),
+    (r"0.1188\]", "-0.1188]", "reference.cam_T_grip.translation_m", "behind the camera"),
+    (r"0.1188\]", "30.0]", "reference.cam_T_grip.translation_m", "30 mm were meant"),
+    (r"0.1188\]", "118.8]", "reference.cam_T_grip.translation_m", "metres"),
+    (r"0.1188\]", "0.0001188]", "reference.cam_T_grip.translation_m", "metres"),
+    (
+        r"0.1188\]\n.*",
+        "0.02]\n    rotation_xyzw: [0.0, 0.70710678, 0.0, 0.70710678]",
+        "reference.cam_T_grip",
+        "corner R_out_near behind",
+    ),
+    (r"\[0.0, 0.0014", "[0.5, 0.0014", "reference.cam_T_grip", "outside of the image"),
+    (r"\[0.0, 0.0014", "[0.068, 0.0014", "reference.cam_T_grip", "shows 2 corners"),
+    (r"rotation_xyzw: .*", "rotation_xyzw: [30.0, 0.0, 0.0]", "reference.cam_T_grip.rotation_xyzw", "4 values"),
+    (
+        r"rotation_xyzw: .*",
+        "rotation_xyzw: [30.0, 0.0, 0.0, 0.0]",
+        "reference.cam_T_grip.rotation_xyzw",
+        "unit quaternion",
+    ),
+    (r"translation_m: .*", "translation_m: {x: 0}", "reference.cam_T_grip.translation_m", "a list of 3"),
+    ("^source: .*", "source: {kind: folder, path: nowhere}", "source.path", "there is no folder"),
+    ("^source: .*", "source: {kind: video, path: nowhere.mp4}", "source.path", "there is no file"),
+    ("^source: .*", "source: {kind: foldr, path: .}", "source.kind", "did you mean 'folder'"),
+    ("^source: .*", "source: {kind: folder, path: ., fsp: 3}", "source.fsp", "did you mean 'fps'"),
+    ("^source: .*", "source: folder", "source", "a section with the key `kind`"),
+    ("^source: .*", "source: {kind: live, device: 0, fps: 0}", "source.fps", "> 0"),
+    ("^source:", "jaw: {source: frames}\nsource:", "jaw.source", "fixed or zenoh"),
+    ("^source:", "jaw: {opening_m: 34}\nsource:", "jaw.opening_m", "<= 0.5"),
+    ("^source:", "jaw: {opening_m: 0.07}\nsource:", "jaw.opening_m", "0 to 0.06 m"),
+    ("^source:", "jaw: {source: zenoh, opening_m: 0.03}\nsource:", "jaw.opening_m", "no effect"),
+    ("^source:", "jaw: {source: zenoh}\npublish: {enabled: false}\nsource:", "jaw.source", "publish.enabled: true"),
+    ("^source:", "publish: {listen: [localhost]}\nsource:", "publish.listen[0]", "tcp/127.0.0.1:7447"),
+    ("^source:", "monitor: {corner: {}}\nsource:", "monitor.corner", "unknown key"),
+    ("^source:", "recording: {image_rate_hz: -1}\nsource:", "recording.image_rate_hz", "(Hz)"),
+    ("^source:", "reference_: 3\nsource:", "reference_", "did you mean 'reference'"),
+    ("^reference:", "reference: [", "line 15", "not YAML"),
+    ("^reference:", "\treference:", "line 13", "not YAML"),
+    ("^  cam_T_grip:", "  position_sigma_m: 5\n  cam_T_grip:", "reference.position_sigma_m", "(m)"),
+    ("^  cam_T_grip:", "  covariance: [1, 2]\n  cam_T_grip:", "reference.covariance", "36"),
+]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "key", "said"), FAULTS, ids=[f"{f[2]}-{i}" for i, f in enumerate(FAULTS)]
+)
+def test_a_fault_is_one_line_with_file_key_and_remedy(
+    folder: Path, pattern: str, replacement: str, key: str, said: str
+):
+    path = edited(folder, pattern, replacement)
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: {key}: "), text
+    assert said in text
+    assert "\n" not in text
+    assert ";" in text, "what would be right comes after a semicolon"
+
+
+GRIPPER_FAULTS = [
+    (r"nominal_m: 0.034", "nominal_m: 34", "jaw.nominal_m", "jaw opening (m)"),
+    (
+        r"  L_in_near: {finger: left, xyz_m: \[-0.017",
+        "  L_in_near: {finger: left, xyz_m: [-17.0",
+        "points.L_in_near.xyz_m",
+        "millimetres",
+    ),
+    (r"  L_in_near: {finger: left", "  L_in_near: {finger: lefft", "points.L_in_near.finger", "left, right"),
+    (r"corner: true}", "cornr: true}", "points.L_in_near.cornr", "did you mean 'corner'"),
+    (r"xyz_m: \[-0.017, -0.008, 0.0\]", "xyz_m: [-0.017, -0.008]", "points.L_in_near.xyz_m", "3 values"),
+    (r"from: L_in_near, to", "frm: L_in_near, to", "edges.L_tip_in.frm", "did you mean 'from'"),
+    (r"from: L_in_near, to", "from: nobody, to", "edges.L_tip_in.from", "there is no point"),
+    (r"^name: .*", "name: a\nname: b", "line 5", "twice"),
+]
+
+
+@pytest.mark.parametrize(("pattern", "replacement", "key", "said"), GRIPPER_FAULTS)
+def test_a_fault_in_the_gripper_file_names_that_file(folder: Path, pattern: str, replacement: str, key: str, said: str):
+    path = edited(folder, pattern, replacement, "gripper.yaml")
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert str(caught.value).startswith(f"{folder / 'gripper.yaml'}: {key}: ")
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", [("L_in_near", "L_in_far"), ("L_in_near", "R_in_near", "L_out_near")])
+def test_a_singular_gripper_is_refused(folder: Path, kept: tuple[str, ...]):
+    """Two corners only; three corners on one line (in_near, out_near of both fingers lie on y = -8 mm, z = 0)."""
+    model = yaml.safe_load((folder / "gripper.yaml").read_text())
+    for name, point in model["points"].items():
+        point["corner"] = name in kept
+    (folder / "gripper.yaml").write_text(yaml.safe_dump(model))
+    with pytest.raises(ConfigError, match=r"points: .*at least 3 corners that are not on a line"):
+        load_config(folder / "config.yaml")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "no such file"),
+        (b"", "is empty"),
+        (b"- 1\n", "holds a list"),
+        (b"\xff\xfe\x00x", "not UTF-8"),
+        (b"a: b: c", "not YAML"),
+    ],
+)
+def test_files_that_are_no_configuration(tmp_path: Path, content: bytes | None, said: str):
+    path = tmp_path / "config.yaml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ConfigError, match=said):
+        load_config(path)
+    with pytest.raises(ConfigError, match="directory"):
+        load_config(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e-3", 1e-3), ("1.5E3", 1500.0), (".5", 0.5), ("5.", 5.0), ("-3", -3), ("010", 10),
+        ("on", "on"), ("no", "no"), ("12:30", "12:30"), ("2024-01-02", "2024-01-02"), ("1_000", "1_000"),
+        ("true", True), ("null", None), ("~", None), ("", None),
+    ],
+)  # fmt: skip
+def test_scalars_mean_what_people_mean(tmp_path: Path, text: str, value: object):
+    path = tmp_path / "x.yaml"
+    path.write_text(f"key: {text}\n")
+    read = read_yaml(path)["key"]
+    assert read == value and type(read) is type(value)
+
+
+def test_covariance_comes_from_the_sigmas_or_as_it_is(folder: Path):
+    path = edited(folder, "^  cam_T_grip:", "  position_sigma_m: 0.002\n  rotation_sigma_rad: 0.01\n  cam_T_grip:")
+    matrix = np.array(load_config(path).reference.covariance).reshape(6, 6)
+    np.testing.assert_allclose(matrix, np.diag([4e-6] * 3 + [1e-4] * 3))
+    own = np.diag([1e-6, 2e-6, 3e-6, 1e-5, 2e-5, 3e-5])
+    own[0, 5] = own[5, 0] = 1e-6
+    path = edited(folder, "^  position_sigma_m: 0.002\n", f"  covariance: {own.ravel().tolist()}\n")
+    np.testing.assert_allclose(np.array(load_config(path).reference.covariance).reshape(6, 6), own)
+
+
+@pytest.mark.parametrize(
+    ("i", "j", "value", "said"), [(0, 0, 0.0, "zero"), (0, 1, 1e-7, "symmetric"), (0, 0, -1e-6, "positive definite")]
+)
+def test_a_covariance_that_is_none_is_refused(folder: Path, i: int, j: int, value: float, said: str):
+    matrix = np.diag([1e-6] * 3 + [1e-5] * 3)
+    matrix[i, j] = value
+    path = edited(folder, "^  cam_T_grip:", f"  covariance: {matrix.ravel().tolist()}\n  cam_T_grip:")
+    with pytest.raises(ConfigError, match=said):
+        load_config(path)
+
+
+def test_the_reference_id_depends_on_the_calibration_only(folder: Path):
+    first = load_config(folder / "config.yaml").reference.reference_id
+    assert load_config(edited(folder, "robot: arm1", "robot: arm2")).reference.reference_id == first
+    assert load_config(edited(folder, r"0.1188\]", "0.1189]")).reference.reference_id != first
+    assert (
+        load_config(edited(folder, "^  cam_T_grip:", "  id: cell-7\n  cam_T_grip:")).reference.reference_id == "cell-7"
+    )
+
+
+class _Inner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    gain: Annotated[float, Meta(gt=0.0, description="gain (DN)")] = 1.0
+    mode: Literal["fast", "slow"] = "fast"
+
+
+class _Outer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    rows: tuple[tuple[float, float], ...] = ()
+    inner: dict[str, _Inner] = {}
+    either: Annotated[int | str | None, Meta(description="index or name")] = None
+
+
+@pytest.mark.parametrize(
+    ("value", "key", "said"),
+    [
+        ({"rows": [[1, 2], [3]]}, "rows[1]", "has 1 values"),
+        ({"rows": [[1, "x"]]}, "rows[0][1]", "a number"),
+        ({"inner": {"a": {}, "b": {"gain": 0}}}, "inner.b.gain", "a number > 0: gain (DN)"),
+        ({"inner": {"a": {"mode": "fas"}}}, "inner.a.mode", "did you mean 'fast'"),
+        ({"inner": {"a": {"gian": 1}}}, "inner.a.gian", "did you mean 'gain'"),
+        ({"inner": {"a": None}}, "inner.a", "is empty"),
+        ({"either": []}, "either", "a whole number or text: index or name"),
+        ({"either": True}, "either", "a whole number or text"),
+    ],
+)
+def test_faults_deep_inside_are_named_by_their_whole_key(value: object, key: str, said: str):
+    with pytest.raises(SettingsError) as caught:
+        to_settings(value, _Outer)
+    assert caught.value.fault.key == key
+    assert said in str(caught.value)
+
+
+def test_typed_settings_keep_what_is_right():
+    value = to_settings({"rows": [[1, 2.5]], "inner": {"a": {"mode": "slow"}}, "either": "x"}, _Outer)
+    assert value == _Outer(rows=((1.0, 2.5),), inner={"a": _Inner(mode="slow")}, either="x")
+
+
+@pytest.mark.parametrize("name", ["demo.yaml", "folder.yaml", "live_camera.yaml"])
+def test_shipped_configurations_are_sound_and_every_key_says_its_unit(name: str):
+    path = builtin_config(name)
+    load_config(path, check_source=False)
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        has_value = re.match(r"\s*\w+: *[^#\s]", line)
+        assert not has_value or " # " in line, f"{path}:{number}: a comment with the unit or the choices is missing"
+
+
+@pytest.mark.parametrize("name", ["two_box_fingers", "adaptive_arc_fingers"])
+def test_shipped_grippers_close_to_the_tcp(name: str):
+    """The innermost corners of both fingers meet at opening 0, and lie symmetric about the TCP at every opening."""
+    gripper = load_gripper(GRIPPERS / f"{name}.yaml")
+    inner = [gripper.point_ids.index(f"{side}_in_{which}") for which in ("near", "far") for side in ("L", "R")]
+    for opening_m in np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, 7):
+        corners = gripper.points_grip_m(float(opening_m))[inner]
+        np.testing.assert_allclose(corners[1::2, 0] - corners[0::2, 0], opening_m, atol=1e-9)
+        np.testing.assert_allclose(corners[:, :2].mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_adaptive_fingertips_stay_on_their_arc():
+    """Between two rows of the table too: within the sagitta of a 2.5 mm chord on a 57.3 mm radius."""
+    gripper = load_gripper(GRIPPERS / "adaptive_arc_fingers.yaml")
+    tip = gripper.point_ids.index("R_in_near")
+    places = np.array([gripper.points_grip_m(float(o))[tip] for o in np.linspace(0.0, 0.08, 161)])
+    radius_m, top_x_m = 0.0573, 0.006
+    top_z_m = places[:, 2].max()
+    distance_m = np.hypot(places[:, 0] - top_x_m, places[:, 2] - top_z_m + radius_m)
+    assert np.ptp(places[:, 2]) > 0.009
+    np.testing.assert_allclose(distance_m, radius_m, atol=0.0025**2 / 8 / 0.0573)
+
+
+def test_scenarios_load_and_refuse(tmp_path: Path):
+    path = tmp_path / "s.yaml"
+    path.write_text("name: mine\nduration_s: 2\nmount:\n  - {kind: bump, at_s: 1, tcp_shift_m: [0.0, 0.0045]}\n")
+    scenario = load_scenario(path)
+    assert (scenario.name, scenario.mount[0].tcp_shift_m) == ("mine", (0.0, 0.0045))
+    path.write_text("name: mine\nmount:\n  - {kind: bmp}\n")
+    with pytest.raises(ConfigError, match=r"mount\[0\].kind: is 'bmp', did you mean 'bump'"):
+        load_scenario(path)
