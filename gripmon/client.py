@@ -149,7 +149,7 @@ class Client:
             self._heard = name
         elif name != self._heard:
             raise LookupError(
-                f"{self.keys['*']} is more than one monitor ({self._heard}, {name}): name the one to follow"
+                f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
 
 

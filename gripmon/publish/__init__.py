@@ -1,0 +1,34 @@
+"""What the monitor says on the network, and the jaw opening that it hears there: one Zenoh session.
+
+Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.records`):
+
+``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested
+``state``      once a second and on every change; late joiners get the last one
+``reference``  on every new revision; late joiners get the last one
+``alert``      when there is one; an advanced subscriber with history gets the last 32
+``alive``      liveliness token, gone as soon as the process is
+``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
+
+"Late joiners get the last one" holds both ways that people ask: a plain ``get`` on the key (a queryable answers it),
+and an advanced subscriber with history (``zenoh.ext``).
+"""
+
+from __future__ import annotations
+
+from gripmon.publish.jaw import JawReading, ZenohJaw
+from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
+from gripmon.publish.session import zenoh_config
+from gripmon.publish.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings
+
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "JawReading",
+    "Keys",
+    "NullPublisher",
+    "PublishError",
+    "PublishSettings",
+    "Publisher",
+    "ZenohJaw",
+    "ZenohPublisher",
+    "zenoh_config",
+]

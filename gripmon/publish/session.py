@@ -1,0 +1,67 @@
+"""From settings to an open Zenoh session, with errors that name the key."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import msgspec
+import zenoh
+
+from gripmon.publish.settings import PublishError, PublishSettings
+
+
+def zenoh_config(settings: PublishSettings) -> zenoh.Config:
+    """Zenoh's own configuration for these settings.  Raises :class:`PublishError`."""
+    defaults = PublishSettings()
+    if settings.zenoh_config is not None:
+        for key in ("mode", "listen", "connect", "multicast_scouting"):
+            if getattr(settings, key) != getattr(defaults, key):
+                raise PublishError(f"publish.{key}: has no effect beside publish.zenoh_config; say it in that file")
+        if not Path(settings.zenoh_config).is_file():
+            raise PublishError(
+                f"publish.zenoh_config: no file {settings.zenoh_config}; give a json5 or yaml file of Zenoh's"
+            )
+        try:
+            return zenoh.Config.from_file(settings.zenoh_config)
+        except zenoh.ZError as error:
+            raise PublishError(f"publish.zenoh_config: {settings.zenoh_config}: {in_short(error)}") from error
+    if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
+        raise PublishError("publish.connect: a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
+    config = zenoh.Config()
+    listen = settings.listen if settings.mode == "peer" else ()
+    entries = {
+        "mode": settings.mode,
+        "listen/endpoints": listen,
+        "listen/exit_on_failure": True,
+        "connect/endpoints": settings.connect,
+        "scouting/multicast/enabled": settings.multicast_scouting,
+        # An express message takes a whole place in the queue, of which there are two: 33 ms without a slice of the
+        # processor would lose a frame.
+        "transport/link/tx/queue/size/real_time": 8,
+    }
+    for key, value in entries.items():
+        try:
+            config.insert_json5(key, msgspec.json.encode(value).decode())
+        except zenoh.ZError as error:
+            raise PublishError(f"publish.{key.split('/')[0]}: {in_short(error)}") from error
+    return config
+
+
+def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:
+    """Raises :class:`PublishError` that names the key."""
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        keys = [f"publish.{key}" for key in ("listen", "connect") if getattr(settings, key)]
+        key = " or ".join(keys) if settings.zenoh_config is None else "publish.zenoh_config"
+        if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
+            key = key.split(" or ")[0]
+            remedy = "stop the program that has it, or choose another port"
+            raise PublishError(f"{key}: {taken[1]} is already in use; {remedy}") from error
+        raise PublishError(f"{key}: can't open a Zenoh session: {in_short(error)}") from error
+
+
+def in_short(error: zenoh.ZError) -> str:
+    """Zenoh's message without the places in its source files."""
+    return re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).strip()

@@ -1,0 +1,71 @@
+"""What a person may set about the network, and the names of the keys."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
+_NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
+
+Endpoint = Annotated[
+    str, msgspec.Meta(pattern=_ENDPOINT_PATTERN, description="a Zenoh endpoint, e.g. tcp/127.0.0.1:7447")
+]
+
+
+class PublishError(ValueError):
+    """The session can't be opened as configured; the text is ``key: what is wrong; what would be right``."""
+
+
+class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How to join the network.  The default is a peer that listens on loopback only and looks for nobody."""
+
+    enabled: Annotated[bool, msgspec.Meta(description="false: nothing is published")] = True
+    mode: Annotated[
+        Literal["peer", "client"],
+        msgspec.Meta(description="peer: listens and connects; client: connects to a router, and waits for it"),
+    ] = "peer"
+    listen: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="where a peer listens; empty: nowhere")] = (
+        DEFAULT_ENDPOINT,
+    )
+    connect: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="peers or routers to connect to")] = ()
+    multicast_scouting: Annotated[bool, msgspec.Meta(description="look for others by UDP multicast")] = False
+    zenoh_config: Annotated[
+        str | None, msgspec.Meta(description="a Zenoh configuration file (json5, json, yaml) instead of the keys above")
+    ] = None
+    retry_first_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="client without a router: first pause before the next attempt (s)")
+    ] = 0.25
+    retry_max_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 8.0
+    jaw_max_age_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="a jaw opening received longer ago than this is not used (s)")
+    ] = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one monitor: ``Keys("arm", "wrist")["state"]``.  For readers a name may be ``*``: any."""
+
+    robot: str
+    camera: str
+
+    def __post_init__(self) -> None:
+        for role, name in (("robot", self.robot), ("camera", self.camera)):
+            if name != "*":
+                check_name(role, name)
+
+    def __getitem__(self, leaf: str) -> str:
+        return f"gripmon/{self.robot}/{self.camera}/{leaf}"
+
+
+def check_name(role: str, name: str) -> None:
+    """Raise ValueError unless the name can be one chunk of a Zenoh key."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{role} name {name!r} can't be part of a Zenoh key; give at least one character, none of them a space or "
+            "one of / * $ # ?, and no @ in front"
+        )
