@@ -1,0 +1,371 @@
+"""The command line as its users meet it: exit codes, one-line faults, help, files on disk, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from gripmon.cli import demo, main
+from gripmon.cli.comparison import compare
+from gripmon.config import builtin_config, load_config
+from gripmon.geometry import from_record, make_transform, to_record
+from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.simulator import FrameTruth
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMANDS = ("demo", "run", "replay", "simulate", "check")
+GRIPMON = (sys.executable, "-m", "gripmon")
+
+
+def gripmon(*arguments: str | Path, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
+    """Run the command in a process of its own."""
+    return subprocess.run([*GRIPMON, *map(str, arguments)], capture_output=True, text=True, timeout=timeout_s, cwd=ROOT)
+
+
+def start(*arguments: str | Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*GRIPMON, *map(str, arguments)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT
+    )
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture
+def live_simulation(tmp_path: Path) -> Path:
+    """A configuration of a simulated camera that goes on for ever, on a free port."""
+    text = builtin_config("demo.yaml").read_text()
+    text = text.replace("7447", str(free_port())).replace("fps: 60.0", "fps: 20.0")
+    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
+    path = tmp_path / "live.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A short simulated sequence on disk."""
+    out = tmp_path_factory.mktemp("simulated") / "creep"
+    assert main(["simulate", "creep", "--out", str(out), "--seconds", "1", "--fps", "8", "--seed", "5"]) == 0
+    return out
+
+
+def test_alone_it_prints_its_help(capsys: pytest.CaptureFixture[str]):
+    assert main([]) == 0
+    text = capsys.readouterr().out
+    assert all(re.search(rf"^\s+{command} ", text, re.MULTILINE) for command in COMMANDS)
+    assert "exit codes" in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_explains_every_argument(command: str, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main([command, "--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "examples:" in text and f"gripmon {command}" in text
+    options = re.findall(r"^  (--?[\w-]+(?:, --[\w-]+)?|\w+)\b.*$", text.split("examples:")[0], re.MULTILINE)
+    assert options
+    assert not re.search(r"^  (--\S+( [A-Z.]+)?|[A-Z]+)\s*\n  (-|\w)", text, re.MULTILINE), (
+        "an argument without a help text"
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["nonsense"],
+        ["run"],
+        ["replay", "x"],
+        ["demo", "--seconds", "-3"],
+        ["demo", "--seconds", "nan"],
+        ["demo", "--fps", "fast"],
+        ["simulate", "bump", "--out", "x", "--seed", "-1"],
+        ["check", "x.yaml", "--jsn"],
+    ],
+)
+def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    assert ended.value.code == 2
+    assert "gripmon" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["check"], ["run"], ["replay", ".", "--out", "-", "--config"]])
+def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(tmp_path: Path, command: list[str]):
+    path = tmp_path / "broken.yaml"
+    path.write_text(builtin_config("demo.yaml").read_text().replace("fx_px: 962.0", "fx_px: 0.9"))
+    done = gripmon(*command, path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    lines = done.stderr.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"{path}: camera.fx_px: 0.9 ")
+    assert "right would be" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["check", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
+        (["run", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
+        (["replay", "nowhere", "--config", "{config}", "--out", "-"], "nowhere: there is no such file or folder"),
+        (["replay", "{folder}", "--config", "{config}", "--out", "-"], "no image in"),
+        (["replay", "{config}", "--config", "{config}", "--out", "-"], "can't be opened as a video"),
+        (["simulate", "nonsense", "--out", "{folder}/x"], "there is no 'nonsense'; one of demo, "),
+        (["simulate", "bump", "--out", "{folder}/.."], "is not empty"),
+        (["simulate", "bump"], "--out DIR"),
+        (["simulate", "{folder}/s.yaml", "--out", "{folder}/x"], "there is no such file"),
+        (["simulate", "series1", "--fps", "3", "--out", "{folder}/x"], "neither duration_s nor fps"),
+        (["demo", "--seconds", "1"], "at least"),
+        (["demo", "--out", "{config}"], "can't be made"),
+    ],
+)
+def test_other_faults_end_with_2_and_one_line(
+    tmp_path: Path, arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "empty"
+    folder.mkdir()
+    filled = [a.format(config=builtin_config("demo.yaml"), folder=folder) for a in arguments]
+    assert main(filled) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and said in lines[0]
+
+
+def test_check_says_what_the_calibration_expects(capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(builtin_config("demo.yaml"))]) == 0
+    text = capsys.readouterr().out
+    assert "corners    6 of 8 visible" in text and "10 of 16 visible" in text
+    assert main(["check", str(builtin_config("demo.yaml")), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    hidden = {c["id"] for c in report["corners"] if not c["visible"]}
+    assert hidden == {"L_out_far", "R_out_far"}
+    assert math.isclose(report["reference"]["distance_m"], math.hypot(0.0004, 0.0014, 0.1188), rel_tol=1e-9)
+    assert report["source"] == {"kind": "simulator", "reachable": True, "detail": "made by this program"}
+
+
+def test_check_tells_a_camera_that_is_absent_from_one_that_answers(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    text = builtin_config("live_camera.yaml").read_text()
+    text = text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/")
+    path = tmp_path / "live.yaml"
+    path.write_text(text.replace("device: 0 ", f"device: rtsp://127.0.0.1:{free_port()}/wrist "))
+    assert main(["check", str(path)]) == 3
+    assert "NOT REACHABLE" in capsys.readouterr().out
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        path.write_text(text.replace("device: 0 ", f"device: rtsp://127.0.0.1:{server.getsockname()[1]}/wrist "))
+        assert main(["check", str(path)]) == 0
+    assert "answers" in capsys.readouterr().out
+
+
+def test_check_refuses_images_that_the_calibration_does_not_belong_to(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    text = (sequence / "config.yaml").read_text()
+    path = tmp_path / "other.yaml"
+    path.write_text(
+        text.replace("width_px: 768", "width_px: 640")
+        .replace("path: .", f"path: {sequence}")
+        .replace("gripper.yaml", str(sequence / "gripper.yaml"))
+    )
+    assert main(["check", str(path)]) == 2
+    assert "is 768 x 576" in capsys.readouterr().err
+
+
+def test_a_simulated_sequence_carries_its_truth_and_a_configuration_that_agrees(sequence: Path):
+    truths = [json.loads(line) for line in (sequence / "truth.jsonl").read_text().splitlines()]
+    stamps = (sequence / "timestamps.csv").read_text().splitlines()
+    images = sorted(path.name for path in sequence.glob("*.png"))
+    assert stamps[0] == "file,stamp_ns,jaw_opening_m"
+    assert [line.split(",")[0] for line in stamps[1:]] == [t["file"] for t in truths] == images
+    assert len(images) == 8
+    config = load_config(sequence / "config.yaml")
+    assert config.settings.jaw.source == "frames"
+    np.testing.assert_allclose(config.cam_T_grip, truths[0]["cam_T_grip"], atol=1e-12)
+    corners = {c["id"]: c["uv_px"] for c in truths[0]["corners"]}
+    for name, uv in zip(config.gripper.corner_ids, config.view().corners_px, strict=True):
+        np.testing.assert_allclose(uv, corners[name], atol=1e-6)
+    assert np.linalg.norm(truths[-1]["tcp_shift_m"]) > 1e-3, "the creep has moved the TCP"
+
+
+def test_the_seed_decides_what_is_simulated(sequence: Path, tmp_path: Path):
+    for name, seed in (("same", "5"), ("other", "6")):
+        arguments = ["simulate", "creep", "--out", str(tmp_path / name), "--seconds", "1", "--fps", "8", "--seed", seed]
+        assert main(arguments) == 0
+    image = "000003.png"
+    assert (tmp_path / "same" / image).read_bytes() == (sequence / image).read_bytes()
+    assert (tmp_path / "other" / image).read_bytes() != (sequence / image).read_bytes()
+
+
+def test_a_scenario_file_on_an_own_gripper(tmp_path: Path):
+    scenario = tmp_path / "s.yaml"
+    scenario.write_text("name: mine\nduration_s: 0.2\nfps: 10\n")
+    config = tmp_path / "c.yaml"
+    text = builtin_config("live_camera.yaml").read_text()
+    config.write_text(text.replace("gripper: grippers/", f"gripper: {builtin_config('demo.yaml').parent}/grippers/"))
+    assert main(["simulate", str(scenario), "--config", str(config), "--out", str(tmp_path / "out")]) == 0
+    assert load_config(tmp_path / "out" / "config.yaml").gripper.name == "adaptive_arc_fingers"
+    assert len(list((tmp_path / "out").glob("*.png"))) == 2
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_a_signal_stops_the_daemon_with_everything_written(
+    live_simulation: Path, tmp_path: Path, number: int, code: int
+):
+    out = tmp_path / "out"
+    with start("run", live_simulation, "--out", out) as process:
+        wait_for(lambda: (out / "estimates.jsonl").exists() and (out / "estimates.jsonl").stat().st_size > 0, process)
+        sent_s = time.monotonic()
+        process.send_signal(number)
+        _, err = process.communicate(timeout=20)
+        took_s = time.monotonic() - sent_s
+    assert process.returncode == code, err
+    assert "Traceback" not in err
+    assert took_s < 5.0, "2 s are promised; a loaded test machine gets more"
+    lines = (out / "estimates.jsonl").read_bytes().splitlines()
+    assert [msgspec.json.decode(line, type=FrameRecord).seq for line in lines] == sorted(
+        json.loads(x)["seq"] for x in lines
+    )
+    assert list(out.glob("*.rrd"))
+
+
+def test_run_ends_after_its_duration(live_simulation: Path, tmp_path: Path):
+    done = gripmon("run", live_simulation, "--duration", "1.5", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    lines = (tmp_path / "out" / "estimates.jsonl").read_text().splitlines()
+    assert 5 <= len(lines) <= 31
+
+
+def test_ctrl_c_in_simulate_leaves_no_traceback(tmp_path: Path):
+    out = tmp_path / "out"
+    with start("simulate", "clutter", "--out", out) as process:
+        wait_for(lambda: (out / "000002.png").exists(), process)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert err.strip() == "gripmon: interrupted"
+
+
+def test_the_demo_keeps_what_it_promises(tmp_path: Path):
+    out = tmp_path / "demo"
+    done = gripmon("demo", "--seconds", "8", "--fps", "20", "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    records = [
+        msgspec.json.decode(line, type=FrameRecord) for line in (out / "estimates.jsonl").read_bytes().splitlines()
+    ]
+    assert len(list(out.glob("*.rrd"))) == 1 and summary["recordings"] == ["demo-0001.rrd"]
+    assert summary["frames"] == len(records) > 100
+    assert summary["transforms_received"] == summary["frames"]
+    comparison = summary["comparison"]
+    assert comparison["without_correction"]["across_mm"]["max"] > 4.0
+    assert comparison["after_correction"]["across_mm"]["p95"] < 0.02
+    assert comparison["after_correction"]["along_mm"]["p95"] < 0.06
+    assert comparison["after_correction"]["frames"] > 0.6 * len(records)
+    assert {"creep", "bump", "occlusion"} <= {event["event"] for event in comparison["events"]}
+    assert all(
+        e["noticed_after_s"] is not None for e in comparison["events"] if e["event"] in ("creep", "bump", "occlusion")
+    )
+    assert "after correction" in done.stdout and "rerun " in done.stdout
+
+
+def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = server.getsockname()[1]
+        monkeypatch.setattr(demo, "_PREFERRED_PORT", taken)
+        assert demo._free_port() != taken
+    assert demo._free_port() == taken
+
+
+def test_a_reader_that_has_seen_enough_is_no_fault(sequence: Path):
+    """``gripmon replay … --out - | head -0``: the pipe is closed before the first line."""
+    arguments = [*GRIPMON, "replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", "-"]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        err = process.stderr.read()
+    assert "Traceback" not in err and "BrokenPipe" not in err
+    assert process.returncode == 141
+
+
+def test_one_thread_for_linear_algebra_unless_the_user_says_otherwise():
+    code = "import os; from gripmon.cli import main; main(['simulate', '--list']); print(os.environ['OMP_NUM_THREADS'])"
+    for given, expected in ((None, "1"), ("2", "2")):
+        environment = {k: v for k, v in os.environ.items() if k != "OMP_NUM_THREADS"}
+        if given is not None:
+            environment["OMP_NUM_THREADS"] = given
+        done = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment, cwd=ROOT
+        )
+        assert done.stdout.splitlines()[-1] == expected
+
+
+def wait_for(condition: Any, process: subprocess.Popen[str], timeout_s: float = 60.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline_s, "it never came"
+        time.sleep(0.05)
+
+
+def record(seq: int, error_m: tuple[float, float, float], **changes: Any) -> FrameRecord:
+    transform = to_record(make_transform(np.eye(3), np.array([0.0, 0.0, 0.1]) + truth_shift_m(seq) + error_m))
+    values: dict[str, Any] = {
+        "seq": seq, "stamp_ns": seq, "verdict": Verdict.VALID, "state": State.TRACKING, "source": Origin.UPDATE,
+        "cam_T_grip": transform, "covariance": None, "smoothed": None, "drift": None, "reference_id": "r", "revision": 0,
+        "rms_px": None, "jaw_opening_m": None, "corners": (), "alerts": (),
+    }  # fmt: skip
+    return FrameRecord(**{**values, **changes})
+
+
+def truth_shift_m(seq: int) -> np.ndarray:
+    return np.array([0.003, 0.004, 0.0]) if seq >= 4 else np.zeros(3)
+
+
+def truth(seq: int) -> FrameTruth:
+    shift_m = truth_shift_m(seq)
+    reference = make_transform(np.eye(3), np.array([0.0, 0.0, 0.1]))
+    moved = make_transform(np.eye(3), reference[:3, 3] + shift_m)
+    events = (("bumped",) if seq >= 4 else ()) + (("hand",) if seq in (7, 8) else ())
+    return FrameTruth(
+        index=seq, time_s=0.1 * seq, stamp_ns=seq, cam_T_grip=moved, reference_cam_T_grip=reference, tcp_shift_m=shift_m,
+        jaw_opening_m=0.0, jaw_reported_m=None, corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(),
+        finger_bend=np.zeros((0, 4, 4)), events=events, exposure=1.0, defocus_px=0.0,
+    )  # fmt: skip
+
+
+def test_the_comparison_counts_by_hand():
+    jump = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "it moved")
+    records = [record(i, (3e-6, 4e-6, -2e-6)) for i in range(5)]
+    records += [record(5, (0.0, 0.0, 1e-5), alerts=(jump,)), record(6, (1.0, 1.0, 1.0), verdict=Verdict.SUSPECT)]
+    records += [
+        record(7, (1.0, 0.0, 0.0), source=Origin.HELD),
+        record(8, (0.0, 0.0, 0.0), state=State.OCCLUDED, cam_T_grip=None),
+    ]
+    result = compare(records, truth)
+    assert result.verdicts == {"valid": 8, "suspect": 1, "unknown": 0}
+    assert result.without_correction.across_mm.max == pytest.approx(5.0)
+    assert result.after_correction.frames == 6, "suspect, held and missing transforms are not counted"
+    assert result.after_correction.across_mm.mean == pytest.approx(5 * 5e-3 / 6)
+    assert result.after_correction.along_mm.max == pytest.approx(1e-2)
+    assert result.smoothed.frames == 0 and result.smoothed.across_mm.mean is None
+    bump, occlusion = result.events
+    assert (bump.event, bump.frames, occlusion.event, occlusion.frames) == ("bump", 3, "occlusion", 2)
+    assert bump.noticed_after_s == pytest.approx(0.1) and "camera_mount_moved" in str(bump.noticed_as)
+    assert occlusion.noticed_as == "state occluded"
+    assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]
