@@ -46,8 +46,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "input",
         metavar="INPUT",
-        help="a folder of images, taken in the order of their names, or a video file; a timestamps.csv may lie in the "
-        "folder, with the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
+        help="a folder of images, taken in the order of their names, a video file, or an .rrd recording of ours; a "
+        "timestamps.csv may lie in the folder, with the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
     )
     parser.add_argument(
         "--config", required=True, metavar="CONFIG", help="configuration (YAML); its source section is not used"
@@ -168,19 +168,27 @@ def _open_input(path: Path, config: Config, fps: float | None) -> Source:
 
     if not path.exists():
         raise common.CommandFailedError(
-            f"{path}: there is no such file or folder; a folder of images or a video", common.EXIT_USAGE
+            f"{path}: there is no such file or folder; a folder of images, a video or an .rrd", common.EXIT_USAGE
         )
-    if path.suffix.lower() == ".rrd":
-        raise common.CommandFailedError(
-            f"{path}: replay of .rrd recordings is not supported yet; a folder of images or a video", common.EXIT_USAGE
-        )
-    settings = settings_for_path(path)
-    if fps is not None:
-        settings = msgspec.structs.replace(settings, fps=fps)
     try:
+        if path.suffix.lower() == ".rrd":
+            return _open_recording(path)
+        settings = settings_for_path(path)
+        if fps is not None:
+            settings = msgspec.structs.replace(settings, fps=fps)
         return open_source(settings)
     except SourceError as error:
         raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+
+
+def _open_recording(path: Path) -> Source:
+    from gripmon.recording.replayed import RecordedFrames
+
+    frames = RecordedFrames(path)
+    if frames.frames_without_image:
+        others = f"{frames.frames_without_image} more were recorded without"
+        print(f"replay: {path} holds images of {len(frames)} frames; {others}", file=sys.stderr)
+    return frames
 
 
 @contextmanager
