@@ -7,6 +7,7 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -24,10 +25,12 @@ _log = logging.getLogger(__name__)
 HANDOVER_PERIOD_S = 0.05
 BATCH_FRAMES = 16
 LONGEST_RESTART_PAUSE_S = 30.0
+_STOPPED_TIMEOUT_S = 2.0
 _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
-_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, Vector | None]
+Truth = Callable[[int], Vector | None]
+_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None]
 _T = TypeVar("_T")
 
 
@@ -43,13 +46,7 @@ class Recorder(Protocol):
     @property
     def failure(self) -> str | None: ...
 
-    def offer(
-        self,
-        frame: Frame,
-        record: FrameRecord,
-        trace: MeasurementTrace | None,
-        truth_tcp_shift_m: Vector | None = None,
-    ) -> None: ...
+    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None: ...
     def alert(self, alert: AlertRecord) -> None: ...
     def reference(self, reference: ReferenceRecord) -> None: ...
     def close(self, timeout_s: float = 2.0) -> None: ...
@@ -61,13 +58,7 @@ class NullRecorder:
     dropped = 0
     failure: str | None = None
 
-    def offer(
-        self,
-        frame: Frame,
-        record: FrameRecord,
-        trace: MeasurementTrace | None,
-        truth_tcp_shift_m: Vector | None = None,
-    ) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
         pass
 
     def alert(self, alert: AlertRecord) -> None:
@@ -90,10 +81,13 @@ def open_recorder(
     reference: ReferenceRecord,
     directory: Path | None = None,
     name: str | None = None,
+    truth_tcp_m: Truth | None = None,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
 
-    ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  Raises OSError
+    ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  ``truth_tcp_m``,
+    which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
+    the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  Raises OSError
     when the directory can't be made.
     """
     if not settings.enabled:
@@ -103,7 +97,7 @@ def open_recorder(
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
     scene = make_scene(settings, str(folder.resolve()), name, robot, camera_name, camera, gripper, reference)
-    return ProcessRecorder(scene)
+    return ProcessRecorder(scene, truth_tcp_m)
 
 
 class ProcessRecorder:
@@ -115,13 +109,15 @@ class ProcessRecorder:
     frames are dropped and counted.  When it dies, it is started again and begins a new file.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None):
         settings = scene.settings
         self._scene = scene
+        self._truth_tcp_m = truth_tcp_m
         self._queue_frames = settings.queue_frames
         self._queue_images = settings.queue_images
         self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
         # Written by the loop's thread only.
+        self._queued = 0
         self._not_queued = 0
         self._images_offered = 0
         self._images_not_queued = 0
@@ -138,6 +134,7 @@ class ProcessRecorder:
         self._written_earlier = 0
         self._newest_reference = scene.reference
         self._own_failure: str | None = None
+        self._stopped: str | None = None
         self._restart_pause_s = 1.0
         self._restart_at = 0.0
         self._encode = msgspec.msgpack.Encoder().encode
@@ -178,27 +175,22 @@ class ProcessRecorder:
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def offer(
-        self,
-        frame: Frame,
-        record: FrameRecord,
-        trace: MeasurementTrace | None,
-        truth_tcp_shift_m: Vector | None = None,
-    ) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
         if len(self._frames) >= self._queue_frames:
             self._not_queued += 1
             return
         shown = (record.state, record.verdict, record.reference_id, record.revision)
+        self._queued += 1
         due = self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
         self._shown = shown
         if due and self._images_offered - self._images_taken < self._queue_images:
             self._images_offered += 1
             self._image_stamp_ns = record.stamp_ns
-            self._frames.append((record, True, frame.image, trace, truth_tcp_shift_m))
+            self._frames.append((record, True, frame.image, trace))
         else:
             self._images_not_queued += bool(due)
-            self._frames.append((record, False, None, None, truth_tcp_shift_m))
+            self._frames.append((record, False, None, None))
 
     def alert(self, alert: AlertRecord) -> None:
         """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
@@ -215,6 +207,8 @@ class ProcessRecorder:
         self._close_before = time.monotonic() + timeout_s
         self._closing.set()
         self._thread.join()
+        self._frames.clear()
+        self._lost_earlier = self._queued - self.frames_written - self._status.frames_lost
 
     def _image_is_due(self, stamp_ns: int) -> bool:
         if self._image_interval_ns is None:
@@ -226,12 +220,12 @@ class ProcessRecorder:
         try:
             while not self._closing.wait(HANDOVER_PERIOD_S):
                 self._hand_over()
-            self._finish()
+            self._hand_over_rest()
         except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
             _log.exception("recording stopped")
-            self._own_failure = f"internal error: {error!r}"
-            if self._worker is not None:
-                self._worker.reap(1.0)
+            self._stopped = f"internal error: {error!r}"
+            self._close_before = time.monotonic() + _STOPPED_TIMEOUT_S
+        self._finish()
 
     def _hand_over(self) -> None:
         worker = self._running_worker()
@@ -269,11 +263,12 @@ class ProcessRecorder:
     def _next_batch(self, worker: WorkerProcess) -> Batch:
         frames: list[FrameNote] = []
         while self._frames and len(frames) < BATCH_FRAMES:
-            record, shown, image, trace, truth_tcp_shift_m = self._frames.popleft()
+            record, shown, image, trace = self._frames.popleft()
             self._images_taken += shown
             note = None if image is None else self._share(worker, image)
             packed = None if trace is None else pack_trace(trace)
-            frames.append(FrameNote(record, note, packed, truth_tcp_shift_m))
+            truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
+            frames.append(FrameNote(record, note, packed, truth_tcp_m))
         worker.frames_sent += len(frames)
         references = _drain(self._references)
         if references:
@@ -292,23 +287,21 @@ class ProcessRecorder:
         worker.images_sent += 1
         return note
 
-    def _finish(self) -> None:
+    def _hand_over_rest(self) -> None:
         self._hand_over()
-        worker = self._worker
-        while worker is not None and self._frames and not worker.gone and time.monotonic() < self._close_before:
+        while self._frames and self._worker is not None and time.monotonic() < self._close_before:
             time.sleep(0.002)
             self._hand_over()
-            worker = self._worker
+
+    def _finish(self) -> None:
+        worker, self._worker = self._worker, None
         if worker is not None:
             failure = worker.finish(self._close_before)
             self._status = worker.status
-            self._lost_earlier += worker.frames_sent - worker.status.frames - worker.status.frames_lost
             self._own_failure = failure
             if failure is not None:
                 _log.error("recording incomplete: %s", failure)
-        self._lost_earlier += len(self._frames)
-        self._frames.clear()
-        self._worker = None
+        self._own_failure = self._stopped or self._own_failure
         self._ring.close()
 
 

@@ -122,6 +122,7 @@ class FileSeries:
             self._references.insert(0, self._newest_reference)
         self._stream, self._writer, self._file = stream, writer, path
         self._frames_in_file = 0
+        self._number += 1
         self.failure = None
         self._own_files.append(path)
         keep = self._scene.settings.keep_files

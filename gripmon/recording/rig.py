@@ -32,7 +32,6 @@ class RigWriter:
         self._edges = np.array(scene.edges, dtype=np.intp).reshape(-1, 2)
         self._triangles, self._face_points = _triangulate(scene.faces)
         self._drawn: tuple[float, Verdict] | None = None
-        self._reference_tcp_m: Array | None = None
         distance_m = float(np.linalg.norm(scene.reference.cam_T_grip.translation_m))
         send.static("rig", rr.ViewCoordinates.RDF)
         send.static(
@@ -74,7 +73,6 @@ class RigWriter:
                 translation=[reference.cam_T_grip.translation_m], quaternion=[reference.cam_T_grip.rotation_xyzw]
             )
             self._send.columns("rig/reference", [stamp_ns], [seq], columns)
-            self._reference_tcp_m = np.array(reference.cam_T_grip.translation_m)
 
     def _write_fingers(self, row: Row) -> None:
         """Redraw the fingers when the jaws moved or the verdict changed; without estimate there is nothing to show."""

@@ -51,7 +51,7 @@ class Row:
     record: FrameRecord
     picture: Picture | None
     trace: TraceNote | None
-    truth_tcp_shift_m: tuple[float, float, float] | None
+    truth_tcp_m: tuple[float, float, float] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +99,7 @@ class RowWriter:
         self._rig = RigWriter(self._send, scene)
         self._state = ""
         self._verdict = ""
+        self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
         self._log_static(scene)
 
     def write(self, rows: Sequence[Row], alerts: Sequence[AlertRecord], references: Sequence[ReferenceRecord]) -> None:
@@ -108,6 +109,8 @@ class RowWriter:
             Event(r.stamp_ns, rows[0].record.seq if rows else 0, "INFO", f"reference {r.reference_id} ({r.origin})")
             for r in references
         ]
+        for r in references:
+            self._reference_tcp_m[r.reference_id, r.revision] = r.cam_T_grip.translation_m
         if references:
             self._rig.write_references(references, rows)
         if rows:
@@ -148,8 +151,8 @@ class RowWriter:
         send.scalars("drift/tcp_shift_sigma_mm", rows, [_band_mm(r.record) for r in rows])
         send.curve("drift/d_mm", rows, [None if d is None else 1e3 * d.translation_m for d in drifts])
         send.curve("drift/delta_deg", rows, [None if d is None else math.degrees(d.rotation_rad) for d in drifts])
-        if any(r.truth_tcp_shift_m is not None for r in rows):
-            send.scalars("drift/truth_mm", rows, [_millimetres(r.truth_tcp_shift_m) for r in rows])
+        if any(r.truth_tcp_m is not None for r in rows):
+            send.scalars("drift/truth_mm", rows, [self._truth_mm(r) for r in rows])
         send.curve("quality/rms_px", rows, [r.record.rms_px for r in rows])
         send.curve("quality/corners_used", rows, [float(sum(c.used for c in r.record.corners)) for r in rows])
         send.curve("timing/latency_us", rows, [1e-3 * r.record.latency_ns for r in rows])
@@ -163,6 +166,13 @@ class RowWriter:
             send.curve("image/contrast_grey", shown, [p.contrast_grey for p in pictures])
             send.curve("image/saturated_percent", shown, [p.saturated_percent for p in pictures])
             send.curve("image/sharpness", shown, [p.sharpness for p in pictures])
+
+    def _truth_mm(self, row: Row) -> list[float]:
+        """The true TCP against the one of the reference that the frame names."""
+        reference_tcp_m = self._reference_tcp_m.get((row.record.reference_id, row.record.revision))
+        if row.truth_tcp_m is None or reference_tcp_m is None:
+            return []
+        return [1e3 * (true - old) for true, old in zip(row.truth_tcp_m, reference_tcp_m, strict=True)]
 
     def _status(self, rows: Sequence[Row]) -> list[Event]:
         """State and verdict where they change, and what happened as text."""

@@ -72,7 +72,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     record: FrameRecord
     image: ImageNote | None
     trace: TraceNote | None
-    truth_tcp_shift_m: tuple[float, float, float] | None
+    truth_tcp_m: tuple[float, float, float] | None
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):

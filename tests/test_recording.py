@@ -1,0 +1,386 @@
+"""What was offered is in the file: values, units, times, images, layout; read back with rerun's own reader."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from recorded import (
+    CAMERA,
+    GRIPPER,
+    HEIGHT_PX,
+    INTERVAL_NS,
+    REFERENCE,
+    START_NS,
+    WIDTH_PX,
+    Recorded,
+    decoded,
+    frame,
+    image,
+    record,
+    recorder,
+    trace,
+    wait_until,
+)
+
+from gripmon.geometry import rotation_from_xyzw
+from gripmon.recording import NullRecorder, RecordingSettings, open_recorder
+from gripmon.recording.wire import ImageRing, Unframer, framed
+from gripmon.recording.worker import to_8_bit
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    AlertRecord,
+    Cause,
+    FrameRecord,
+    MeasurementTrace,
+    Severity,
+    State,
+    Verdict,
+)
+
+COUNT = 24
+JUMP = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
+OVERLAY = "rig/camera/image"
+
+
+def story(i: int) -> FrameRecord:
+    """Tracking; a jump at 10, drifting from there; lost without an estimate from 20 to 21."""
+    if i in (20, 21):
+        return record(
+            i,
+            State.LOST,
+            Verdict.UNKNOWN,
+            cam_T_grip=None,
+            covariance=None,
+            drift=None,
+            rms_px=None,
+            jaw_opening_m=None,
+        )
+    if i >= 10:
+        return record(i, State.DRIFTING, Verdict.SUSPECT, (JUMP,) if i == 10 else ())
+    return record(i)
+
+
+def truth(i: int) -> tuple[float, float, float]:
+    return (0.001 * i, 0.0, 0.11)
+
+
+@pytest.fixture(scope="module")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """The story with every image, lossless."""
+    directory = tmp_path_factory.mktemp("story")
+    writer = recorder(directory, truth, image_rate_hz=1000.0, image_format="png", queue_images=32)
+    for i in range(COUNT):
+        writer.offer(frame(i), story(i), trace(i))
+    writer.alert(
+        AlertRecord(
+            robot="arm",
+            camera="wrist",
+            seq=COUNT,
+            stamp_ns=START_NS + COUNT * INTERVAL_NS,
+            state=State.STALE,
+            reference_id="first",
+            revision=1,
+            kind=AlertKind.SOURCE,
+            cause=Cause.NO_CAMERA,
+            severity=Severity.WARNING,
+            text="unplugged",
+        )
+    )
+    writer.close(10.0)
+    assert (writer.dropped, writer.images_dropped, writer.failure) == (0, 0, None)
+    assert writer.frames_written == COUNT
+    (path,) = directory.iterdir()
+    assert path.name == "run-0001.rrd"
+    return Recorded(path)
+
+
+def test_every_frame_carries_its_capture_time_and_number(told: Recorded) -> None:
+    cells = told.timed("record")
+    assert [cell.seq for cell in cells] == list(range(COUNT))
+    assert [cell.stamp_ns for cell in cells] == [START_NS + i * INTERVAL_NS for i in range(COUNT)]
+
+
+def test_the_whole_record_is_kept_to_the_last_digit(told: Recorded) -> None:
+    for i, (line,) in told.by_seq("record", "json").items():
+        assert msgspec.json.decode(line, type=FrameRecord) == story(i)
+
+
+def test_the_gripper_moves_as_estimated(told: Recorded) -> None:
+    translations = told.by_seq("rig/gripper", "translation")
+    quaternions = told.by_seq("rig/gripper", "quaternion")
+    assert set(translations) == set(range(COUNT)) - {20, 21}
+    for i in translations:
+        transform = story(i).cam_T_grip
+        assert transform is not None
+        np.testing.assert_allclose(translations[i][0], transform.translation_m, rtol=1e-6)
+        # Compared as rotation: a swapped order of the quaternion's components can't pass.
+        np.testing.assert_allclose(
+            rotation_from_xyzw(tuple(quaternions[i][0])), rotation_from_xyzw(transform.rotation_xyzw), atol=1e-6
+        )
+
+
+def test_the_reference_stands_where_it_was_calibrated(told: Recorded) -> None:
+    (cell,) = told.timed("rig/reference")
+    np.testing.assert_allclose(cell.values["translation"][0], REFERENCE.cam_T_grip.translation_m, rtol=1e-6)
+    np.testing.assert_allclose(cell.values["quaternion"][0], REFERENCE.cam_T_grip.rotation_xyzw, rtol=1e-6)
+
+
+def test_fingers_stand_at_the_reported_opening(told: Recorded) -> None:
+    for cell in told.timed("rig/gripper/edges"):
+        assert cell.seq is not None
+        expected = story(cell.seq)
+        strips = np.array(cell.values["strips"]).reshape(-1, 2, 3)
+        if expected.cam_T_grip is None:
+            assert len(strips) == 0
+        else:
+            points_m = GRIPPER.points_grip_m(expected.jaw_opening_m)
+            np.testing.assert_allclose(strips, points_m[GRIPPER.edge_points], atol=1e-8)
+
+
+def test_curves_have_people_s_units(told: Recorded) -> None:
+    shift = told.by_seq("drift/tcp_shift_mm", "scalars")
+    band = told.by_seq("drift/tcp_shift_sigma_mm", "scalars")
+    d, delta = told.by_seq("drift/d_mm", "scalars"), told.by_seq("drift/delta_deg", "scalars")
+    rms, latency = told.by_seq("quality/rms_px", "scalars"), told.by_seq("timing/latency_us", "scalars")
+    for i in set(range(COUNT)) - {20, 21}:
+        expected = story(i)
+        assert expected.drift is not None
+        shift_mm = 1e3 * np.array(expected.drift.tcp_shift_m)
+        np.testing.assert_allclose(shift[i], shift_mm, rtol=1e-12)
+        sigma_mm = np.array([0.01, 0.02, 0.03])
+        np.testing.assert_allclose(band[i], np.concatenate([shift_mm - sigma_mm, shift_mm + sigma_mm]), atol=1e-12)
+        np.testing.assert_allclose(d[i], [1e3 * expected.drift.translation_m])
+        np.testing.assert_allclose(delta[i], [np.degrees(expected.drift.rotation_rad)])
+        assert rms[i] == [expected.rms_px]
+        np.testing.assert_allclose(latency[i], [1e-3 * expected.latency_ns])
+
+
+def test_what_is_unknown_leaves_a_gap(told: Recorded) -> None:
+    for path in ("drift/tcp_shift_mm", "drift/tcp_shift_sigma_mm", "drift/d_mm", "drift/delta_deg", "quality/rms_px"):
+        values = told.by_seq(path, "scalars")
+        assert values[20] == [] and values[21] == [] and values[22] != []
+
+
+def test_truth_is_drawn_against_the_reference(told: Recorded) -> None:
+    for i, values in told.by_seq("drift/truth_mm", "scalars").items():
+        expected = 1e3 * (np.array(truth(i)) - REFERENCE.cam_T_grip.translation_m)
+        np.testing.assert_allclose(values, expected, rtol=1e-12)
+
+
+def test_images_are_the_frames_images(told: Recorded) -> None:
+    blobs = told.by_seq(OVERLAY, "blob")
+    assert set(blobs) == set(range(COUNT))
+    for i, blob in blobs.items():
+        np.testing.assert_array_equal(decoded(blob), image(i))
+    means = told.by_seq("image/mean_grey", "scalars")
+    contrasts = told.by_seq("image/contrast_grey", "scalars")
+    for i in means:
+        np.testing.assert_allclose([means[i][0], contrasts[i][0]], [image(i).mean(), image(i).std()], rtol=1e-9)
+
+
+def test_edge_points_are_sorted_by_belief(told: Recorded) -> None:
+    used, refused = (told.by_seq(f"{OVERLAY}/edges/{kind}", "positions") for kind in ("used", "refused"))
+    counts = told.by_seq("quality/edge_points", "scalars")
+    for i in range(COUNT):
+        expected = trace(i)
+        np.testing.assert_allclose(used[i], expected.edge_uv_px[expected.edge_used], rtol=1e-6)
+        np.testing.assert_allclose(refused[i], expected.edge_uv_px[~expected.edge_used], rtol=1e-6)
+        assert counts[i] == [expected.edge_used.sum(), (~expected.edge_used).sum()]
+
+
+def test_predictions_are_drawn(told: Recorded) -> None:
+    strips = told.by_seq(f"{OVERLAY}/edges/predicted", "strips")
+    corners = told.by_seq(f"{OVERLAY}/corners/predicted", "positions")
+    for i in range(COUNT):
+        expected = trace(i)
+        assert [len(strip) for strip in strips[i]] == [5, 2, 9]
+        for strip, edge in zip(strips[i], expected.predicted_edges_uv_px, strict=True):
+            np.testing.assert_allclose(strip, edge, rtol=1e-6)
+        seen = np.delete(expected.predicted_corners_uv_px, 2, axis=0)
+        np.testing.assert_allclose(corners[i], seen, rtol=1e-6)
+
+
+def test_corners_are_named_and_a_hidden_one_says_so_where_it_was_expected(told: Recorded) -> None:
+    used = told.by_seq(f"{OVERLAY}/corners/used", "positions")
+    refused = told.by_seq(f"{OVERLAY}/corners/refused", "positions")
+    names, reasons = (told.by_seq(f"{OVERLAY}/labels/{kind}", "labels") for kind in ("used", "refused"))
+    for i in range(COUNT):
+        measured = [corner for corner in story(i).corners if corner.used]
+        np.testing.assert_allclose(used[i], [corner.uv_px for corner in measured], rtol=1e-6)
+        assert names[i] == [corner.id for corner in measured]
+        np.testing.assert_allclose(refused[i], [trace(i).predicted_corners_uv_px[1]], rtol=1e-6)
+        assert reasons[i] == [f"{GRIPPER.corner_ids[1]}: hidden"]
+
+
+def test_states_are_recorded_where_they_change(told: Recorded) -> None:
+    states = {i: value for i, (value,) in told.by_seq("status/state", "state").items()}
+    verdicts = {i: value for i, (value,) in told.by_seq("status/verdict", "state").items()}
+    assert states == {0: "tracking", 10: "drifting", 20: "lost", 22: "drifting"}
+    assert verdicts == {0: "valid", 10: "suspect", 20: "unknown", 22: "suspect"}
+
+
+def test_alerts_are_in_the_log_with_their_level_and_time(told: Recorded) -> None:
+    events = [(c.seq, c.stamp_ns, c.values["level"][0], c.values["text"][0]) for c in told.timed("events")]
+    jump = [e for e in events if "moved by 4.5 mm" in e[3]]
+    assert jump == [(10, START_NS + 10 * INTERVAL_NS, "ERROR", "jump [camera_mount_moved] moved by 4.5 mm")]
+    assert (COUNT, START_NS + COUNT * INTERVAL_NS, "WARN", "source [no_camera] unplugged") in events
+    assert any(e[0] == 20 and "drifting (suspect) → lost (unknown)" in e[3] for e in events)
+
+
+def test_the_layout_is_embedded(told: Recorded) -> None:
+    for view in ("2D", "3D", "TimeSeries", "StateTimeline", "TextLog"):
+        assert any(f"'{view}'" in text for text in told.blueprint), view
+    assert any("capture_time" in text for text in told.blueprint)
+    paths = {*told.cells}
+    for origin in ("rig/camera/image", "events", "drift/tcp_shift_mm", "drift/truth_mm", "status/state"):
+        assert origin in paths
+
+
+def test_camera_matches_the_configured_one(told: Recorded) -> None:
+    (cell,) = [cell for cell in told.cells["rig/camera"] if "image_from_camera" in cell.values]
+    matrix = np.array(cell.values["image_from_camera"][0]).reshape(3, 3).T
+    np.testing.assert_allclose(matrix, [[CAMERA.fx_px, 0, CAMERA.cx_px], [0, CAMERA.fy_px, CAMERA.cy_px], [0, 0, 1]])
+    assert cell.values["resolution"] == [[WIDTH_PX, HEIGHT_PX]]
+
+
+def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64)
+    for i in range(60):
+        state = State.DRIFTING if i in (31, 32) else State.TRACKING
+        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 45 else ()), trace(i))
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    told = Recorded(path)
+    assert told.seqs() == list(range(60))
+    shown = set(told.by_seq(OVERLAY, "blob"))
+    # Six frames to 100 ms; a change or an alert shows its frame and begins a new interval.
+    assert shown == {0, 6, 12, 18, 24, 30, 31, 33, 39, 45, 51, 57}
+    assert set(told.by_seq(f"{OVERLAY}/edges/used", "positions")) == shown
+
+
+def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    writer.offer(frame(0), record(0), None)
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    told = Recorded(path)
+    (cell,) = told.timed(OVERLAY)
+    assert cell.values["media_type"] == ["image/jpeg"]
+    difference = decoded(cell.values["blob"]).astype(float) - image(0)
+    assert np.abs(difference).max() < 12.0
+
+
+@pytest.mark.parametrize(
+    "picture",
+    [
+        np.zeros((3, 4, 5, 6), np.uint8),
+        np.zeros((0, 4), np.uint8),
+        np.zeros((HEIGHT_PX, WIDTH_PX, 7), np.uint8),
+        np.zeros((10 * HEIGHT_PX, 10 * WIDTH_PX), np.float32),
+        np.array(["no", "image"], dtype=object),
+    ],
+)
+def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.ndarray) -> None:
+    refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image")
+    writer = recorder(tmp_path)
+    writer.offer(frame(0), record(0), trace(0))
+    writer.offer(frame(1, picture), refused, None)
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    told = Recorded(path)
+    assert (told.seqs(), set(told.by_seq(OVERLAY, "blob"))) == ([0, 1], {0})
+    overlay = told.by_seq(f"{OVERLAY}/edges/used", "positions")
+    assert overlay[0] != [] and overlay[1] == []
+
+
+def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
+    none = np.empty((0, 2))
+    empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), (), np.full((8, 2), np.nan))
+    writer = recorder(tmp_path)
+    writer.offer(frame(0), record(0, corners=()), empty)
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    assert Recorded(path).by_seq("quality/edge_points", "scalars") == {0: [0.0, 0.0]}
+
+
+def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
+    script = (
+        "import sys; from pathlib import Path; from recorded import *; w = recorder(Path(sys.argv[1]));"
+        "w.offer(frame(0), record(0), trace(0)); w.close(10.0);"
+        "assert w.frames_written == 1, w.failure; assert 'rerun' not in sys.modules"
+    )
+    here = Path(__file__).parent
+    subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path[:0] = [{str(here)!r}, {str(here.parent)!r}]; {script}", tmp_path],
+        check=True,
+    )
+
+
+def test_disabled_recording_touches_nothing(tmp_path: Path) -> None:
+    writer = open_recorder(
+        RecordingSettings(enabled=False),
+        robot="arm",
+        camera_name="wrist",
+        camera=CAMERA,
+        gripper=GRIPPER,
+        reference=REFERENCE,
+        directory=tmp_path / "none",
+    )
+    assert isinstance(writer, NullRecorder)
+    writer.offer(frame(0), record(0), None)
+    writer.close()
+    assert not (tmp_path / "none").exists()
+
+
+def test_an_old_file_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "run-0001.rrd").write_bytes(b"precious")
+    writer = recorder(tmp_path)
+    wait_until(lambda: writer.path is not None)
+    assert writer.path == tmp_path / "run-0002.rrd"
+    writer.close(10.0)
+    assert (tmp_path / "run-0001.rrd").read_bytes() == b"precious"
+
+
+@given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))
+def test_messages_survive_any_cutting(payloads: list[bytes], cut: int) -> None:
+    stream = b"".join(framed(payload) for payload in payloads)
+    unframer = Unframer()
+    found = [p for i in range(0, len(stream), cut) for p in unframer.feed(stream[i : i + cut])]
+    assert found == payloads
+
+
+def test_shared_images_keep_apart() -> None:
+    ring = ImageRing.for_camera(WIDTH_PX, HEIGHT_PX, 3)
+    rng = np.random.default_rng(5)
+    pictures = [
+        rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8),
+        rng.integers(0, 65535, (HEIGHT_PX, WIDTH_PX), np.uint16)[::2, ::3],
+        rng.random((HEIGHT_PX, WIDTH_PX, 3), np.float32),
+    ]
+    notes = [ring.put(slot, picture) for slot, picture in enumerate(pictures)]
+    for note, picture in zip(notes, pictures, strict=True):
+        assert ring.takes(picture)
+        np.testing.assert_array_equal(ring.get(note), picture)
+    ring.close()
+
+
+def test_deep_pixels_become_8_bit() -> None:
+    np.testing.assert_array_equal(to_8_bit(np.array([[0, 255, 256, 65535]], np.uint16)), [[0, 0, 1, 255]])
+    floats = np.array([[0.0, 0.5, 1.0, 7.0, -1.0, np.nan]], np.float32)
+    np.testing.assert_array_equal(to_8_bit(floats), [[0, 128, 255, 255, 0, 0]])
+
+
+def test_every_state_and_verdict_has_its_own_colour() -> None:
+    from gripmon.recording import palette
+
+    assert set(palette.STATES) == set(State) and set(palette.VERDICTS) == set(Verdict)
+    assert max(Counter(palette.STATES.values()).values()) == 1

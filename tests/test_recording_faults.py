@@ -1,0 +1,334 @@
+"""What a black box is for: crashes, a full disk, a stalled process; and nothing is left behind."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import psutil
+import pytest
+from recorded import (
+    CAMERA,
+    GRIPPER,
+    INTERVAL_NS,
+    REFERENCE,
+    START_NS,
+    Recorded,
+    frame,
+    record,
+    recorder,
+    settings,
+    trace,
+    wait_until,
+)
+
+from gripmon.geometry import make_transform, to_record
+from gripmon.recording import ProcessRecorder
+from gripmon.recording.files import FileSeries
+from gripmon.recording.rows import Row
+from gripmon.recording.wire import make_scene
+from gripmon.records import ReferenceRecord
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def no_child_left() -> Iterator[None]:
+    before = set(psutil.Process().children())
+    yield
+    assert set(psutil.Process().children()) <= before
+
+
+def offer(writer: ProcessRecorder, first: int, count: int) -> None:
+    for i in range(first, first + count):
+        writer.offer(frame(i), record(i), trace(i))
+
+
+def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
+    written = writer.frames_written
+    offer(writer, first, count)
+    wait_until(lambda: writer.frames_written == written + count)
+
+
+def open_files() -> set[int]:
+    """Numbers of this process's descriptors (those that survive the look at them)."""
+    return {int(path.name) for path in Path("/proc/self/fd").iterdir() if path.exists()}
+
+
+def running_worker(writer: ProcessRecorder) -> int:
+    wait_until(lambda: writer.path is not None)
+    assert writer.process_id is not None
+    return writer.process_id
+
+
+def test_a_killed_daemon_leaves_a_complete_file(tmp_path: Path) -> None:
+    script = (
+        "import os, signal, sys, time; from pathlib import Path; from recorded import *;"
+        "w = recorder(Path(sys.argv[1]), flush_period_s=0.5); wait_until(lambda: w.path is not None);"
+        "[w.offer(frame(i), record(i), trace(i)) for i in range(50)];"
+        "print(w.process_id, flush=True); time.sleep(1.0); w.offer(frame(50), record(50), None);"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    paths = f"import sys; sys.path[:0] = [{str(HERE)!r}, {str(HERE.parent)!r}]; "
+    daemon = subprocess.run([sys.executable, "-c", paths + script, tmp_path], stdout=subprocess.PIPE, check=False)
+    assert daemon.returncode == -signal.SIGKILL
+    worker = int(daemon.stdout)
+    wait_until(lambda: not psutil.pid_exists(worker) or psutil.Process(worker).status() == psutil.STATUS_ZOMBIE)
+    (path,) = tmp_path.iterdir()
+    # Only what was handed over within the last instant may be missing.
+    assert Recorded(path).seqs()[:50] == list(range(50))
+
+
+def test_a_killed_recording_process_is_replaced(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    worker = running_worker(writer)
+    offer_and_wait(writer, 0, 20)
+    os.kill(worker, signal.SIGKILL)
+    wait_until(lambda: writer.failure is not None)
+    assert "code -9" in str(writer.failure)
+    offer(writer, 20, 10)
+    wait_until(lambda: writer.frames_written == 30)
+    assert running_worker(writer) != worker
+    offer_and_wait(writer, 30, 5)
+    wait_until(lambda: writer.failure is None)
+    writer.close(10.0)
+    assert (writer.frames_written, writer.dropped) == (35, 0)
+    first, second = sorted(tmp_path.iterdir())
+    assert (first.name, second.name) == ("run-0001.rrd", "run-0002.rrd")
+    told = Recorded(second)
+    assert told.seqs() == list(range(20, 35))
+    assert told.by_seq("status/state", "state")[20] == ["tracking"]
+    # The first file lacks its footer, but holds what had been flushed.
+    from rerun.chunk import RrdReader
+
+    with pytest.warns(match="no footer"):
+        reader = RrdReader(first)
+    assert sum(chunk.num_rows for chunk in reader.stream().to_chunks() if chunk.entity_path == "/record") == 20
+
+
+def test_frames_that_a_killed_process_took_with_it_are_counted(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, flush_period_s=10.0)
+    worker = running_worker(writer)
+    offer(writer, 0, 20)
+    time.sleep(0.5)  # handed over, not flushed
+    os.kill(worker, signal.SIGKILL)
+    wait_until(lambda: writer.failure is not None)
+    assert writer.dropped == 20
+    writer.close(10.0)
+    assert (writer.frames_written, writer.dropped) == (0, 20)
+
+
+def test_a_stalled_process_costs_frames_not_memory(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, queue_frames=100, queue_images=4, image_rate_hz=1000.0)
+    worker = running_worker(writer)
+    os.kill(worker, signal.SIGSTOP)
+    count = 3000
+    offer(writer, 0, count)
+    time.sleep(0.5)
+    offer(writer, count, 200)
+    # A pipe's worth of records left, the rest waits in the queue or is dropped.
+    assert 0 < writer.dropped < count + 100
+    assert writer.images_dropped > 0
+    os.kill(worker, signal.SIGCONT)
+    writer.close(10.0)
+    assert writer.failure is None
+    assert writer.frames_written + writer.dropped == count + 200
+    (path,) = tmp_path.iterdir()
+    told = Recorded(path)
+    assert len(told.seqs()) == writer.frames_written
+    assert 1 <= len(told.timed("rig/camera/image")) <= writer.frames_written - writer.images_dropped
+
+
+def test_close_ends_a_process_that_never_finishes(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    worker = running_worker(writer)
+    offer_and_wait(writer, 0, 10)
+    os.kill(worker, signal.SIGSTOP)
+    offer(writer, 10, 5)
+    writer.close(1.0)
+    assert "did not finish in time" in str(writer.failure)
+    assert (writer.frames_written, writer.dropped) == (10, 5)
+    assert not psutil.pid_exists(worker)
+
+
+def test_signals_for_the_daemon_s_group_don_t_end_the_recording(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    worker = running_worker(writer)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(worker, number)
+    offer_and_wait(writer, 0, 5)
+    writer.close(10.0)
+    assert (writer.failure, writer.dropped) == (None, 0)
+
+
+def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(tmp_path: Path) -> None:
+    """A limit on the file's size stands for the disk: the process sees the same failing write."""
+    writer = recorder(tmp_path)
+    worker = running_worker(writer)
+    offer_and_wait(writer, 0, 10)
+    first = writer.path
+    limit = 4096 + max(path.stat().st_size for path in tmp_path.iterdir())
+    resource.prlimit(worker, resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+    offer(writer, 10, 60)
+    wait_until(lambda: writer.failure is not None)
+    assert "recording failed: can't write" in str(writer.failure)
+    wait_until(lambda: writer.dropped == 60)
+    resource.prlimit(worker, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    wait_until(lambda: writer.failure is None)
+    assert writer.process_id == worker
+    assert writer.path is not None and writer.path != first
+    offer_and_wait(writer, 70, 10)
+    last = writer.path
+    writer.close(10.0)
+    assert (writer.frames_written, writer.dropped, writer.failure) == (20, 60, None)
+    told = Recorded(last)
+    assert told.seqs() == list(range(70, 80))
+    assert told.blueprint and told.timed("rig/reference")
+
+
+def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free = [2_000_000_000]
+    monkeypatch.setattr("gripmon.recording.files.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    monkeypatch.setattr("gripmon.recording.files._FIRST_RETRY_S", 0.0)
+    keeping = settings(min_free_bytes=1_000_000_000)
+    files = FileSeries(make_scene(keeping, str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
+    files.add_frames([Row(record(0), None, None, None)])
+    files.write()
+    assert (files.frames_written, files.failure) == (1, None)
+
+    free[0] = 900_000_000
+    files.add_frames([Row(record(1), None, None, None)])
+    files.write()  # the frame is still written, then the file is completed
+    assert files.failure == f"recording failed: {tmp_path} has 900 MB free, min_free_bytes keeps 1000 MB"
+    assert files.path is None
+    files.add_frames([Row(record(2), None, None, None)])
+    files.write()
+    assert (files.frames_written, files.frames_lost) == (2, 1)
+
+    free[0] = 1_500_000_000
+    files.add_frames([Row(record(3), None, None, None)])
+    files.write()
+    assert (files.frames_written, files.frames_lost, files.failure) == (3, 1, None)
+    files.close()
+    first, second = sorted(tmp_path.iterdir())
+    assert (Recorded(first).seqs(), Recorded(second).seqs()) == ([0, 1], [3])
+
+
+def test_a_directory_that_vanishes_is_reported(tmp_path: Path) -> None:
+    directory = tmp_path / "gone"
+    writer = recorder(directory)
+    running_worker(writer)
+    offer_and_wait(writer, 0, 3)
+    for path in directory.iterdir():
+        path.unlink()
+    directory.rmdir()
+    offer(writer, 3, 3)
+    wait_until(lambda: writer.failure is not None)
+    assert str(directory) in str(writer.failure)
+    directory.mkdir()
+    wait_until(lambda: writer.failure is None)
+    offer_and_wait(writer, 6, 3)
+    writer.close(10.0)
+    (path,) = directory.iterdir()
+    assert Recorded(path).seqs() == [6, 7, 8]
+
+
+def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, max_file_bytes=150_000, flush_period_s=0.05, image_rate_hz=1000.0)
+    running_worker(writer)
+    for i in range(0, 200, 10):
+        offer_and_wait(writer, i, 10)
+    writer.close(10.0)
+    paths = sorted(tmp_path.iterdir())
+    assert len(paths) > 3
+    assert [path.name for path in paths] == [f"run-{k:04d}.rrd" for k in range(1, len(paths) + 1)]
+    seen: list[int] = []
+    for path in paths:
+        told = Recorded(path)
+        assert told.blueprint and told.cells["about"] and told.cells["rig/camera"]
+        assert path.stat().st_size < 400_000
+        if seqs := told.seqs():
+            assert told.timed("rig/reference") and told.by_seq("status/state", "state")[seqs[0]] == ["tracking"]
+        seen += told.seqs()
+    assert seen == list(range(200))
+    assert len(Recorded(*paths).recording_ids) == 1
+
+
+def test_only_the_newest_files_are_kept(tmp_path: Path) -> None:
+    (tmp_path / "somebody-elses.rrd").write_bytes(b"x")
+    writer = recorder(tmp_path, max_file_bytes=100_000, flush_period_s=0.05, image_rate_hz=1000.0, keep_files=2)
+    running_worker(writer)
+    for i in range(0, 200, 10):
+        offer_and_wait(writer, i, 10)
+    writer.close(10.0)
+    names = sorted(path.name for path in tmp_path.glob("run-*.rrd"))
+    assert len(names) == 2 and names[0] != "run-0001.rrd"
+    assert (tmp_path / "somebody-elses.rrd").exists()
+    assert Recorded(*(tmp_path / name for name in names)).seqs()[-1] == 199
+
+
+def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, truth=lambda i: (0.0, 0.0, 0.1), image_rate_hz=1000.0)
+    worker = running_worker(writer)
+    offer_and_wait(writer, 0, 5)
+    moved = to_record(make_transform(np.eye(3), np.array([0.002, 0.003, 0.2])))
+    new = ReferenceRecord("second", 2, START_NS + 5 * INTERVAL_NS, "recalibration", moved, (0.0,) * 36)
+    writer.reference(new)
+    for i in range(5, 8):
+        writer.offer(frame(i), record(i, reference_id="second", revision=2), trace(i))
+    wait_until(lambda: writer.frames_written == 8)
+    os.kill(worker, signal.SIGKILL)
+    wait_until(lambda: writer.failure is not None)
+    writer.offer(frame(8), record(8, reference_id="second", revision=2), trace(8))
+    wait_until(lambda: writer.frames_written == 9)
+    writer.close(10.0)
+    told = Recorded(tmp_path / "run-0002.rrd")
+    (cell,) = told.timed("rig/reference")
+    assert cell.values["translation"][0] == pytest.approx([0.002, 0.003, 0.2], rel=1e-6)
+    assert told.by_seq("drift/truth_mm", "scalars")[8] == pytest.approx([-2.0, -3.0, -100.0])
+
+
+def test_close_releases_everything(tmp_path: Path) -> None:
+    process = psutil.Process()
+    recorder(tmp_path / "warm").close(10.0)
+    descriptors, threads = open_files(), threading.active_count()
+    writer = recorder(tmp_path / "run")
+    offer(writer, 0, 10)
+    assert "gripmon-images" in Path("/proc/self/maps").read_text()
+    writer.close(10.0)
+    writer.close(10.0)
+    assert open_files() == descriptors
+    assert threading.active_count() == threads
+    assert not process.children()
+    assert "gripmon-images" not in Path("/proc/self/maps").read_text()
+
+
+def test_a_recorder_that_is_closed_at_once_still_leaves_a_complete_file(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    offer(writer, 0, 3)
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    assert Recorded(path).seqs() == [0, 1, 2]
+
+
+def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def no_truth(_: int) -> tuple[float, float, float]:
+        raise RuntimeError("no truth here")
+
+    writer = recorder(tmp_path, truth=no_truth, queue_frames=10)
+    offer(writer, 0, 5)
+    wait_until(lambda: writer.failure is not None)
+    assert "no truth here" in str(writer.failure) and "recording stopped" in caplog.text
+    offer(writer, 5, 30)
+    writer.close(10.0)
+    assert writer.dropped == 35 and "no truth here" in str(writer.failure)
+    assert "gripmon-images" not in Path("/proc/self/maps").read_text()
