@@ -49,6 +49,13 @@ def can_bind(endpoint: str) -> bool:
         return True
 
 
+def accepts(endpoint: str) -> bool:
+    """Does a program listen there?"""
+    with socket.socket() as probe:
+        probe.settimeout(1.0)
+        return probe.connect_ex(("127.0.0.1", int(endpoint.rsplit(":", 1)[1]))) == 0
+
+
 def wait_until(condition: Callable[[], object], what: str, timeout_s: float = WAIT_S) -> None:
     """Come back when the condition holds; fail with ``what`` when it takes too long."""
     end_s = time.monotonic() + timeout_s

@@ -1,0 +1,37 @@
+"""A daemon in a process of its own, monitor and camera stood in for, the publisher real: ENDPOINT KIND [FILE]."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
+
+from gripmon.daemon import DaemonSettings, log_to_stderr, run
+from gripmon.geometry import make_transform, to_record
+from gripmon.publish import PublishSettings, ZenohPublisher
+
+# A third of a turn about (1, 1, 1) after a turn about x: no component of its quaternion is like another.
+ROTATION = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ np.array(
+    [[1.0, 0.0, 0.0], [0.0, 0.6, -0.8], [0.0, 0.8, 0.6]]
+)
+TRANSLATION_M = (0.011, -0.022, 0.133)
+FRAMES_PER_S = 60.0
+
+if __name__ == "__main__":
+    endpoint, kind, *rest = sys.argv[1:]
+    log_to_stderr()
+    transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
+    sys.exit(
+        run(
+            ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
+            TickingSource(FRAMES_PER_S) if kind == "ticking" else SilentSource(FRAMES_PER_S),
+            ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist"),
+            Listener(),
+            DaemonSettings(no_camera_alert_after_s=0.5),
+            robot="arm",
+            camera="wrist",
+            estimates=Path(rest[0]) if rest else None,
+        )
+    )

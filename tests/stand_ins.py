@@ -1,0 +1,150 @@
+"""Stand-ins for the daemon's neighbours: monitor and sources that follow a script, outputs that write it all down."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from loopback import frame_record, reference_record
+
+from gripmon.records import (
+    AlertRecord,
+    CornerFault,
+    CornerRecord,
+    Frame,
+    FrameRecord,
+    MeasurementTrace,
+    Origin,
+    ReferenceRecord,
+    StateRecord,
+    Verdict,
+)
+from gripmon.sources import Waiting
+
+REFUSED = {
+    "verdict": Verdict.UNKNOWN,
+    "source": Origin.HELD,
+    "corners": (CornerRecord("L_in_near", None, None, used=False, reason=CornerFault.FRAME_REFUSED),),
+    "alerts": (),
+    "reason": "black",
+}
+
+
+class ScriptedMonitor:
+    """Answers frame i with ``answers(i)``; an exception there is raised."""
+
+    def __init__(self, answers: Callable[[int], dict[str, object] | Exception] = lambda seq: {}) -> None:
+        self.answers = answers
+        self.frames: list[Frame] = []
+        self.reference = reference_record(3)
+
+    def process(self, frame: Frame) -> FrameRecord:
+        self.frames.append(frame)
+        answer = self.answers(frame.seq)
+        if isinstance(answer, Exception):
+            raise answer
+        values = {"stamp_ns": frame.stamp_ns, "alerts": (), "jaw_opening_m": frame.jaw_opening_m} | answer
+        record = frame_record(frame.seq, **values)
+        if record.revision != self.reference.revision:
+            self.reference = reference_record(record.revision)
+        return record
+
+    def trace(self) -> MeasurementTrace | None:
+        return None
+
+
+class ScriptedSource:
+    """Gives the items in order, then None; numbers stand for frames, exceptions are raised, functions called."""
+
+    def __init__(self, items: Iterable[object], *, live: bool = False) -> None:
+        self._items = iter(items)
+        self.live = live
+        self.connected = True
+        self.dropped = 0
+        self.closed = 0
+
+    def read(self) -> Frame | Waiting | None:
+        for item in self._items:
+            if isinstance(item, Exception):
+                raise item
+            if callable(item):
+                item(self)
+                continue
+            self.connected = not isinstance(item, Waiting)
+            return Frame(item, 1_000 + item, None) if isinstance(item, int) else item  # type: ignore[return-value]
+        return None
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Listener:
+    """Publisher and recorder at once: writes everything down."""
+
+    def __init__(self, *, fails: str = "", closing_fails: bool = False) -> None:
+        self.transforms: list[FrameRecord] = []
+        self.states: list[StateRecord] = []
+        self.alerts: list[AlertRecord] = []
+        self.references: list[ReferenceRecord] = []
+        self.offered: list[tuple[Frame, FrameRecord]] = []
+        self.closed = 0
+        self.dropped = 0
+        self.failure: str | None = None
+        self._fails, self._closing_fails = fails, closing_fails
+
+    def transform(self, record: FrameRecord) -> None:
+        if self._fails == "transform":
+            raise OSError("the network is gone")
+        self.transforms.append(record)
+
+    def state(self, record: StateRecord) -> None:
+        self.states.append(record)
+
+    def alert(self, record: AlertRecord) -> None:
+        if self._fails == "transform":
+            raise OSError("the network is gone")
+        self.alerts.append(record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self.references.append(record)
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
+        if self._fails == "offer":
+            raise RuntimeError("the recorder is broken")
+        self.offered.append((frame, record))
+
+    def close(self, timeout_s: float = 0.0) -> None:
+        self.closed += 1
+        if self._closing_fails:
+            raise RuntimeError("can't close")
+
+
+class TickingSource:
+    """A camera of so many frames a second; where the machine was late it catches up, so that no number is missing."""
+
+    live = True
+    connected = True
+    dropped = 0
+
+    def __init__(self, frames_per_s: float) -> None:
+        self._period_s = 1.0 / frames_per_s
+        self._start_s = time.monotonic()
+        self._seq = -1
+
+    def read(self) -> Frame:
+        self._seq += 1
+        time.sleep(max(0.0, self._start_s + self._seq * self._period_s - time.monotonic()))
+        return Frame(self._seq, time.time_ns(), None)
+
+    def close(self) -> None:
+        pass
+
+
+class SilentSource(TickingSource):
+    """A camera that is not there."""
+
+    connected = False
+
+    def read(self) -> Waiting:  # type: ignore[override]
+        time.sleep(0.5)
+        return Waiting("camera 0 can't be opened")

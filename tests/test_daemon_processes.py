@@ -1,0 +1,139 @@
+"""Daemon and subscriber in two processes on loopback, as users run them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zenoh
+from daemon_process import ROTATION, TRANSLATION_M
+from loopback import WAIT_S, accepts, ask, can_bind, free_endpoint, plain_session, wait_until
+from scipy.spatial.transform import Rotation
+
+HERE = Path(__file__).resolve().parent
+PREFIX = "gripmon/arm/wrist"
+
+
+@contextmanager
+def daemon(endpoint: str, kind: str = "ticking", *rest: str) -> Iterator[subprocess.Popen[str]]:
+    """A daemon process that listens; it is killed at the end if it still runs."""
+    command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, kind, *rest]
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+    try:
+        wait_until(lambda: process.poll() is not None or accepts(endpoint), "the daemon to listen")
+        assert process.poll() is None, process.stderr and process.stderr.read()
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def subscribe(endpoint: str, key: str, count: int) -> list[dict[str, object]]:
+    """So many messages as a subscriber in another process gets them."""
+    command = [sys.executable, str(HERE / "plain_subscriber.py"), endpoint, key, str(count)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
+    assert done.returncode == 0, done.stderr
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+def test_transform_and_stamp_arrive_as_they_were_meant(endpoint: str):
+    before_ns = time.time_ns()
+    with daemon(endpoint):
+        messages = subscribe(endpoint, f"{PREFIX}/transform", 3)
+        after_ns = time.time_ns()
+        (reference,) = ask_in_another_session(endpoint, f"{PREFIX}/reference")
+    for message in messages:
+        transform = message["cam_T_grip"]
+        np.testing.assert_allclose(Rotation.from_quat(transform["rotation_xyzw"]).as_matrix(), ROTATION, atol=1e-12)
+        assert tuple(transform["translation_m"]) == TRANSLATION_M
+        assert isinstance(message["stamp_ns"], int) and before_ns < message["stamp_ns"] < after_ns
+        assert 0 < message["latency_ns"] < after_ns - before_ns
+    seqs = [message["seq"] for message in messages]
+    assert seqs == list(range(seqs[0], seqs[0] + 3))
+    assert reference["revision"] == 3 and reference["reference_id"] == "plate-2"
+
+
+def ask_in_another_session(endpoint: str, key: str) -> list[dict[str, object]]:
+    with plain_session(connect=endpoint) as session:
+        return ask(session, key)
+
+
+def test_at_60_frames_a_second_a_subscriber_gets_at_least_58(endpoint: str):
+    """Counted by sequence numbers, which the camera gives at 60 a second whatever the machine does besides."""
+    with daemon(endpoint):
+        seqs = [message["seq"] for message in subscribe(endpoint, f"{PREFIX}/transform", 300)]
+    span_s = (seqs[-1] - seqs[0]) / 60.0
+    assert seqs == sorted(set(seqs))
+    assert (len(seqs) - 1) / span_s >= 58.0
+
+
+def test_a_killed_daemon_is_seen_to_be_gone(endpoint: str):
+    with daemon(endpoint) as process, plain_session(connect=endpoint) as session:
+        tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
+        assert tokens.recv().kind == zenoh.SampleKind.PUT
+        process.send_signal(signal.SIGKILL)
+        gone: list[zenoh.Sample] = []
+        wait_until(lambda: (sample := tokens.try_recv()) is not None and not gone.append(sample), "the token to vanish")
+        assert [(sample.kind, str(sample.key_expr)) for sample in gone] == [
+            (zenoh.SampleKind.DELETE, f"{PREFIX}/alive")
+        ]
+    wait_until(lambda: can_bind(endpoint), "the port to be free")
+
+
+@pytest.mark.parametrize("kind", ["ticking", "silent"])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
+def test_a_signal_ends_it_with_everything_closed(
+    endpoint: str, tmp_path: Path, kind: str, number: signal.Signals, code: int
+):
+    estimates = tmp_path / "estimates.jsonl"
+    with daemon(endpoint, kind, str(estimates)) as process:
+        with plain_session(connect=endpoint) as session:
+            tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
+            assert tokens.recv().kind == zenoh.SampleKind.PUT
+            wait_until(lambda: kind == "silent" or any(s["frames"] for s in ask(session, f"{PREFIX}/state")), "a frame")
+            process.send_signal(number)
+            assert process.wait(WAIT_S) == code
+            assert tokens.recv().kind == zenoh.SampleKind.DELETE
+        assert process.stderr is not None
+        last = process.stderr.read().splitlines()[-1]
+    frames = [json.loads(line) for line in estimates.read_text().splitlines()]
+    assert f"stopped after {len(frames)} frames" in last
+    assert [frame["seq"] for frame in frames] == list(range(len(frames)))
+    wait_until(lambda: can_bind(endpoint), "the port to be free")
+
+
+def test_a_missing_camera_is_said_on_the_network(endpoint: str):
+    with daemon(endpoint, "silent"), plain_session(connect=endpoint) as session:
+        wait_until(lambda: any(s["state"] == "stale" for s in ask(session, f"{PREFIX}/state")), "the state stale")
+        (state,) = ask(session, f"{PREFIX}/state")
+        assert state["camera_connected"] is False and state["verdict"] == "unknown"
+        assert state["message"] == "no frames: camera 0 can't be opened"
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+        alert = zenoh.ext.declare_advanced_subscriber(session, f"{PREFIX}/alert", history=history).recv()
+        assert json.loads(alert.payload.to_bytes())["cause"] == "no_camera"
+
+
+def test_a_second_daemon_on_the_same_port_says_so(endpoint: str):
+    with daemon(endpoint):
+        command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, "ticking"]
+        environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+        second = subprocess.run(command, capture_output=True, text=True, timeout=60.0, env=environment)
+    assert second.returncode == 1
+    assert second.stderr.splitlines()[-1].endswith(
+        f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
+    )
