@@ -327,8 +327,8 @@ def record(seq: int, error_m: tuple[float, float, float], **changes: Any) -> Fra
     transform = to_record(make_transform(np.eye(3), np.array([0.0, 0.0, 0.1]) + truth_shift_m(seq) + error_m))
     values: dict[str, Any] = {
         "seq": seq, "stamp_ns": seq, "verdict": Verdict.VALID, "state": State.TRACKING, "source": Origin.UPDATE,
-        "cam_T_grip": transform, "covariance": None, "smoothed": None, "drift": None, "reference_id": "r", "revision": 0,
-        "rms_px": None, "jaw_opening_m": None, "corners": (), "alerts": (),
+        "cam_T_grip": transform, "covariance": None, "smoothed": None, "drift": None, "reference_id": "r",
+        "revision": 0, "rms_px": None, "jaw_opening_m": None, "corners": (), "alerts": (),
     }  # fmt: skip
     return FrameRecord(**{**values, **changes})
 
@@ -343,9 +343,9 @@ def truth(seq: int) -> FrameTruth:
     moved = make_transform(np.eye(3), reference[:3, 3] + shift_m)
     events = (("bumped",) if seq >= 4 else ()) + (("hand",) if seq in (7, 8) else ())
     return FrameTruth(
-        index=seq, time_s=0.1 * seq, stamp_ns=seq, cam_T_grip=moved, reference_cam_T_grip=reference, tcp_shift_m=shift_m,
-        jaw_opening_m=0.0, jaw_reported_m=None, corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(),
-        finger_bend=np.zeros((0, 4, 4)), events=events, exposure=1.0, defocus_px=0.0,
+        index=seq, time_s=0.1 * seq, stamp_ns=seq, cam_T_grip=moved, reference_cam_T_grip=reference,
+        tcp_shift_m=shift_m, jaw_opening_m=0.0, jaw_reported_m=None,
+        corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(), finger_bend=np.zeros((0, 4, 4)), events=events, exposure=1.0, defocus_px=0.0,
     )  # fmt: skip
 
 

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = common.load(arguments.config, check_source=False)
     cv2.setNumThreads(1)
-    source = _open_input(Path(arguments.input), config, arguments.fps)
+    source = _open_input(Path(arguments.input), arguments.fps)
     try:
         with _output(arguments.out) as out, _recorder(arguments.recording, config) as recorder:
             counts = _Counts()
@@ -161,7 +161,7 @@ def _jaw_of(config: Config) -> Callable[[Any], Any]:
     return with_fixed_jaw
 
 
-def _open_input(path: Path, config: Config, fps: float | None) -> Source:
+def _open_input(path: Path, fps: float | None) -> Source:
     import msgspec
 
     from gripmon.sources import SourceError, open_source, settings_for_path

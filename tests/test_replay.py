@@ -1,0 +1,206 @@
+"""``gripmon replay``: one line for every frame, in order, the same bytes each time; nothing stops it half-way."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from gripmon.cli import main
+from gripmon.records import Refusal
+
+ROOT = Path(__file__).resolve().parent.parent
+GRIPMON = (sys.executable, "-m", "gripmon")
+CONTRACT = {
+    "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
+    "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",
+}  # fmt: skip
+FPS = 10
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two seconds of a camera that a cable pulls aside."""
+    out = tmp_path_factory.mktemp("simulated") / "creep"
+    assert main(["simulate", "creep", "--out", str(out), "--seconds", "2", "--fps", str(FPS), "--seed", "2"]) == 0
+    return out
+
+
+@pytest.fixture
+def copied(sequence: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(sequence, tmp_path / "copied"))
+
+
+def replayed(source: Path, out: Path, *options: str, config: Path | None = None, code: int = 0) -> list[dict[str, Any]]:
+    """The lines that replaying ``source`` gives."""
+    config = source / "config.yaml" if config is None else config
+    assert main(["replay", str(source), "--config", str(config), "--out", str(out), *options]) == code
+    return [json.loads(line) for line in out.read_bytes().splitlines()]
+
+
+def without_latency(path: Path) -> bytes:
+    return re.sub(rb'"latency_ns":\d+', b"", path.read_bytes())
+
+
+def test_one_line_for_every_frame_in_order_with_all_fields(sequence: Path, tmp_path: Path):
+    lines = replayed(sequence, tmp_path / "out.jsonl")
+    truths = [json.loads(line) for line in (sequence / "truth.jsonl").read_text().splitlines()]
+    assert [line["name"] for line in lines] == [t["file"] for t in truths]
+    assert [line["stamp_ns"] for line in lines] == [t["stamp_ns"] for t in truths]
+    assert [line["seq"] for line in lines] == list(range(len(truths)))
+    assert all(line.keys() >= CONTRACT for line in lines)
+    assert all(line["latency_ns"] > 0 for line in lines)
+
+
+def test_the_transforms_follow_the_truth(sequence: Path, tmp_path: Path):
+    lines = replayed(sequence, tmp_path / "out.jsonl")
+    truths = [json.loads(line) for line in (sequence / "truth.jsonl").read_text().splitlines()]
+    assert np.linalg.norm(truths[-1]["tcp_shift_m"]) > 1e-3
+    measured = [(line, t) for line, t in zip(lines, truths, strict=True) if line["verdict"] == "valid"]
+    assert len(measured) > 0.6 * len(lines)
+    errors_m = np.array(
+        [np.subtract(line["cam_T_grip"]["translation_m"], np.array(t["cam_T_grip"])[:3, 3]) for line, t in measured]
+    )
+    assert np.percentile(np.hypot(errors_m[:, 0], errors_m[:, 1]), 95.0) < 20e-6
+    assert np.percentile(np.abs(errors_m[:, 2]), 95.0) < 60e-6
+
+
+def test_the_same_input_gives_the_same_bytes(sequence: Path, tmp_path: Path):
+    """In this process and in another one, with another hash seed."""
+    replayed(sequence, tmp_path / "here.jsonl")
+    there = tmp_path / "there.jsonl"
+    arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", str(there)]
+    subprocess.run([*GRIPMON, *arguments], check=True, cwd=ROOT, env={**os.environ, "PYTHONHASHSEED": "77"})
+    assert without_latency(there) == without_latency(tmp_path / "here.jsonl")
+
+
+def test_standard_output_holds_lines_only(sequence: Path, tmp_path: Path):
+    arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", "-"]
+    done = subprocess.run([*GRIPMON, *arguments], capture_output=True, check=True, cwd=ROOT)
+    replayed(sequence, tmp_path / "file.jsonl")
+    (tmp_path / "stdout.jsonl").write_bytes(done.stdout)
+    assert without_latency(tmp_path / "stdout.jsonl") == without_latency(tmp_path / "file.jsonl")
+    assert done.stderr.count(b"\n") == 1 and done.stderr.startswith(b"replay: 20 frames: ")
+
+
+def test_bad_frames_are_refused_with_a_reason_and_the_others_go_on(copied: Path, tmp_path: Path):
+    good = cv2.imread(str(copied / "000005.png"), cv2.IMREAD_UNCHANGED)
+    cv2.imwrite(str(copied / "000005.png"), np.zeros_like(good))
+    cv2.imwrite(str(copied / "000007.png"), np.full_like(good, 255))
+    cv2.imwrite(str(copied / "000009.png"), good[:100, :100])
+    (copied / "000011.png").write_bytes((copied / "000012.png").read_bytes()[:5000])
+    (copied / "000013.png").write_text("this is no image")
+    (copied / "000015.png").write_bytes(b"")
+    (copied / "000017.png").unlink()
+    lines = replayed(copied, tmp_path / "out.jsonl")
+    assert len(lines) == 20
+    expected = {
+        5: Refusal.BLACK, 7: Refusal.WHITE, 9: Refusal.WRONG_SIZE, 11: Refusal.NOT_AN_IMAGE, 13: Refusal.NOT_AN_IMAGE,
+        15: Refusal.NOT_AN_IMAGE, 17: Refusal.NOT_AN_IMAGE,
+    }  # fmt: skip
+    for seq, refusal in expected.items():
+        assert lines[seq]["reason"].startswith(refusal), lines[seq]["reason"]
+        assert lines[seq]["verdict"] == "unknown" or lines[seq]["source"] == "held"
+        assert not any(corner["used"] for corner in lines[seq]["corners"])
+    assert all(lines[seq]["source"] == "update" for seq in (3, 4, 10, 18, 19))
+
+
+def test_no_usable_frame_ends_with_3(copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    for path in copied.glob("*.png"):
+        path.write_bytes(b"nothing")
+    lines = replayed(copied, tmp_path / "out.jsonl", code=3)
+    assert len(lines) == 20 and {line["verdict"] for line in lines} == {"unknown"}
+    assert "no frame could be used (not_an_image" in capsys.readouterr().err
+
+
+def test_names_are_counted_as_people_count(copied: Path, tmp_path: Path):
+    (copied / "timestamps.csv").unlink()
+    for i, path in enumerate(sorted(copied.glob("*.png"))):
+        path.rename(copied / f"shot{i}.png")
+    config = copied / "config.yaml"
+    config.write_text(config.read_text().replace("source: frames", "source: fixed"))
+    lines = replayed(copied, tmp_path / "out.jsonl", "--fps", "4")
+    assert [line["name"] for line in lines] == [f"shot{i}.png" for i in range(20)]
+    assert [line["stamp_ns"] for line in lines] == [i * 250_000_000 for i in range(20)]
+
+
+def test_a_video_gives_what_its_frames_give(sequence: Path, tmp_path: Path):
+    """Lossless, so every number is the same as from the images (the jaw opening is the nominal one in both)."""
+    video = tmp_path / "wrist.avi"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"FFV1"), FPS, (768, 576), isColor=False)
+    if not writer.isOpened():
+        pytest.skip("this OpenCV has no FFV1")
+    for path in sorted(sequence.glob("*.png")):
+        writer.write(cv2.imread(str(path), cv2.IMREAD_UNCHANGED))
+    writer.release()
+    config = tmp_path / "config.yaml"
+    text = (sequence / "config.yaml").read_text().replace("source: frames", "source: fixed")
+    config.write_text(text.replace("gripper.yaml", str(sequence / "gripper.yaml")))
+    from_video = replayed(video, tmp_path / "video.jsonl", config=config)
+    from_images = replayed(sequence, tmp_path / "images.jsonl", config=config)
+    assert len(from_video) == len(from_images) == 20
+    for a, b in zip(from_video, from_images, strict=True):
+        assert (a["cam_T_grip"], a["verdict"], a["corners"]) == (b["cam_T_grip"], b["verdict"], b["corners"])
+
+
+def test_a_lossless_recording_replays_to_the_same_transforms(sequence: Path, tmp_path: Path):
+    config = tmp_path / "config.yaml"
+    text = (sequence / "config.yaml").read_text().replace("gripper.yaml", str(sequence / "gripper.yaml"))
+    config.write_text(text + "recording:\n  image_format: png\n  image_rate_hz: 1000\n  min_free_bytes: 0\n")
+    recording = tmp_path / "story.rrd"
+    first = replayed(sequence, tmp_path / "first.jsonl", "--recording", str(recording), config=config)
+    assert [path.name for path in tmp_path.glob("*.rrd")] == ["story.rrd"]
+    again = replayed(recording, tmp_path / "again.jsonl", config=config)
+    varying = {"latency_ns"}
+    assert [{k: v for k, v in x.items() if k not in varying} for x in again] == [
+        {k: v for k, v in x.items() if k not in varying} for x in first
+    ]
+
+
+def test_a_file_that_is_no_recording_is_named(tmp_path: Path, sequence: Path, capsys: pytest.CaptureFixture[str]):
+    broken = tmp_path / "broken.rrd"
+    broken.write_bytes(b"RRF2 but no more")
+    assert main(["replay", str(broken), "--config", str(sequence / "config.yaml"), "--out", "-"]) == 2
+    assert f"{broken} can't be read" in capsys.readouterr().err
+
+
+def test_an_output_that_cannot_be_written_is_said_before_work_begins(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", str(tmp_path)]
+    assert main(arguments) == 2
+    assert "can't be written" in capsys.readouterr().err
+
+
+def test_ctrl_c_leaves_whole_lines_and_130(sequence: Path, tmp_path: Path):
+    many = tmp_path / "many"
+    many.mkdir()
+    for i in range(4000):
+        (many / f"{i:06d}.png").symlink_to(sequence / f"{i % 20:06d}.png")
+    out = tmp_path / "out.jsonl"
+    config = tmp_path / "config.yaml"
+    text = (sequence / "config.yaml").read_text().replace("source: frames", "source: fixed")
+    config.write_text(text.replace("gripper.yaml", str(sequence / "gripper.yaml")))
+    arguments = [*GRIPMON, "replay", str(many), "--config", str(config), "--out", str(out)]
+    with subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        deadline_s = time.monotonic() + 60.0
+        while not (out.exists() and out.stat().st_size > 0):
+            assert process.poll() is None and time.monotonic() < deadline_s
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "Traceback" not in err and "gripmon: interrupted" in err
+    lines = [json.loads(line) for line in out.read_bytes().splitlines()]
+    assert 0 < len(lines) < 4000 and [line["seq"] for line in lines] == list(range(len(lines)))
