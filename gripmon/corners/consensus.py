@@ -35,6 +35,12 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     support_share: Annotated[
         float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
     ] = 0.3
+    trusted_share: Annotated[
+        float, Meta(ge=0.05, le=0.95, description="share of all profiles that must agree for a fit where the gripper was expected")
+    ] = 0.3
+    found_share: Annotated[
+        float, Meta(ge=0.05, le=0.95, description="share of all profiles that must agree for a fit where it was looked for")
+    ] = 0.5
 
 
 GATE_PX = 0.8
@@ -50,7 +56,8 @@ class Consensus:
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in 1/px², zero for
     those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper
-    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).
+    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).  ``share``: part of all profiles that agree, on edges that
+    are seen; zero with fewer than three such edges.
     """
 
     xi: Array
@@ -61,12 +68,7 @@ class Consensus:
     supported: NDArray[np.bool_]
     edge_share: Array
     edge_seen: NDArray[np.bool_]
-    profiles: int
-
-    @property
-    def score(self) -> float:
-        """Profiles that agree; comparable between fits of the same image and layout."""
-        return float(np.count_nonzero(self.supported))
+    share: float
 
 
 def base_weights(candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], bevel_m: Array, floor_px: float) -> Array:
@@ -93,18 +95,19 @@ def agree(
     candidates: Candidates,
     prediction: Prediction,
     weights: Array,
-    start_xi: Array,
-    prior_information: Array,
+    start: Array,
+    prior_mean: Array,
+    prior: Array,
     settings: ConsensusSettings,
 ) -> Consensus:
     """Robust fit from one start: iteratively re-weighted, the width shrinking from ``start_width_px`` to the measured scale.
 
-    ``weights`` (k,) from :func:`base_weights`; ``prior_information`` (m,) holds each unknown at zero by that much (1/m², 1/rad²), as
+    ``weights`` (k,) from :func:`base_weights`; ``prior`` (m,) holds each unknown at ``prior_mean`` by that much (1/m², 1/rad²), as
     a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
     jacobian = np.ascontiguousarray(prediction.jacobian[candidates.sample].T)
     offset = candidates.offset_px
-    xi = start_xi
+    xi = start
     width = settings.start_width_px
     scale = _LARGEST_SCALE_PX
     for round_ in range(5):
@@ -114,7 +117,7 @@ def agree(
             width = min(_TUKEY * scale, settings.start_width_px)
         elif round_ == 1:
             width = 0.5 * settings.start_width_px
-        step, information, weight = _step(jacobian, residual, weights, width, xi, prior_information)
+        step, information, weight = _step(jacobian, residual, weights, width, prior_mean - xi, prior)
         xi = xi + step
     residual = offset - xi @ jacobian
     return _judge(candidates, prediction, weights, xi, weight, residual, information, scale, settings)
@@ -125,7 +128,8 @@ def agree_from_grid(
     prediction: Prediction,
     weights: Array,
     starts: Array,
-    prior_information: Array,
+    prior_mean: Array,
+    prior: Array,
     settings: ConsensusSettings,
     refine: int = 6,
 ) -> Consensus:
@@ -137,8 +141,8 @@ def agree_from_grid(
     np.subtract(1.0, distance, out=distance)
     np.maximum(distance, 0.0, out=distance)
     best = np.argsort(-(distance @ active.astype(float)), kind="stable")[:refine]
-    fits = [agree(candidates, prediction, weights, starts[i], prior_information, settings) for i in best]
-    return max(fits, key=lambda fit: fit.score)
+    fits = [agree(candidates, prediction, weights, starts[i], prior_mean, prior, settings) for i in best]
+    return max(fits, key=lambda fit: fit.share)
 
 
 def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> Array:
@@ -160,7 +164,7 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
 
 
 def _step(
-    jacobian: Array, residual: Array, weights: Array, width: float, xi: Array, prior_information: Array
+    jacobian: Array, residual: Array, weights: Array, width: float, to_prior: Array, prior: Array
 ) -> tuple[Array, Array, Array]:
     """One weighted Gauss-Newton step: (m,) step, (m, m) information, (k,) weights."""
     weight = residual * (1.0 / width)
@@ -172,18 +176,19 @@ def _step(
     weighted = jacobian * weight
     information = weighted @ jacobian.T
     normal = information.copy()
-    normal.flat[:: len(normal) + 1] += prior_information
-    step = np.linalg.solve(normal, weighted @ residual - prior_information * xi)
+    normal.flat[:: len(normal) + 1] += prior
+    step = np.linalg.solve(normal, weighted @ residual + prior * to_prior)
     return step, information, weight
 
 
-def vague_prior(jaw_sigma_m: float) -> Array:
+def prior_information(jaw_sigma_m: float | None) -> Array:
     """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
 
-    With ``jaw_sigma_m`` > 0 the jaw opening is the seventh unknown and the reported one is worth that standard deviation.
+    With a ``jaw_sigma_m`` the jaw opening is the seventh unknown, and the reported one is worth that standard deviation (at least a
+    micrometre, which stands for "exact").
     """
     pose = [1.0 / 0.1**2] * 3 + [1.0] * 3
-    return np.array([*pose, jaw_sigma_m**-2] if jaw_sigma_m > 0.0 else pose)
+    return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
 
 
 def _scale(residual: Array, weights: Array, width: float, floor_px: float) -> float:
@@ -222,8 +227,10 @@ def _judge(
         share = agreeing / profiles
         needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
+    total = int(np.count_nonzero(prediction.ok))
+    believed = float(agreeing[seen].sum()) / total if total and np.count_nonzero(seen) >= 3 else 0.0
     return Consensus(
-        xi, weight, residual, information, scale_px, supported, share, seen, int(np.count_nonzero(prediction.ok))
+        xi, weight, residual, information, scale_px, supported, share, seen, believed
     )
 
 

@@ -134,6 +134,9 @@ def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consen
     along = prediction.along[sample]
     offset = gain * candidates.offset_px[inlier]
     weight = consensus.weight[inlier] / gain**2
+    if len(edge) == 0:
+        nothing = np.full(edges, np.nan)
+        return _Lines(nothing, nothing, np.full((edges, 3), np.nan))
     s0 = np.bincount(edge, weight, edges)
     s1 = np.bincount(edge, weight * along, edges)
     s2 = np.bincount(edge, weight * along * along, edges)
@@ -165,7 +168,7 @@ def _faults(
     angle_ok: NDArray[np.bool_],
     settings: CornerSettings,
 ) -> list[CornerFault | None]:
-    beside = _seen_beside(prediction, consensus, edges, settings.neighbourhood)
+    beside = np.zeros(edges.shape, dtype=bool) if len(prediction.layout.edges) == 0 else _seen_beside(prediction, consensus, edges, settings.neighbourhood)
     inside = np.isfinite(prediction.corners_uv_px).all(axis=1)
     sampled = (edges >= 0) & np.isfinite(prediction.line_origin[edges, 0])
     out: list[CornerFault | None] = []

@@ -28,7 +28,7 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     end_margin_px: Annotated[
         float, Meta(ge=0.0, le=40.0, description="part of an edge at each end that is left out: the neighbour edge shows there (px)")
     ] = 4.0
-    creases: Annotated[bool, Meta(description="use edges between two visible faces too")] = True
+    creases: Annotated[bool, Meta(description="use edges between two visible faces too; bevels shift them")] = False
 
 
 STEP_PX = 0.5
@@ -219,6 +219,9 @@ def _ideal_lines(
     ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal coordinates.  Lines of
     edges that are not sampled are NaN.
     """
+    if len(layout.edges) == 0:
+        nowhere = np.full((edge_count, 2), np.nan)
+        return np.zeros(0), np.zeros(0), nowhere, nowhere
     xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
     last = np.append(layout.first[1:], len(xy)) - 1
     origin, direction = np.full((edge_count, 2), np.nan), np.full((edge_count, 2), np.nan)

@@ -69,6 +69,8 @@ def profile_offsets_px(reach_px: float) -> Array:
 
 def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
     """Interpolate the image at the maps (n, s): float32 grey levels; colour is reduced to grey here, so that cost grows with edges."""
+    if map_x.size == 0:
+        return np.zeros(map_x.shape, dtype=np.float32)
     values = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     if values.ndim == 3:
         return values.astype(np.float32) @ GREY_BGR
@@ -78,6 +80,11 @@ def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.fl
 def full_scale(image: Image) -> float:
     """Largest grey level of an image's type; 1 for float images."""
     return float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else 1.0
+
+
+def quantum(image: Image) -> float:
+    """Step between grey levels of an image's type; float images are taken to come from 16 bits."""
+    return 1.0 if np.issubdtype(image.dtype, np.integer) else 1.0 / 65535.0
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,222 @@
+"""The corner measurement as one: from an image and an expected pose to edge points that agree, and corners.
+
+The cheap way is tried first: profiles about the expected pose and one robust fit.  Only when too few profiles agree are other starts
+tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.camera import Camera
+from gripmon.corners.consensus import (
+    Consensus,
+    ConsensusSettings,
+    agree,
+    agree_from_grid,
+    base_weights,
+    grid_of_starts,
+    prior_information,
+)
+from gripmon.corners.lines import Corners, CornerSettings, CornerTopology, intersect_edges
+from gripmon.corners.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
+from gripmon.corners.profiles import (
+    Candidates,
+    EdgeSettings,
+    estimate_noise,
+    find_candidates,
+    full_scale,
+    profile_offsets_px,
+    quantum,
+    read_profiles,
+)
+from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.records import Array, Image
+
+RELAYOUT_PX = 6.0
+"""Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""
+
+
+class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """From the image to edge points and corners."""
+
+    sampling: SamplingSettings = SamplingSettings()
+    edges: EdgeSettings = EdgeSettings()
+    consensus: ConsensusSettings = ConsensusSettings()
+    corners: CornerSettings = CornerSettings()
+    search: SearchSettings = SearchSettings()
+    relinearise_px: Annotated[
+        float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed anew (px)")
+    ] = 0.5
+
+
+class Effort(enum.IntEnum):
+    """How far a measurement may look for the gripper."""
+
+    NARROW = 0
+    GRID = 1
+    SEARCH = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
+
+    ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
+    """
+
+    prediction: Prediction
+    candidates: Candidates
+    consensus: Consensus
+    corners: Corners
+    cam_T_grip: Array
+    jaw_opening_m: float
+    effort: Effort
+    trusted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """A pose and the two openings that go with it: the one to start from and the one that the robot reports."""
+
+    cam_T_grip: Array
+    jaw_opening_m: float
+    jaw_reported_m: float
+
+
+class FingertipMeter:
+    """Measures one gripper with one camera.  Keeps the prediction between calls and nothing that depends on the images."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
+        self._camera, self._gripper, self._settings = camera, gripper, settings
+        self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
+        self._topology = CornerTopology.of(gripper)
+        self._prior = prior_information(jaw_sigma_m if gripper.has_jaw else None)
+        self._laid_out: tuple[EdgeLayout, Array] | None = None
+        self._prediction: Prediction | None = None
+
+    def measure(
+        self, image: Image, cam_T_grip: Array, jaw_opening_m: float, satisfied_share: float, effort: Effort
+    ) -> Measurement:
+        """Measure about an expected pose.
+
+        Where less than ``satisfied_share`` of the profiles agree the gripper is looked for elsewhere as far as ``effort`` allows, and
+        the place with the largest share is returned.
+        """
+        expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
+        best = self._settle(image, expected)
+        if effort >= Effort.GRID and best.consensus.share < satisfied_share:
+            best = max(best, self._from_grid(image, expected), key=_agreement)
+        if effort >= Effort.SEARCH and best.consensus.share < satisfied_share:
+            best = max(best, self._search(image, expected), key=_agreement)
+        consensus = self._settings.consensus
+        needed = consensus.trusted_share if best.effort == Effort.NARROW else consensus.found_share
+        return replace(best, trusted=best.consensus.share >= needed)
+
+    def _settle(self, image: Image, expected: _Expected) -> Measurement:
+        """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at most."""
+        for _ in range(3):
+            prediction = self._predicted(expected)
+            candidates, weights = self._look(image, prediction)
+            start = self._from_prediction(prediction, expected)
+            prior_mean = self._prior_mean(prediction, expected)
+            consensus = agree(candidates, prediction, weights, start, prior_mean, self._prior, self._settings.consensus)
+            moved_px = prediction.moved_px(consensus.xi)
+            if moved_px > 2.0 * self._settings.sampling.reach_px:
+                # Nothing was seen out there: the few points that agree don't determine the motion.
+                consensus = replace(consensus, share=0.0)
+                break
+            expected = self._moved(prediction, consensus.xi, expected)
+            if moved_px <= self._settings.relinearise_px:
+                break
+        corners = intersect_edges(candidates, prediction, consensus, self._topology, self._settings.corners)
+        return Measurement(
+            prediction, candidates, consensus, corners, expected.cam_T_grip, expected.jaw_opening_m, Effort.NARROW
+        )
+
+    def _from_grid(self, image: Image, expected: _Expected) -> Measurement:
+        """Starts all over the reach of the profiles; the best one settled."""
+        prediction = self._predicted(expected)
+        if not prediction.ok.any():
+            return self._settle(image, expected)
+        candidates, weights = self._look(image, prediction)
+        settings = self._settings
+        prior_mean = self._prior_mean(prediction, expected)
+        starts = grid_of_starts(prediction, settings.sampling.reach_px, settings.consensus.start_width_px)
+        starts = starts + self._from_prediction(prediction, expected)
+        consensus = agree_from_grid(candidates, prediction, weights, starts, prior_mean, self._prior, settings.consensus)
+        return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
+
+    def _search(self, image: Image, expected: _Expected) -> Measurement:
+        """Starts from the reduced image; the best of them settled."""
+        prediction = self._predicted(expected)
+        starts = search_starts(image, prediction, self._settings.search)
+        found = [self._from_grid(image, self._moved(prediction, start, expected)) for start in starts]
+        return replace(max(found, key=_agreement) if found else self._settle(image, expected), effort=Effort.SEARCH)
+
+    def _predicted(self, expected: _Expected) -> Prediction:
+        """The kept prediction while it holds, else a new one at the expected pose."""
+        kept = self._prediction
+        if kept is not None and len(kept.uv_px):
+            if kept.moved_px(self._from_prediction(kept, expected)) <= self._settings.relinearise_px:
+                return kept
+        cam_T_grip, jaw_opening_m = expected.cam_T_grip, expected.jaw_opening_m
+        if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
+            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.sampling)
+            self._laid_out = layout, self._corner_pixels(expected)
+        self._prediction = predict(
+            self._camera,
+            self._gripper,
+            self._laid_out[0],
+            cam_T_grip,
+            jaw_opening_m,
+            self._offsets_px,
+            jaw_unknown=len(self._prior) == 7,
+        )
+        return self._prediction
+
+    def _layout_moved_px(self, expected: _Expected) -> float:
+        assert self._laid_out is not None
+        moved = np.abs(self._corner_pixels(expected) - self._laid_out[1])
+        return float(np.nanmax(moved)) if np.isfinite(moved).any() else np.inf
+
+    def _corner_pixels(self, expected: _Expected) -> Array:
+        points_grip_m = self._gripper.points_grip_m(expected.jaw_opening_m)[self._gripper.corner_points]
+        return self._camera.project(points_grip_m @ expected.cam_T_grip[:3, :3].T + expected.cam_T_grip[:3, 3])
+
+    def _look(self, image: Image, prediction: Prediction) -> tuple[Candidates, Array]:
+        settings = self._settings
+        profiles = read_profiles(image, prediction.map_x, prediction.map_y)
+        noise = estimate_noise(profiles, quantum(image))
+        candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges)
+        gripper, floor_px = self._gripper, settings.consensus.point_floor_px
+        return candidates, base_weights(candidates, prediction, gripper.edge_polarity, gripper.edge_bevel_m, floor_px)
+
+    def _from_prediction(self, prediction: Prediction, expected: _Expected) -> Array:
+        """(m,) from the prediction's pose and opening to the expected ones."""
+        xi = perturbation_between(prediction.cam_T_grip, expected.cam_T_grip)
+        return np.append(xi, expected.jaw_opening_m - prediction.jaw_opening_m) if len(self._prior) == 7 else xi
+
+    def _prior_mean(self, prediction: Prediction, expected: _Expected) -> Array:
+        mean = np.zeros(len(self._prior))
+        mean[6:] = expected.jaw_reported_m - prediction.jaw_opening_m
+        return mean
+
+    def _moved(self, prediction: Prediction, xi: Array, expected: _Expected) -> _Expected:
+        """The expectation after a fit; an opening beyond the jaw's range stays at its end (the fit sees the misfit)."""
+        gripper = self._gripper
+        jaw_opening_m = prediction.jaw_opening_m + (float(xi[6]) if len(xi) == 7 else 0.0)
+        jaw_opening_m = min(max(jaw_opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
+        return _Expected(perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m, expected.jaw_reported_m)
+
+
+def _agreement(measurement: Measurement) -> float:
+    return measurement.consensus.share
