@@ -345,7 +345,8 @@ def truth(seq: int) -> FrameTruth:
     return FrameTruth(
         index=seq, time_s=0.1 * seq, stamp_ns=seq, cam_T_grip=moved, reference_cam_T_grip=reference,
         tcp_shift_m=shift_m, jaw_opening_m=0.0, jaw_reported_m=None,
-        corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(), finger_bend=np.zeros((0, 4, 4)), events=events, exposure=1.0, defocus_px=0.0,
+        corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(), finger_bend=np.zeros((0, 4, 4)),
+        events=events, exposure=1.0, defocus_px=0.0,
     )  # fmt: skip
 
 
