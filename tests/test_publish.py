@@ -181,7 +181,7 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
         ".yaml": "mode: peer\nlisten:\n  endpoints: [HERE]\nscouting:\n  multicast:\n    enabled: false\n",
     }[suffix].replace("HERE", endpoint)
     path.write_text(text)
-    publisher = ZenohPublisher(PublishSettings(zenoh_config=str(path)), "arm", "wrist")
+    publisher = ZenohPublisher(PublishSettings(zenoh_config=path.name), "arm", "wrist", relative_to=tmp_path)
     try:
         publisher.state(state_record(5))
         with plain_session(connect=endpoint) as session:

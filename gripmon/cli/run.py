@@ -128,7 +128,13 @@ def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None]:
         return NullPublisher(), fixed
     from_network = settings.jaw.source == "zenoh"
     try:
-        publisher = ZenohPublisher(settings.publish, settings.robot, settings.camera_name, subscribe_jaw=from_network)
+        publisher = ZenohPublisher(
+            settings.publish,
+            settings.robot,
+            settings.camera_name,
+            subscribe_jaw=from_network,
+            relative_to=config.directory,
+        )
     except PublishError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
     return publisher, publisher.jaw if from_network else fixed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
+from pathlib import Path
 from typing import Protocol
 
 import zenoh
@@ -49,8 +50,18 @@ class ZenohPublisher:
     last state, the last reference and the last few alerts are kept for the router's arrival.
     """
 
-    def __init__(self, settings: PublishSettings, robot: str, camera: str, *, subscribe_jaw: bool = False) -> None:
-        """Raises ValueError for a name that can't be part of a key, and :class:`PublishError` for a configuration that
+    def __init__(
+        self,
+        settings: PublishSettings,
+        robot: str,
+        camera: str,
+        *,
+        subscribe_jaw: bool = False,
+        relative_to: Path = Path(),
+    ) -> None:
+        """``relative_to`` is the folder of the configuration file, from which a path in the settings counts.
+
+        Raises ValueError for a name that can't be part of a key, and :class:`PublishError` for a configuration that
         can't work or an address that is already taken.
         """
         check_name("robot", robot)
@@ -67,7 +78,7 @@ class ZenohPublisher:
         self._alerts: deque[AlertRecord] = deque(maxlen=_ALERTS_KEPT)
         self._closing = threading.Event()
         self._opener: threading.Thread | None = None
-        config = zenoh_config(settings)
+        config = zenoh_config(settings, relative_to)
         if config.get_json("mode") == '"client"':
             self._opener = threading.Thread(
                 target=self._open_until_it_works, args=(config,), name="zenoh-open", daemon=True

@@ -11,21 +11,23 @@ import zenoh
 from gripmon.publish.settings import PublishError, PublishSettings
 
 
-def zenoh_config(settings: PublishSettings) -> zenoh.Config:
-    """Zenoh's own configuration for these settings.  Raises :class:`PublishError`."""
+def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh.Config:
+    """Zenoh's own configuration for these settings; a path in them counts from ``relative_to``.
+
+    Raises :class:`PublishError`.
+    """
     defaults = PublishSettings()
     if settings.zenoh_config is not None:
         for key in ("mode", "listen", "connect", "multicast_scouting"):
             if getattr(settings, key) != getattr(defaults, key):
                 raise PublishError(f"publish.{key}: has no effect beside publish.zenoh_config; say it in that file")
-        if not Path(settings.zenoh_config).is_file():
-            raise PublishError(
-                f"publish.zenoh_config: no file {settings.zenoh_config}; give a json5 or yaml file of Zenoh's"
-            )
+        path = relative_to / settings.zenoh_config
+        if not path.is_file():
+            raise PublishError(f"publish.zenoh_config: no file {path}; give a json5 or yaml file of Zenoh's")
         try:
-            return zenoh.Config.from_file(settings.zenoh_config)
+            return zenoh.Config.from_file(path)
         except zenoh.ZError as error:
-            raise PublishError(f"publish.zenoh_config: {settings.zenoh_config}: {in_short(error)}") from error
+            raise PublishError(f"publish.zenoh_config: {path}: {in_short(error)}") from error
     if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
         raise PublishError("publish.connect: a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
     config = zenoh.Config()

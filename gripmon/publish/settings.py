@@ -35,7 +35,7 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     connect: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="peers or routers to connect to")] = ()
     multicast_scouting: Annotated[bool, msgspec.Meta(description="look for others by UDP multicast")] = False
     zenoh_config: Annotated[
-        str | None, msgspec.Meta(description="a Zenoh configuration file (json5, json, yaml) instead of the keys above")
+        str | None, msgspec.Meta(description="path of a file of Zenoh's (json5, yaml) instead of the keys above")
     ] = None
     retry_first_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="client without a router: first pause before the next attempt (s)")
