@@ -96,8 +96,9 @@ def test_a_changed_state_is_said_at_once_and_an_unchanged_one_is_not():
         (State.TRACKING, 0, 1),
         (State.OCCLUDED, 2, 3),
         (State.TRACKING, 4, 5),
-        (State.TRACKING, 5, 6),
+        (State.STALE, 5, 6),
     ]
+    assert bench.network.states[-1].verdict is Verdict.UNKNOWN
     assert [message for _, message in bench.states] == ["no frame yet", "", "", "", "stopped"]
 
 
@@ -133,11 +134,11 @@ def test_a_missing_camera_is_said_on_the_network_and_its_return_too():
     stale = next(state for state in bench.network.states if state.state is State.STALE)
     assert not stale.camera_connected and stale.verdict is Verdict.UNKNOWN and stale.frames_per_s == 0.0
     assert stale.message == "no frames: camera 0 can't be opened"
-    assert [state for state, _ in bench.states].count(State.STALE) == 1
+    assert [state for state, _ in bench.states].count(State.STALE) == 2  # and at the end
     assert bench.alerts == [(AlertKind.SOURCE, Cause.NO_CAMERA), (AlertKind.RECOVERED, Cause.NO_CAMERA)]
     assert bench.network.alerts[0].severity is Severity.ERROR
     assert bench.recording.alerts == bench.network.alerts
-    assert (bench.network.states[-1].state, bench.network.states[-1].camera_connected) == (State.TRACKING, True)
+    assert (bench.network.states[-2].state, bench.network.states[-2].camera_connected) == (State.TRACKING, True)
 
 
 def test_a_camera_that_never_comes_is_a_failure_at_the_end():
@@ -179,7 +180,7 @@ def test_one_failing_frame_is_survived_and_said(caplog: pytest.LogCaptureFixture
     assert broken.reason == "internal error: ValueError: singular matrix"
     assert bench.alerts == [(AlertKind.LOST, Cause.UNKNOWN)]
     assert (State.LOST, "internal error: ValueError: singular matrix") in bench.states
-    assert bench.states[-1][0] is State.TRACKING
+    assert bench.states[-2:] == [(State.TRACKING, ""), (State.STALE, "stopped")]
     errors = [entry for entry in caplog.records if entry.levelno >= logging.ERROR]
     assert [entry.getMessage() for entry in errors if "frame 1" in entry.getMessage()] == [
         "frame 1: internal error: ValueError: singular matrix"

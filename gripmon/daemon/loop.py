@@ -120,7 +120,7 @@ class Daemon:
             pass
         watch = self._watch
         exit_code = self._stop.exit_code if self._stop.exit_code is not None else self._code_at_the_end()
-        watch.message = "stopped"
+        watch.stopped()
         self._say_state(time.monotonic())
         _log.info(
             "stopped after %d frames, %d refused, %d dropped", watch.frames, watch.frames_refused, self._source.dropped

@@ -70,6 +70,10 @@ class Watch:
             return []
         return [Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, self.message)]
 
+    def stopped(self) -> None:
+        """The end: whoever keeps the last state message must not go on trusting the last transform."""
+        self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
+
     @property
     def gives_up(self) -> bool:
         """Have errors persisted for as long as the settings allow?"""
