@@ -26,6 +26,7 @@ _REACH_SIGMAS = 3.3
 _STEP_SIGMAS = 1.6
 _GAUSS_POINTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 _VIEW_MARGIN = 1.06
+_FARTHEST_IDEAL = 100.0
 
 Mask = NDArray[np.float32]
 
@@ -44,7 +45,8 @@ class CoverageRaster:
 
     def __init__(self, camera: Camera, psf_sigma_px: float) -> None:
         self._camera = camera
-        self._step_px = _STEP_SIGMAS * psf_sigma_px
+        self._step_px = _STEP_SIGMAS * psf_sigma_px / _magnification(camera)
+        self._radius = _lens_radius(camera)
         self._reach = math.ceil(0.5 + _REACH_SIGMAS * psf_sigma_px)
         self._rows, self._columns = _kernel_tables(psf_sigma_px, self._reach)
         self._view_planes = _view_planes(camera)
@@ -53,7 +55,7 @@ class CoverageRaster:
     def masks(self, polygons_cam_m: list[Array]) -> list[Coverage | None]:
         """One mask a polygon (k, 3), planar, counter-clockwise seen from the camera; None for what is out of sight."""
         loops = [_clip(polygon, self._view_planes) for polygon in polygons_cam_m]
-        pieces = _trace(self._camera, loops, self._step_px)
+        pieces = _trace(self._camera, loops, self._step_px, self._radius)
         return [None if piece is None else self._accumulate(*piece) for piece in pieces]
 
     def _accumulate(self, points_px: Array, dy_px: Array) -> Coverage | None:
@@ -87,7 +89,7 @@ class CoverageRaster:
         return Coverage(left, top, inside[:, pad:].astype(np.float32))
 
     def _scratch(self, count: int) -> tuple[NDArray[np.intp], Array]:
-        """Index and weight arrays (count, rows, columns) of patches; kept, because fresh memory costs more than the sums."""
+        """Index and weight arrays (count, rows, columns) of patches; kept: fresh memory costs more than the sums."""
         if len(self._where) < count:
             shape = (count + count // 2, 2 * self._reach, 2 * self._reach + 1)
             self._where, self._what = np.empty(shape, dtype=np.intp), np.empty(shape)
@@ -126,6 +128,27 @@ def _view_planes(camera: Camera) -> Array:
     return np.column_stack([-directions, support + directions @ centre])
 
 
+def _magnification(camera: Camera) -> float:
+    """Largest scale of the lens in the image: how much longer than f times its ideal length a short line can appear."""
+    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 17), np.linspace(0, camera.height_px - 1, 17))
+    _, d_xy_d_uv = camera.undistort_with_jacobian(np.stack([u.ravel(), v.ravel()], axis=1))
+    inverse = d_xy_d_uv[np.isfinite(d_xy_d_uv).all(axis=(1, 2))] * max(camera.fx_px, camera.fy_px)
+    return max(1.0, 1.0 / float(np.linalg.svd(inverse, compute_uv=False).min()))
+
+
+def _lens_radius(camera: Camera) -> float:
+    """Ideal radius up to which the lens model holds in all directions; infinite if it does everywhere."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
+    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    good, bad = 0.0, _FARTHEST_IDEAL
+    if np.isfinite(camera.distort(bad * ring)).all():
+        return math.inf
+    for _ in range(60):
+        middle = 0.5 * (good + bad)
+        good, bad = (middle, bad) if np.isfinite(camera.distort(middle * ring)).all() else (good, middle)
+    return good * (1.0 - 1e-7)  # the last bisection step and rounding stay inside
+
+
 def _clip(polygon: Array, planes: Array) -> Array:
     """Cut a planar polygon (k, 3) by half spaces ``a·X >= 0`` (Sutherland-Hodgman); may become empty."""
     heights = polygon @ planes.T
@@ -153,7 +176,7 @@ def _clip(polygon: Array, planes: Array) -> Array:
     return np.array(corners)
 
 
-def _trace(camera: Camera, loops: list[Array], step_px: float) -> list[tuple[Array, Array] | None]:
+def _trace(camera: Camera, loops: list[Array], step_px: float, radius: float) -> list[tuple[Array, Array] | None]:
     """Points (n, 2) on each loop's boundary in the distorted image, and the vertical extent (n,) of each."""
     visible = [k for k, loop in enumerate(loops) if len(loop)]
     out: list[tuple[Array, Array] | None] = [None] * len(loops)
@@ -168,7 +191,10 @@ def _trace(camera: Camera, loops: list[Array], step_px: float) -> list[tuple[Arr
     edge = np.repeat(np.arange(len(a)), nodes)
     index = np.arange(len(edge)) - np.repeat(np.cumsum(nodes) - nodes, nodes)
     share = (index / counts[edge])[:, None]
-    uv = camera.distort(a[edge] + share * (b - a)[edge])
+    xy = a[edge] + share * (b - a)[edge]
+    if math.isfinite(radius):  # what lies beyond the lens stays beyond the image, at the end of the lens
+        xy *= np.minimum(1.0, radius / np.maximum(np.hypot(xy[:, 0], xy[:, 1]), radius))[:, None]
+    uv = camera.distort(xy)
     pieces = np.flatnonzero(index[1:] > 0)
     begin, extent = uv[pieces], uv[pieces + 1] - uv[pieces]
     points = (begin[:, None] + _GAUSS_POINTS[:, None] * extent[:, None]).reshape(-1, 2)

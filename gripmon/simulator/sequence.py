@@ -74,13 +74,21 @@ class Simulator:
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """Image (height, width) of a frame."""
+        _, sensor = self._painters()
+        return sensor.expose(self.light(index), index, self.time_s(index))
+
+    def light(self, index: int) -> NDArray[np.float32]:
+        """Light on the sensor (height, width) of a frame in DN at exposure 1, before vignetting, exposure and noise."""
+        renderer, _ = self._painters()
+        return renderer.render(self.time_s(index))
+
+    def _painters(self) -> tuple[Renderer, SensorModel]:
+        """Renderer and sensor, made when the first picture is asked for: truth needs neither."""
         if self._painting is None:
             scenario, nominal = self.scenario, self.nominal_cam_T_grip
             renderer = Renderer(self.camera, self._bodies, self._scene, scenario, nominal, self.seed)
             self._painting = renderer, SensorModel(renderer.rays, scenario, self.seed)
-        renderer, sensor = self._painting
-        time_s = self.time_s(index)
-        return sensor.expose(renderer.render(time_s), index, time_s)
+        return self._painting
 
     def frame(self, index: int) -> Frame:
         """A frame as a camera would hand it over, with the jaw opening that the robot reports."""

@@ -177,7 +177,28 @@ def _hides(a: PlacedSolid, b: PlacedSolid) -> bool:
         return False
     if (beyond_a & ~a.facing).any() or (beyond_b & b.facing).any():
         return True
-    return _distance(a) < _distance(b)
+    return _hides_across_edges(a, b)
+
+
+def _hides_across_edges(a: PlacedSolid, b: PlacedSolid) -> bool:
+    """As ``_hides`` where no face separates the two: then a plane along one edge of each does, if anything."""
+    normals = np.cross(_edge_directions(a)[:, None], _edge_directions(b)[None]).reshape(-1, 3)
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals[lengths > 1e-9] / lengths[lengths > 1e-9, None]
+    of_a, of_b = a.vertices_cam_m @ normals.T, b.vertices_cam_m @ normals.T
+    gap_up, gap_down = of_b.min(axis=0) - of_a.max(axis=0), of_a.min(axis=0) - of_b.max(axis=0)
+    best = int(np.maximum(gap_up, gap_down).argmax())
+    if max(gap_up[best], gap_down[best]) < -_TOUCH_M:
+        return _distance(a) < _distance(b)  # the bodies cross each other
+    if gap_up[best] >= gap_down[best]:  # a below, b above: the camera at height 0
+        return bool(of_a[:, best].max() + of_b[:, best].min() > 0.0)
+    return bool(of_a[:, best].min() + of_b[:, best].max() < 0.0)
+
+
+def _edge_directions(body: PlacedSolid) -> Array:
+    """Directions (e, 3) of all sides of all faces, camera frame."""
+    vertices = body.vertices_cam_m
+    return np.concatenate([np.roll(vertices[loop], -1, axis=0) - vertices[loop] for loop in body.solid.loops])
 
 
 def hidden_by(body: PlacedSolid, points_cam_m: Array) -> NDArray[np.bool_]:

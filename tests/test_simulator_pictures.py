@@ -1,0 +1,394 @@
+"""The simulator's pictures against independent measurements: outlines to 0.01 px, noise, blur, occlusion."""
+
+from __future__ import annotations
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import brentq, curve_fit
+from scipy.special import erf
+from simulated import (
+    IDEAL_SENSOR,
+    PAPER_LENS,
+    PLAIN_FINGERS,
+    STRONG_LENS,
+    nominal_cam_T_grip,
+    plain_scenario,
+    simulator,
+)
+
+from gripmon.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
+from gripmon.simulator import Hidden, Simulator, make_scenario
+from gripmon.simulator.background import _smear_kernel
+from gripmon.simulator.coverage import CoverageRaster
+from gripmon.simulator.scenario import (
+    Background,
+    Cover,
+    Creep,
+    Defocus,
+    GraspedObject,
+    JawScript,
+    Light,
+    LightStep,
+    Sensor,
+    Shadow,
+)
+from gripmon.simulator.sensor import blur
+from gripmon.simulator.solids import box, hidden_by, paint_order, place
+
+CONTOURS = ("L_tip_near", "L_tip_in", "L_in_far_along", "L_out_near_along", "R_tip_near", "R_tip_in", "R_in_far_along")
+MARGIN_PX = 8.0
+REACH_PX = 6
+DITHER = Sensor(read_noise_dn=1.0, shot_noise_dn=0.0, vignetting=0.0, exposure_time_s=0.0)
+
+
+def project(lens: LensSettings, points_cam_m: np.ndarray) -> np.ndarray:
+    """Camera points (n, 3) -> pixels, without the project's camera: OpenCV, or a root of the paper's equation (4)."""
+    if isinstance(lens, BrownConradyLens):
+        matrix = np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]])
+        return cv2.projectPoints(points_cam_m, np.zeros(3), np.zeros(3), matrix, np.array(lens.coefficients))[0][:, 0]
+    assert isinstance(lens, PaperLens)
+    ideal = points_cam_m[:, :2] / points_cam_m[:, 2:] * lens.fx_px
+    radius = np.linalg.norm(ideal, axis=1)
+    distorted = [brentq(lambda d, r=r: d * (1.0 + lens.kappa_per_px2 * d * d) - r, 0.0, 2.0 * r) for r in radius]
+    return ideal * (np.array(distorted) / radius)[:, None] + np.array([lens.cx_px, lens.cy_px])
+
+
+def line_curve(sim: Simulator, lens: LensSettings, points: frozenset[str], index: int) -> np.ndarray:
+    """Dense points (n, 2) in the image of the line between two points of the gripper."""
+    start, end = (np.array(sim.gripper.model.points[p].xyz_m) for p in sorted(points))
+    share = np.linspace(0.0, 1.0, 500)[:, None]
+    cam_T_grip = sim.truth(index).cam_T_grip
+    return project(lens, (start + share * (end - start)) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+
+
+def edge_curve(sim: Simulator, lens: LensSettings, edge: str, index: int) -> np.ndarray:
+    """Dense points (n, 2) of a gripper edge in the image."""
+    model = sim.gripper.model.edges[edge]
+    return line_curve(sim, lens, frozenset((model.start, model.end)), index)
+
+
+def other_curves(sim: Simulator, lens: LensSettings, edge: str, index: int) -> list[np.ndarray]:
+    """Those of all other sides of all faces."""
+    loops = [face.points for face in sim.gripper.model.faces]
+    sides = {frozenset(side) for loop in loops for side in zip(loop, (*loop[1:], loop[0]), strict=True)}
+    model = sim.gripper.model.edges[edge]
+    return [line_curve(sim, lens, side, index) for side in sides - {frozenset((model.start, model.end))}]
+
+
+def position_errors(image: np.ndarray, curve: np.ndarray, others: list[np.ndarray]) -> np.ndarray:
+    """Measured minus true edge position, px along the normal, one a row (or column) that the edge crosses.
+
+    The measurement is the area moment: the share of light that the row lost to the darker side.  It needs no
+    interpolation and is exact for any symmetric blur of a straight edge.  Rows near other edges don't count.
+    """
+    extent = np.abs(curve[-1] - curve[0])
+    if extent[1] < extent[0]:  # a flat edge: transpose
+        image, curve, others = image.T, curve[:, ::-1], [other[:, ::-1] for other in others]
+    near = np.concatenate(others)
+    if curve[0, 1] > curve[-1, 1]:
+        curve = curve[::-1]
+    errors = []
+    first, last = max(np.ceil(curve[0, 1]) + MARGIN_PX, 2), min(curve[-1, 1] - MARGIN_PX, image.shape[0] - 3)
+    for row in np.arange(first, last + 1).astype(int):
+        true = np.interp(row, curve[:, 1], curve[:, 0])
+        slope = np.interp(row + 0.5, curve[:, 1], curve[:, 0]) - np.interp(row - 0.5, curve[:, 1], curve[:, 0])
+        left, right = int(true) - REACH_PX, int(true) + REACH_PX + 1
+        beside = (np.abs(near[:, 1] - row) < 4.0) & (near[:, 0] > left - 4.0) & (near[:, 0] < right + 4.0)
+        if left < 0 or right >= image.shape[1] or beside.any():
+            continue
+        profile = image[row, left : right + 1].astype(float)
+        a, b = profile[:2].mean(), profile[-2:].mean()
+        measured = left - 0.5 + ((profile - b) / (a - b)).sum()
+        errors.append((measured - true) / np.hypot(1.0, slope))
+    return np.array(errors)
+
+
+# --- outlines
+
+
+@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS], ids=["paper", "strong distortion"])
+@pytest.mark.parametrize("pose", range(3))
+def test_outlines_are_at_their_true_place_to_a_hundredth_of_a_pixel(lens: LensSettings, pose: int) -> None:
+    rng = np.random.default_rng(pose)
+    turn = cv2.Rodrigues(rng.normal(0.0, 0.05, 3))[0]
+    cam_T_grip = nominal_cam_T_grip(tcp_m=tuple(np.array([0.0004, 0.0013, 0.115]) + rng.normal(0.0, 0.002, 3)))
+    cam_T_grip[:3, :3] = turn @ cam_T_grip[:3, :3]
+    sim = simulator(plain_scenario(), lens=lens, cam_T_grip=cam_T_grip)
+    noisy = simulator(plain_scenario(sensor=DITHER), lens=lens, cam_T_grip=cam_T_grip)
+    light, image = sim.light(0), np.mean([noisy.render(i) for i in range(25)], axis=0)
+    of_light = []
+    for edge in CONTOURS:
+        curve, others = edge_curve(sim, lens, edge, 0), other_curves(sim, lens, edge, 0)
+        of_light.append(position_errors(light, curve, others))
+        of_image = position_errors(image, curve, others)
+        assert len(of_image) > 15
+        assert abs(of_image.mean()) < 0.005 and of_image.std() < 0.02
+    assert np.abs(np.concatenate(of_light)).max() < 0.002
+
+
+def test_a_strong_lens_really_bends_the_edges_of_that_test() -> None:
+    sim = simulator(plain_scenario(), lens=STRONG_LENS)
+    curve = edge_curve(sim, STRONG_LENS, "L_out_near_along", 0)
+    chord = curve[0] + np.linspace(0.0, 1.0, 500)[:, None] * (curve[-1] - curve[0])
+    along = (curve[-1] - curve[0]) / np.linalg.norm(curve[-1] - curve[0])
+    offset = (curve - chord) @ np.array([-along[1], along[0]])
+    assert np.abs(offset).max() > 1.0
+
+
+def test_an_outline_is_as_blurred_as_the_lens_and_the_pixel() -> None:
+    sim = simulator(plain_scenario())
+    light = sim.light(0)
+    curve = edge_curve(sim, PAPER_LENS, "R_in_far_along", 0)
+    rows = np.arange(400, 520)
+    true = np.interp(rows, curve[:, 1], curve[:, 0])
+    cosine = 1.0 / np.hypot(1.0, np.gradient(true, rows).mean())
+    u = np.concatenate([np.arange(int(t) - 5, int(t) + 7) - t for t in true]) * cosine
+    v = np.concatenate([light[row, int(t) - 5 : int(t) + 7] for row, t in zip(rows, true, strict=True)])
+    model = lambda x, low, step, at, sigma: low + step * 0.5 * (1.0 + erf((x - at) / (sigma * np.sqrt(2.0))))  # noqa: E731
+    (_, _, at, sigma), _ = curve_fit(model, u, v, p0=(60.0, 120.0, 0.0, 0.7))
+    assert sigma == pytest.approx(np.sqrt(0.6**2 + 1.0 / 12.0), rel=0.01)
+    assert abs(at) < 0.002
+
+
+@pytest.mark.parametrize("psf_px", [0.3, 0.6, 1.0])
+def test_masks_are_what_supersampling_gives_corners_and_borders_included(psf_px: float) -> None:
+    lens = BrownConradyLens(
+        width_px=72,
+        height_px=60,
+        fx_px=70.0,
+        fy_px=69.0,
+        cx_px=35.3,
+        cy_px=30.1,
+        coefficients=(-0.3, 0.08, 0.001, -0.002),
+    )
+    camera = make_camera(lens)
+    corners = np.array([[-0.25, -0.3, 1.0], [-0.8, 0.25, 1.1], [0.2, 0.6, 1.05], [0.3, -0.1, 0.9]])  # leaves the view
+    coverage = CoverageRaster(camera, psf_px).masks([corners])[0]
+    assert coverage is not None
+    mask = np.zeros((60, 72))
+    height, width = coverage.mask.shape
+    mask[coverage.top : coverage.top + height, coverage.left : coverage.left + width] = coverage.mask
+    fine, border = 24, 8
+    matrix = np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0.0, 0.0, 1.0]])
+    share = np.linspace(0.0, 1.0, 400)[:, None]
+    outline = np.concatenate([a + share * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)])
+    uv = cv2.projectPoints(outline, np.zeros(3), np.zeros(3), matrix, np.array(lens.coefficients))[0][:, 0]
+    shape = (60 + 2 * border) * fine, (72 + 2 * border) * fine
+    inside = np.zeros(shape, dtype=bool)
+    columns = (np.arange(shape[1]) + 0.5) / fine - 0.5 - border
+    begin, end = uv, np.roll(uv, -1, axis=0)
+    for k in range(shape[0]):  # even-odd rule
+        row = (k + 0.5) / fine - 0.5 - border
+        crossing = (begin[:, 1] <= row) != (end[:, 1] <= row)
+        a, b = begin[crossing], end[crossing]
+        at = np.sort(a[:, 0] + (row - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0]))
+        inside[k] = np.searchsorted(at, columns) % 2 == 1
+    blurred = gaussian_filter(inside.astype(float), psf_px * fine, mode="nearest")
+    pixels = blurred.reshape(60 + 2 * border, fine, 72 + 2 * border, fine).mean(axis=(1, 3))[
+        border:-border, border:-border
+    ]
+    assert np.abs(mask - pixels).max() < 0.008
+
+
+# --- sensor
+
+
+def noise_by_level(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Mean grey values and variances of a still chequered view, from differences of frames."""
+    table = Background(kind="chequer", level_dn=110.0, contrast=0.9, motion="still")
+    sim = simulator(plain_scenario(background=table, sensor=sensor))
+    stack = np.stack([sim.render(i).astype(np.float32) for i in range(24)])
+    mean, variance = stack.mean(axis=0), stack.var(axis=0, ddof=1)
+    bins = np.digitize(mean, np.arange(20, 220, 20))
+    chosen = [k for k in range(1, 10) if (bins == k).sum() > 2000]
+    return np.array([mean[bins == k].mean() for k in chosen]), np.array([variance[bins == k].mean() for k in chosen])
+
+
+def test_noise_variance_grows_with_the_grey_value() -> None:
+    level, variance = noise_by_level(Sensor(read_noise_dn=1.5, shot_noise_dn=0.03, vignetting=0.0))
+    assert len(level) >= 6
+    slope, at_zero = np.polyfit(level, variance, 1)
+    assert slope == pytest.approx(0.03, rel=0.05)
+    assert at_zero == pytest.approx(1.5**2 + 1.0 / 12.0, rel=0.1)
+
+
+def test_noise_is_new_in_every_frame_and_white() -> None:
+    sensor = Sensor(read_noise_dn=3.0, shot_noise_dn=0.0, vignetting=0.0)
+    sim = simulator(plain_scenario(sensor=sensor))
+    clean = simulator(plain_scenario()).render(0).astype(float)
+    noise = np.stack([sim.render(i) - clean for i in range(12)]).reshape(12, 576, 768)
+    between = np.corrcoef(noise.reshape(12, -1)) - np.eye(12)
+    assert np.abs(between).max() < 0.02
+    neighbours = (noise[:, :, 1:] * noise[:, :, :-1]).mean() / noise.var()
+    assert abs(neighbours) < 0.01
+    assert noise.mean(axis=0).std() == pytest.approx(noise.std() / np.sqrt(12), rel=0.05)
+
+
+def test_exposure_scales_and_saturates() -> None:
+    light = Light(steps=(LightStep(at_s=0.5, factor=0.5), LightStep(at_s=1.5, factor=4.0)))
+    sim = simulator(plain_scenario(light=light, fps=1.0))
+    before, darker, brighter = (sim.render(i)[50, 50] for i in range(3))
+    assert (before, darker, brighter) == (180, 90, 255)
+    assert sim.truth(1).exposure == 0.5
+
+
+def test_vignetting_darkens_the_corners_as_asked() -> None:
+    sensor = msgspec.structs.replace(IDEAL_SENSOR, vignetting=0.3)
+    image = simulator(plain_scenario(sensor=sensor)).render(0)
+    assert image[0, 0] / image[287, 384] == pytest.approx(0.7, abs=0.01)
+
+
+def test_a_shadow_takes_its_share_of_the_light_and_travels() -> None:
+    shadow = Shadow(start_s=0.0, end_s=4.0, depth=0.4, width=0.3, softness=0.05, angle_deg=0.0)
+    sim = simulator(plain_scenario(light=Light(shadows=(shadow,)), fps=10.0))
+    plain = simulator(plain_scenario()).render(0).astype(float)
+    darkest = []
+    for index in (12, 20, 28):
+        ratio = (sim.render(index) / plain)[100]
+        assert ratio.min() == pytest.approx(0.6, abs=0.01) and ratio.max() == pytest.approx(1.0, abs=0.01)
+        darkest.append(float(np.flatnonzero(ratio < 0.7).mean()))
+    assert darkest[1] - darkest[0] > 150.0 and darkest[2] - darkest[1] > 150.0
+    np.testing.assert_array_equal(sim.render(41), simulator(plain_scenario()).render(0))
+
+
+@pytest.mark.parametrize("sigma_px", [0.2, 0.5, 0.79, 0.8, 1.5, 3.0])
+def test_blur_has_the_variance_asked_for(sigma_px: float) -> None:
+    point = np.zeros((41, 41), np.float32)
+    point[20, 20] = 1.0
+    spread = blur(point, sigma_px).astype(float)
+    offset = np.arange(41) - 20.0
+    assert spread.sum() == pytest.approx(1.0, abs=1e-5)
+    for axis in (0, 1):
+        assert (spread.sum(axis=axis) * offset**2).sum() == pytest.approx(sigma_px**2, rel=0.02)
+
+
+def edge_variance(image: np.ndarray, row: int, left: int, right: int) -> float:
+    """Variance (px²) of the slope of one row across an edge: that of everything that blurred it."""
+    slope = np.diff(image[row, left:right].astype(float))
+    u = np.arange(len(slope))
+    share = slope / slope.sum()
+    mean = (share * u).sum()
+    return float((share * (u - mean) ** 2).sum())
+
+
+def test_defocus_and_motion_blur_widen_an_outline() -> None:
+    row, left, right = 420, 521, 555
+    sharp = edge_variance(simulator(plain_scenario()).render(0), row, left, right)
+    soft = simulator(plain_scenario(defocus=(Defocus(sigma_px=2.0),), fps=10.0)).render(10)
+    assert edge_variance(soft, row, left, right) - sharp == pytest.approx(4.0, rel=0.05)
+    # 10 mm/s along x, 20 ms exposure: 0.2 mm are 1.6 px at the fingers, an even smear of variance length²/12.
+    creep = Creep(start_s=0.0, law="linear", time_s=1.0, translation_m=(0.01, 0.0, 0.0))
+    sensor = msgspec.structs.replace(IDEAL_SENSOR, exposure_time_s=0.02)
+    moving = simulator(plain_scenario(mount=(creep,), sensor=sensor, fps=100.0))
+    still = simulator(plain_scenario(mount=(creep,), fps=100.0))
+    slower = edge_curve(still, PAPER_LENS, "R_in_far_along", 9), edge_curve(still, PAPER_LENS, "R_in_far_along", 11)
+    length = np.diff([np.interp(row, c[:, 1], c[:, 0]) for c in slower])[0]
+    widths = [edge_variance(s.light(10), row, left, right) for s in (moving, still)]
+    assert length > 1.5
+    assert widths[0] - widths[1] == pytest.approx(length**2 / 12.0, rel=0.03)
+    errors = position_errors(moving.light(10), edge_curve(still, PAPER_LENS, "R_in_far_along", 10), [np.zeros((1, 2))])
+    assert len(errors) > 100 and np.abs(errors).max() < 0.01
+
+
+@pytest.mark.parametrize("step_px", [(0.5, 0.0), (3.0, -1.0), (0.0, 7.3)])
+def test_the_background_is_smeared_along_its_motion(step_px: tuple[float, float]) -> None:
+    kernel = _smear_kernel(np.array(step_px)).astype(float)
+    assert kernel.shape[0] % 2 == 1 and kernel.sum() == pytest.approx(1.0)
+    offset = np.arange(len(kernel)) - len(kernel) // 2
+    for axis, step in enumerate(step_px):
+        shares = kernel.sum(axis=axis)
+        assert (shares * offset).sum() == pytest.approx(0.0, abs=1e-6)
+        # Sharing points among pixels adds up to 1/4 px².
+        assert step**2 / 12.0 - 0.01 <= (shares * offset**2).sum() <= step**2 / 12.0 * 1.2 + 0.25
+
+
+def test_jpeg_is_that_of_the_uncompressed_frame() -> None:
+    scenario = make_scenario("clutter")
+    raw = simulator(scenario).render(3)
+    packed = simulator(msgspec.structs.replace(scenario, sensor=Sensor(jpeg_quality=60))).render(3)
+    expected = cv2.imdecode(cv2.imencode(".jpg", raw, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(packed, expected)
+    assert 1.0 < np.abs(packed.astype(float) - raw).mean() < 8.0
+
+
+# --- what hides what
+
+
+def test_what_is_hidden_leaves_no_trace_in_the_picture_and_what_is_visible_does() -> None:
+    sections = {
+        "jaw": JawScript(knots=((0.0, 0.034), (1.0, 0.026))),
+        "grasped": GraspedObject(arrive_s=(0.0, 1.0)),
+        "covers": (Cover(start_s=2.6, end_s=4.0, move_s=0.5),),
+        "fps": 10.0,
+    }
+    looks = (PLAIN_FINGERS, msgspec.structs.replace(PLAIN_FINGERS, level_dn=200.0))
+    dark, bright = (simulator(plain_scenario(fingers=look, **sections)) for look in looks)
+    found = set()
+    for index in (0, 15, 26, 27, 28, 35):
+        changed = np.abs(dark.light(index) - bright.light(index))
+        truth, state = dark.truth(index), dark._scene.at(dark.time_s(index))
+        for k, hidden in enumerate(truth.hidden):
+            if hidden is Hidden.SELF:
+                continue
+            # A point of the finger's inner face near the corner: a corner that touches the object is half hidden.
+            point = state.points_grip_m[dark.gripper.corner_points[k]]
+            inner = point * (1.0, 0.8, 1.0) + (0.0, 0.0, -0.002) if "_in_" in truth.corner_ids[k] else point
+            uv = dark.camera.project((truth.cam_T_grip[:3, :3] @ inner + truth.cam_T_grip[:3, 3])[None])[0]
+            u, v = np.round(uv).astype(int)
+            change = changed[v - 1 : v + 2, u - 1 : u + 2].max()
+            assert change > 5.0 if hidden is None else change < 0.02
+            found.add(hidden)
+    assert found == {None, Hidden.OBJECT, Hidden.COVER}
+
+
+def random_box(rng: np.random.Generator, name: str):
+    half = rng.uniform(0.004, 0.02, 3)
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(rng.normal(0.0, 1.0, 3))[0]
+    pose[:3, 3] = rng.uniform((-0.03, -0.03, 0.1), (0.03, 0.03, 0.2))
+    return place(box(name, -half, half), pose), half, pose
+
+
+def inside_box(points: np.ndarray, half: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    return (np.abs(local) < half).all(axis=-1)
+
+
+def test_hiding_agrees_with_steps_along_the_rays() -> None:
+    rng = np.random.default_rng(3)
+    outcomes = []
+    for k in range(60):
+        body, half, pose = random_box(rng, f"box {k}")
+        points = rng.uniform((-0.05, -0.05, 0.1), (0.05, 0.05, 0.25), (40, 3))
+        steps = np.linspace(0.0, 1.0, 4001)[:-1, None, None] * points
+        stepped = inside_box(steps, half, pose).sum(axis=0)
+        clear = (stepped == 0) | (stepped > 3)  # a ray that grazes an edge is decided by the step's length
+        np.testing.assert_array_equal(hidden_by(body, points)[clear], (stepped > 0)[clear])
+        outcomes += (stepped > 0).tolist()
+    assert 0.05 < np.mean(outcomes) < 0.95
+
+
+def test_boxes_are_painted_from_back_to_front() -> None:
+    rng = np.random.default_rng(8)
+    pairs = 0
+    for _ in range(300):
+        bodies = [random_box(rng, name) for name in ("a", "b")]
+        cloud = rng.uniform(-1.2, 1.2, (3000, 3)) * bodies[0][1] @ bodies[0][2][:3, :3].T + bodies[0][2][:3, 3]
+        if inside_box(cloud, 1.2 * bodies[1][1], bodies[1][2]).any():
+            continue  # boxes that cross each other have no order
+        order = [b.solid.name for b in paint_order([b[0] for b in bodies])]
+        rays = np.stack(
+            [*np.meshgrid(np.linspace(-0.3, 0.3, 30), np.linspace(-0.3, 0.3, 30)), np.ones((30, 30))], axis=-1
+        )
+        depths = np.linspace(0.06, 0.26, 250)
+        hits = [inside_box(rays.reshape(-1, 1, 3) * depths[:, None], half, pose) for _, half, pose in bodies]
+        both = hits[0].any(axis=1) & hits[1].any(axis=1)
+        if both.any():
+            pairs += 1
+            nearest = [depths[h[both].argmax(axis=1)] for h in hits]
+            in_front = "a" if (nearest[0] < nearest[1]).mean() > 0.5 else "b"
+            assert order[-1] == in_front
+    assert pairs > 20
