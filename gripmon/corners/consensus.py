@@ -181,6 +181,27 @@ def _step(
     return step, information, weight
 
 
+def noise_inflation(candidates: Candidates, prediction: Prediction, weights: Array, consensus: Consensus) -> float:
+    """Factor >= 1 by which the fit's covariance must grow so that it matches the residuals.
+
+    Two things make edge points worth less than their image noise says: residuals larger than that (texture on and behind the edge), and
+    neighbours on an edge that err together.  The first is the normalised residual variance; the second is measured as the
+    correlation r of neighbours and counts (1 + r) / (1 - r), as in a first-order autoregressive sequence.
+    """
+    inlier = np.flatnonzero(consensus.weight)
+    if len(inlier) < 12:
+        return 1.0
+    residual = consensus.residual_px[inlier] * np.sqrt(weights[inlier])
+    tukey = consensus.weight[inlier] / weights[inlier]
+    variance = float(tukey @ (residual * residual) / tukey.sum())
+    edge = prediction.layout.edge[candidates.sample[inlier]]
+    same = edge[1:] == edge[:-1]
+    products = residual[1:] * residual[:-1] * same
+    together = float(products.sum()) / (float((residual * residual).mean()) * max(int(same.sum()), 1))
+    together = min(max(together, 0.0), 0.95)
+    return max(1.0, variance) * (1.0 + together) / (1.0 - together)
+
+
 def prior_information(jaw_sigma_m: float | None) -> Array:
     """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
 

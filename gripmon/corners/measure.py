@@ -22,6 +22,7 @@ from gripmon.corners.consensus import (
     agree_from_grid,
     base_weights,
     grid_of_starts,
+    noise_inflation,
     prior_information,
 )
 from gripmon.corners.lines import Corners, CornerSettings, CornerTopology, intersect_edges
@@ -43,6 +44,10 @@ from gripmon.records import Array, Image
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""
+
+
+JAW_UNREPORTED_SIGMA_M = 0.02
+"""What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
 class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -70,6 +75,9 @@ class Effort(enum.IntEnum):
 class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
+    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening), already multiplied by ``inflation``, the factor by which the residuals exceed
+    the image noise; ``jaw_surprise``: the seen jaw opening against the reported one, in standard deviations of the latter.
+
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     """
 
@@ -79,8 +87,30 @@ class Measurement:
     corners: Corners
     cam_T_grip: Array
     jaw_opening_m: float
+    covariance: Array
+    inflation: float
+    jaw_surprise: float
     effort: Effort
     trusted: bool = False
+
+    @property
+    def corners_cam_m(self) -> Array:
+        """Corners (c, 3) in the camera frame at the prediction's pose, but with the jaw opening that was measured."""
+        prediction = self.prediction
+        opened_m = self.jaw_opening_m - prediction.jaw_opening_m
+        return prediction.corners_cam_m + opened_m * prediction.corners_jaw_rate
+
+    def corner_rms_px(self, cam_T_grip: Array) -> float | None:
+        """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without corners."""
+        usable = self.corners.usable
+        if not usable.any():
+            return None
+        prediction = self.prediction
+        turn = cam_T_grip[:3, :3] @ prediction.cam_T_grip[:3, :3].T
+        points = (self.corners_cam_m[usable] - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
+        miss_xy = self.corners.xy[usable] - points[:, :2] / points[:, 2:]
+        miss_px = np.einsum("cij,cj->ci", prediction.corners_d_uv_d_xy[usable], miss_xy)
+        return float(np.sqrt((miss_px * miss_px).sum() / len(miss_px)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,18 +129,27 @@ class FingertipMeter:
         self._camera, self._gripper, self._settings = camera, gripper, settings
         self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
         self._topology = CornerTopology.of(gripper)
-        self._prior = prior_information(jaw_sigma_m if gripper.has_jaw else None)
+        self._prior_reported = prior_information(jaw_sigma_m if gripper.has_jaw else None)
+        self._prior_unreported = prior_information(JAW_UNREPORTED_SIGMA_M if gripper.has_jaw else None)
+        self._prior = self._prior_reported
         self._laid_out: tuple[EdgeLayout, Array] | None = None
         self._prediction: Prediction | None = None
 
     def measure(
-        self, image: Image, cam_T_grip: Array, jaw_opening_m: float, satisfied_share: float, effort: Effort
+        self,
+        image: Image,
+        cam_T_grip: Array,
+        jaw_opening_m: float,
+        satisfied_share: float,
+        effort: Effort,
+        jaw_reported: bool = True,
     ) -> Measurement:
-        """Measure about an expected pose.
+        """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to start from).
 
         Where less than ``satisfied_share`` of the profiles agree the gripper is looked for elsewhere as far as ``effort`` allows, and
         the place with the largest share is returned.
         """
+        self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
         if effort >= Effort.GRID and best.consensus.share < satisfied_share:
@@ -138,8 +177,18 @@ class FingertipMeter:
             if moved_px <= self._settings.relinearise_px:
                 break
         corners = intersect_edges(candidates, prediction, consensus, self._topology, self._settings.corners)
+        inflation = noise_inflation(candidates, prediction, weights, consensus)
         return Measurement(
-            prediction, candidates, consensus, corners, expected.cam_T_grip, expected.jaw_opening_m, Effort.NARROW
+            prediction,
+            candidates,
+            consensus,
+            corners,
+            expected.cam_T_grip,
+            expected.jaw_opening_m,
+            inflation * np.linalg.inv(consensus.information + np.diag(self._prior)),
+            inflation,
+            self._jaw_surprise(prediction, consensus.xi, prior_mean),
+            Effort.NARROW,
         )
 
     def _from_grid(self, image: Image, expected: _Expected) -> Measurement:
@@ -199,6 +248,10 @@ class FingertipMeter:
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges)
         gripper, floor_px = self._gripper, settings.consensus.point_floor_px
         return candidates, base_weights(candidates, prediction, gripper.edge_polarity, gripper.edge_bevel_m, floor_px)
+
+    def _jaw_surprise(self, prediction: Prediction, xi: Array, prior_mean: Array) -> float:
+        """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a jaw."""
+        return float((xi[6] - prior_mean[6]) * np.sqrt(self._prior[6])) if len(self._prior) == 7 else 0.0
 
     def _from_prediction(self, prediction: Prediction, expected: _Expected) -> Array:
         """(m,) from the prediction's pose and opening to the expected ones."""

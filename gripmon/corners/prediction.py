@@ -64,7 +64,7 @@ class Prediction:
     unknown too, by the opening (px/m).
     ``along`` (n,) and ``gain`` (n,): ideal coordinate along the edge's line, and ideal distance from the line for each px of offset along the
     normal.  ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies in the image.
-    ``corner_at_start`` (c, e): the corner is the first end of the edge.
+    ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.  ``corner_at_start`` (c, e): the corner is the first end of the edge.
     """
 
     cam_T_grip: Array
@@ -78,6 +78,7 @@ class Prediction:
     line_origin: Array
     line_direction: Array
     corners_cam_m: Array
+    corners_jaw_rate: Array
     corners_xy: Array
     corners_uv_px: Array
     corners_d_uv_d_xy: Array
@@ -176,9 +177,10 @@ def predict(
     jacobian = np.empty((len(edge), 7 if jaw_unknown else 6))
     jacobian[:, :3] = gradient
     jacobian[:, 3:6] = np.cross(lever, gradient)
+    rate = np.zeros_like(levers)
     if jaw_unknown:
-        motion = gripper.point_motion(jaw_opening_m)[gripper.edge_points[edge, 0]] @ rotation.T
-        jacobian[:, 6] = np.einsum("ni,ni->n", gradient, motion)
+        rate = gripper.point_motion(jaw_opening_m) @ rotation.T
+        jacobian[:, 6] = np.einsum("ni,ni->n", gradient, rate[gripper.edge_points[edge, 0]])
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
     along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
     corners_cam_m = levers[gripper.corner_points] + translation
@@ -199,6 +201,7 @@ def predict(
         line_origin=origin,
         line_direction=direction,
         corners_cam_m=corners_cam_m,
+        corners_jaw_rate=rate[gripper.corner_points],
         corners_xy=corners_cam_m[:, :2] / corners_cam_m[:, 2:],
         corners_uv_px=corners_uv,
         corners_d_uv_d_xy=corners_d_uv[:, :, :2] * corners_cam_m[:, 2][:, None, None],

@@ -1,0 +1,55 @@
+"""What a measurement shows besides its result: pixels for people who look, and which finger left the reference."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gripmon.camera import Camera
+from gripmon.corners.consensus import GATE_PX
+from gripmon.corners.measure import Measurement
+from gripmon.geometry import perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.records import Array, MeasurementTrace
+
+
+def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> MeasurementTrace:
+    """Measured edge points and the model drawn at the measured pose, in pixels of the distorted image."""
+    prediction, candidates, consensus = measurement.prediction, measurement.candidates, measurement.consensus
+    sample = candidates.sample
+    points_grip_m = gripper.points_grip_m(measurement.jaw_opening_m if gripper.has_jaw else None)
+    points_cam_m = points_grip_m @ measurement.cam_T_grip[:3, :3].T + measurement.cam_T_grip[:3, 3]
+    along = np.linspace(0.0, 1.0, 33)[:, None]
+    lines = []
+    for edge in np.flatnonzero(prediction.layout.visible):
+        start, end = points_cam_m[gripper.edge_points[edge]]
+        line = camera.project(start + along * (end - start))
+        lines.append(line[np.isfinite(line).all(axis=1)])
+    corners_uv_px = camera.project(points_cam_m[gripper.corner_points])
+    corners_uv_px[~prediction.corner_visible] = np.nan
+    return MeasurementTrace(
+        edge_uv_px=prediction.uv_px[sample] + candidates.offset_px[:, None] * prediction.normal[sample],
+        edge_used=consensus.weight > 0.0,
+        edge_index=prediction.layout.edge[sample],
+        predicted_edges_uv_px=tuple(lines),
+        predicted_corners_uv_px=corners_uv_px,
+    )
+
+
+def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array) -> Array:
+    """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that isn't sampled.
+
+    Edge points closer to that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach gets zeros.
+    """
+    prediction, candidates = measurement.prediction, measurement.candidates
+    xi = perturbation_between(prediction.cam_T_grip, cam_T_grip)
+    offset_px = prediction.jacobian[:, :6] @ xi
+    if prediction.jacobian.shape[1] == 7:
+        offset_px = offset_px + prediction.jacobian[:, 6] * (measurement.jaw_opening_m - prediction.jaw_opening_m)
+    gate_px = min(3.0 * measurement.consensus.scale_px, GATE_PX)
+    close = np.abs(candidates.offset_px - offset_px[candidates.sample]) < gate_px
+    agrees = np.zeros(len(prediction.uv_px), dtype=bool)
+    agrees[candidates.sample[close]] = True
+    finger = gripper.edge_finger[prediction.layout.edge[prediction.ok]]
+    count = np.bincount(finger, minlength=len(gripper.finger_ids))
+    with np.errstate(invalid="ignore"):
+        return np.bincount(finger, agrees[prediction.ok], len(gripper.finger_ids)) / np.where(count, count, np.nan)

@@ -1,0 +1,52 @@
+"""Is this frame an image that the monitor can measure?  Looks at some 1,500 pixels, whatever the image's size."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gripmon.camera import Camera
+from gripmon.gripper import Gripper
+from gripmon.records import Frame, Refusal
+
+_DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
+"""Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
+
+
+def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, str] | None:
+    """None if the frame may be measured; else the reason, and in words what came and what would be right."""
+    image = frame.image
+    if image is None or not isinstance(image, np.ndarray):
+        return Refusal.NOT_AN_IMAGE, frame.fault or "there is no image"
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        return Refusal.WRONG_TYPE, f"shape {image.shape}; H x W, or H x W x 3 in the order BGR"
+    if image.shape[:2] != (camera.height_px, camera.width_px):
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        return Refusal.WRONG_SIZE, f"{size} pixels; {camera.width_px}x{camera.height_px} as the camera's calibration says"
+    if image.dtype not in (np.uint8, np.uint16, np.float32):
+        return Refusal.WRONG_TYPE, f"pixels of type {image.dtype}; uint8, uint16 or float32 in 0 to 1"
+    return _grey_levels(image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]) or _jaw(frame, gripper)
+
+
+def _grey_levels(sparse: np.ndarray) -> tuple[Refusal, str] | None:
+    low, high = float(sparse.min()), float(sparse.max())
+    scale = 1.0 if sparse.dtype == np.float32 else float(np.iinfo(sparse.dtype).max)
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return Refusal.NOT_FINITE, "pixels that are NaN or infinite; float images in 0 to 1"
+    if low < 0.0 or high > scale:
+        return Refusal.WRONG_TYPE, f"float pixels from {low:g} to {high:g}; float images in 0 to 1"
+    if high <= _DARK * scale:
+        return Refusal.BLACK, f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
+    if low >= _BRIGHT * scale:
+        return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
+    if high - low <= _FLAT * scale:
+        return Refusal.FLAT, f"all pixels within {100.0 * (high - low) / scale:.1f} % of the full scale"
+    return None
+
+
+def _jaw(frame: Frame, gripper: Gripper) -> tuple[Refusal, str] | None:
+    opening_m = frame.jaw_opening_m
+    if opening_m is None or not gripper.has_jaw:
+        return None
+    if not gripper.jaw_min_m - 1e-3 <= opening_m <= gripper.jaw_max_m + 1e-3:
+        return Refusal.JAW_OPENING, f"jaw opening {opening_m:g} m; {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+    return None

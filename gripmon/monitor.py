@@ -1,0 +1,325 @@
+"""The per-frame method: predict, measure, update, judge, and past the limit recalibrate.
+
+A pure function of the frames so far: no clock, no I/O, no threads.  Time is the frames' own.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.camera import Camera
+from gripmon.corners import Effort, FingertipMeter, Measurement, MeasurementSettings, finger_shares, trace_of
+from gripmon.differential import DegenerateGeometry, differential_update
+from gripmon.geometry import (
+    from_record,
+    invert,
+    perturb,
+    perturbation_between,
+    rotation_angle,
+    to_record,
+)
+from gripmon.gripper import Gripper
+from gripmon.inspection import inspect
+from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
+from gripmon.recalibrate import RecalibrationRefused, recalibrate
+from gripmon.records import (
+    Alert,
+    Array,
+    Cause,
+    CornerFault,
+    CornerRecord,
+    Drift,
+    Frame,
+    FrameRecord,
+    MeasurementTrace,
+    Origin,
+    ReferenceRecord,
+    Smoothed,
+    Verdict,
+)
+from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
+
+USUAL_SHARE = 0.9
+"""Share of agreeing profiles that is expected before anything is known about this gripper."""
+
+USUAL_RATE = 0.1
+"""How fast the usual share follows the measured one, per frame."""
+
+SATISFIED = 0.8
+"""Part of the usual share below which the gripper is looked for elsewhere, too."""
+
+JAW_SURPRISE = 5.0
+"""Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
+
+
+class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The whole method, a section for each step."""
+
+    measurement: Annotated[
+        Literal["edges", "corners"],
+        Meta(description="what the update rests on: all agreed edge points, or the corners of equation (17)"),
+    ] = "edges"
+    jaw_sigma_m: Annotated[
+        float, Meta(ge=0.0, le=0.05, description="standard deviation of the reported jaw opening (m)")
+    ] = 5e-5
+    floor_m: Annotated[
+        float, Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)")
+    ] = 2e-6
+    floor_rad: Annotated[
+        float, Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)")
+    ] = 5e-5
+    corners: MeasurementSettings = MeasurementSettings()
+    smoothing: SmoothingSettings = SmoothingSettings()
+    policy: PolicySettings = PolicySettings()
+
+
+class Monitor:
+    """Watches one camera on one gripper, starting from a reference calibration."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+        self._camera, self._gripper, self._settings = camera, gripper, settings
+        self._meter = FingertipMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
+        self._policy = Policy(settings.policy)
+        self._average = PoseAverage(settings.smoothing)
+        self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        self._reference = reference
+        self._ref_cam_T_grip = from_record(reference.cam_T_grip)
+        self._cam_T_grip = self._ref_cam_T_grip
+        self._covariance: Array | None = None
+        self._jaw_opening_m = gripper.jaw_nominal_m
+        self._measured_s = 0.0
+        self._stamp_s: float | None = None
+        self._usual_share = USUAL_SHARE
+        self._dissatisfied = 0
+        self._newest: Measurement | None = None
+
+    @property
+    def reference(self) -> ReferenceRecord:
+        """The calibration that drift is measured against now."""
+        return self._reference
+
+    def process(self, frame: Frame) -> FrameRecord:
+        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
+        self._tick(frame)
+        refusal = inspect(frame, self._camera, self._gripper)
+        if refusal is not None:
+            self._newest = None
+            return self._unmeasured(frame, f"{refusal[0]}: {refusal[1]}", CornerFault.FRAME_REFUSED, refusal[0])
+        measurement = self._newest = self._measure(frame)
+        if not measurement.trusted:
+            return self._unmeasured(frame, "too few edges of the gripper agree", CornerFault.NO_FIT, None)
+        before_T = self._cam_T_grip
+        self._cam_T_grip, self._covariance = self._update(measurement)
+        self._jaw_opening_m, self._measured_s = measurement.jaw_opening_m, self._now_s
+        self._average.add(self._cam_T_grip, self._covariance)
+        judgement = self._policy.measured(self._evidence(measurement, before_T))
+        origin, alerts = Origin.UPDATE, judgement.alerts
+        if judgement.recalibrate:
+            recalibrated = self._recalibrate(measurement, frame.stamp_ns)
+            if recalibrated is not None:
+                origin, alerts = Origin.RECALIBRATION, (*alerts, recalibrated)
+        return self._record(frame, judgement, origin, alerts, measurement)
+
+    def trace(self) -> MeasurementTrace | None:
+        """The pixels behind the newest record; None if its frame was refused."""
+        if self._newest is None:
+            return None
+        return trace_of(self._newest, self._camera, self._gripper)
+
+    def _tick(self, frame: Frame) -> None:
+        """Time passes to the frame's stamp; a stamp before the last one counts as no time."""
+        now_s = 1e-9 * frame.stamp_ns
+        if self._stamp_s is not None and now_s > self._stamp_s:
+            self._average.wander(now_s - self._stamp_s)
+        self._stamp_s = now_s if self._stamp_s is None else max(now_s, self._stamp_s)
+
+    @property
+    def _now_s(self) -> float:
+        assert self._stamp_s is not None
+        return self._stamp_s
+
+    def _measure(self, frame: Frame) -> Measurement:
+        """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually."""
+        search = self._settings.corners.search
+        eager = self._dissatisfied < search.eager_frames or self._dissatisfied % search.patient_every == 0
+        reported_m = frame.jaw_opening_m
+        assert frame.image is not None
+        measurement = self._meter.measure(
+            frame.image,
+            self._cam_T_grip,
+            self._jaw_opening_m if reported_m is None else reported_m,
+            SATISFIED * self._usual_share,
+            Effort.SEARCH if eager else Effort.GRID,
+            jaw_reported=reported_m is not None,
+        )
+        share = measurement.consensus.share
+        self._dissatisfied = self._dissatisfied + 1 if share < SATISFIED * self._usual_share else 0
+        if measurement.trusted:
+            self._usual_share += USUAL_RATE * (share - self._usual_share)
+        return measurement
+
+    def _update(self, measurement: Measurement) -> tuple[Array, Array]:
+        """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation (17)."""
+        cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
+        usable = measurement.corners.usable
+        if self._settings.measurement == "corners" and np.count_nonzero(usable) >= 3:
+            prediction = measurement.prediction
+            try:
+                update = differential_update(
+                    measurement.corners_cam_m[usable],
+                    measurement.corners.xy[usable],
+                    measurement.inflation * measurement.corners.covariance_xy[usable],
+                    prediction.cam_T_grip[:3, 3],
+                )
+                cam_T_grip, covariance = perturb(prediction.cam_T_grip, update.xi), update.covariance
+            except DegenerateGeometry:
+                pass  # The corners that are left lie on a line: the edges still determine the motion.
+        return cam_T_grip, covariance + self._floor
+
+    def _evidence(self, measurement: Measurement, before_T: Array) -> Evidence:
+        assert self._covariance is not None
+        shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
+        drift = self._drift()
+        # Motion that the profiles can follow from frame to frame is no jump.
+        moved_px = measurement.prediction.moved_px(perturbation_between(before_T, self._cam_T_grip))
+        jumped = moved_px > self._settings.corners.sampling.reach_px
+        cause = self._cause(measurement) if jumped or self._policy.test.suspicious else Cause.UNKNOWN
+        sigma = np.sqrt(np.diag(self._covariance))
+        return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause)
+
+    def _drift(self) -> Drift:
+        """Equation (14) for the motion from the reference to now, and the TCP's way in the camera frame."""
+        motion = self._cam_T_grip @ invert(self._ref_cam_T_grip)
+        x, y, z = (self._cam_T_grip[:3, 3] - self._ref_cam_T_grip[:3, 3]).tolist()
+        return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
+
+    def _cause(self, measurement: Measurement) -> Cause:
+        """A finger that left the reference alone is bent; when all have left it, the camera has moved."""
+        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+            return Cause.JAW_OPENING
+        shares = finger_shares(measurement, self._gripper, self._ref_cam_T_grip)
+        known = shares[np.isfinite(shares)]
+        if len(known) >= 2 and known.max() > 0.6 and known.min() < 0.3:
+            return Cause.FINGER_BENT
+        return Cause.CAMERA_MOUNT if len(known) and known.max() < 0.6 else Cause.UNKNOWN
+
+    def _recalibrate(self, measurement: Measurement, stamp_ns: int) -> Alert | None:
+        """PnP from the corners alone; if it agrees, the average since the camera came to rest becomes the reference.
+
+        None if too few corners are seen, or if the corners contradict the edges: then the next frame may try again.
+        """
+        usable = measurement.corners.usable
+        points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
+        covariance_xy = measurement.inflation * measurement.corners.covariance_xy
+        try:
+            pnp = recalibrate(
+                points_grip_m[usable], measurement.corners.xy[usable], covariance_xy[usable], self._cam_T_grip
+            )
+        except RecalibrationRefused:
+            return None
+        new_T, new_covariance = self._average.cam_T_grip, self._average.covariance
+        if new_T is None:
+            return None
+        difference = perturbation_between(new_T, pnp.cam_T_grip)
+        if difference @ np.linalg.solve(pnp.covariance + new_covariance + self._floor, difference) > GATE:
+            return None
+        before = self._drift()
+        self._set_reference(new_T, new_covariance + self._floor, stamp_ns, "recalibration")
+        return self._policy.recalibrated(
+            f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} degrees; "
+            f"it was calibrated anew from {np.count_nonzero(usable)} corners: revision {self._reference.revision}"
+        )
+
+    def _set_reference(self, cam_T_grip: Array, covariance: Array, stamp_ns: int, origin: str) -> None:
+        digest = hashlib.sha256(cam_T_grip.tobytes()).hexdigest()[:8]
+        revision = self._reference.revision + 1
+        self._ref_cam_T_grip = cam_T_grip
+        self._reference = ReferenceRecord(
+            f"{origin}-{revision}-{digest}", revision, stamp_ns, origin, to_record(cam_T_grip), _flat(covariance)
+        )
+
+    def _unmeasured(self, frame: Frame, reason: str, fault: CornerFault, refusal: str | None) -> FrameRecord:
+        """The last transform held with a covariance that grows, or none when it is too old."""
+        judgement = self._policy.unmeasured(self._now_s, refusal, self._covariance is not None)
+        corners = tuple(CornerRecord(name, None, None, False, fault) for name in self._gripper.corner_ids)
+        if judgement.verdict is Verdict.UNKNOWN or self._covariance is None:
+            return self._blank(frame, judgement, corners, reason)
+        held = self._covariance + np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
+        return msgspec.structs.replace(
+            self._blank(frame, judgement, corners, reason),
+            cam_T_grip=to_record(self._cam_T_grip),
+            covariance=_flat(held),
+            smoothed=self._smoothed(),
+            drift=self._drift(),
+        )
+
+    def _blank(
+        self, frame: Frame, judgement: Judgement, corners: tuple[CornerRecord, ...], reason: str | None
+    ) -> FrameRecord:
+        return FrameRecord(
+            seq=frame.seq,
+            stamp_ns=frame.stamp_ns,
+            verdict=judgement.verdict,
+            state=judgement.state,
+            source=Origin.HELD,
+            cam_T_grip=None,
+            covariance=None,
+            smoothed=None,
+            drift=None,
+            reference_id=self._reference.reference_id,
+            revision=self._reference.revision,
+            rms_px=None,
+            jaw_opening_m=frame.jaw_opening_m,
+            corners=corners,
+            alerts=judgement.alerts,
+            reason=reason,
+            name=frame.name,
+        )
+
+    def _record(
+        self, frame: Frame, judgement: Judgement, origin: Origin, alerts: tuple[Alert, ...], measurement: Measurement
+    ) -> FrameRecord:
+        assert self._covariance is not None
+        return FrameRecord(
+            seq=frame.seq,
+            stamp_ns=frame.stamp_ns,
+            verdict=judgement.verdict,
+            state=judgement.state,
+            source=origin,
+            cam_T_grip=to_record(self._cam_T_grip),
+            covariance=_flat(self._covariance),
+            smoothed=self._smoothed(),
+            drift=self._drift(),
+            reference_id=self._reference.reference_id,
+            revision=self._reference.revision,
+            rms_px=measurement.corner_rms_px(self._cam_T_grip),
+            jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
+            corners=_corner_records(measurement, self._gripper.corner_ids),
+            alerts=alerts,
+            name=frame.name,
+        )
+
+    def _smoothed(self) -> Smoothed | None:
+        if self._average.cam_T_grip is None:
+            return None
+        transform = to_record(self._average.cam_T_grip)
+        return Smoothed(transform.translation_m, transform.rotation_xyzw, _flat(self._average.covariance + self._floor))
+
+
+def _flat(covariance: Array) -> tuple[float, ...]:
+    return tuple(covariance.ravel().tolist())
+
+
+def _corner_records(measurement: Measurement, names: tuple[str, ...]) -> tuple[CornerRecord, ...]:
+    corners = measurement.corners
+    return tuple(
+        CornerRecord(name, (u, v), sigma, True) if fault is None else CornerRecord(name, None, None, False, fault)
+        for name, (u, v), sigma, fault in zip(
+            names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, strict=True
+        )
+    )

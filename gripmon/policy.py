@@ -1,0 +1,214 @@
+"""Judging what was measured: states, verdicts, alerts, and when to recalibrate.
+
+Drift is decided by a sequential test, not by a bare threshold.  For every axis and sign the log-likelihood ratio of "shifted by the smallest
+drift worth noticing" against "not shifted" is summed up and cut at zero (CUSUM, Page 1954).  Without drift such a sum of independent frames
+reaches ``h`` after exp(h) frames on average or later (Lorden 1971), so that ``h`` follows from the false alarms a day that are tolerated.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.records import Alert, AlertKind, Array, Cause, Severity, State, Verdict
+
+
+class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is noticed, and what is done then."""
+
+    smallest_drift_m: Annotated[
+        float, Meta(gt=0.0, le=0.1, description="smallest shift of the TCP, along any camera axis, that is worth an alert (m)")
+    ] = 1e-4
+    smallest_drift_rad: Annotated[
+        float, Meta(gt=0.0, le=1.0, description="smallest rotation about any camera axis that is worth an alert (rad)")
+    ] = 3e-3
+    false_alarms_per_day: Annotated[
+        float, Meta(gt=0.0, le=1000.0, description="drift alarms a day that an unmoved camera may give (1/day)")
+    ] = 0.01
+    frames_per_s: Annotated[float, Meta(gt=0.0, le=2000.0, description="frame rate that this is reckoned for (1/s)")] = 60.0
+    limit_m: Annotated[
+        float, Meta(gt=0.0, le=1.0, description="motion d of equation (14) past which the reference is measured anew (m)")
+    ] = 2.5e-3
+    limit_rad: Annotated[
+        float, Meta(gt=0.0, le=3.0, description="rotation delta of equation (14) past which the reference is measured anew (rad)")
+    ] = 0.02
+    recalibrate: Annotated[bool, Meta(description="true: past the limit take the new pose as reference; false: only alert")] = True
+    settle_frames: Annotated[
+        int, Meta(ge=1, le=10000, description="frames that must agree after a jump before a recalibration")
+    ] = 15
+    confirm_frames: Annotated[
+        int, Meta(ge=1, le=1000, description="frames that must agree after a jump before the transform counts as valid")
+    ] = 2
+    hold_s: Annotated[
+        float, Meta(ge=0.0, le=3600.0, description="how long the last transform is held when nothing can be measured (s)")
+    ] = 1.0
+    hold_m_per_sqrt_s: Annotated[
+        float, Meta(gt=0.0, le=1.0, description="growth of a held transform's position sigma (m per square root of a second)")
+    ] = 2e-4
+    hold_rad_per_sqrt_s: Annotated[
+        float, Meta(gt=0.0, le=3.0, description="growth of a held transform's rotation sigma (rad per square root of a second)")
+    ] = 2e-3
+    image_alert_after_s: Annotated[
+        float, Meta(ge=0.0, le=3600.0, description="refused frames for so long give an alert (s)")
+    ] = 1.0
+    suspect_sigma_m: Annotated[
+        float, Meta(gt=0.0, le=1.0, description="a transform whose TCP is less certain than this is suspect (m)")
+    ] = 3e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the motion ``d_m`` and
+    ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, and what would explain a drift.
+    """
+
+    shift: Array
+    sigma: Array
+    d_m: float
+    delta_rad: float
+    jumped: bool
+    cause: Cause
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    state: State
+    verdict: Verdict
+    alerts: tuple[Alert, ...]
+    recalibrate: bool = False
+
+
+class DriftTest:
+    """Twelve one-sided CUSUMs: three shifts and three rotations, both signs."""
+
+    def __init__(self, settings: PolicySettings):
+        self._smallest = np.array([settings.smallest_drift_m] * 3 + [settings.smallest_drift_rad] * 3)
+        frames_a_day = 86400.0 * settings.frames_per_s
+        self.threshold = math.log(2 * len(self._smallest) * frames_a_day / settings.false_alarms_per_day)
+        self._sums = np.zeros((2, 6))
+
+    def add(self, shift: Array, sigma: Array) -> bool:
+        """One frame's shift against the reference (6,) and its standard deviations; True while a drift is established."""
+        gain = self._smallest / sigma**2
+        evidence = np.stack([gain * (shift - 0.5 * self._smallest), gain * (-shift - 0.5 * self._smallest)])
+        # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
+        limit = 0.2 * self.threshold
+        self._sums = np.clip(self._sums + np.clip(evidence, -limit, limit), 0.0, self.threshold)
+        return bool((self._sums >= self.threshold).any())
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether anything speaks for a drift just now."""
+        return bool(self._sums.any())
+
+    def reset(self) -> None:
+        self._sums[:] = 0.0
+
+
+class Policy:
+    """The states ``acquiring -> tracking <-> drifting -> recalibrating -> tracking``, ``occluded`` and ``lost``.
+
+    A function of the frames so far: time is the frames' own.
+    """
+
+    def __init__(self, settings: PolicySettings):
+        self._settings = settings
+        self.test = DriftTest(settings)
+        self.state = State.ACQUIRING
+        self._settled = 0
+        self._drift_alerted = False
+        self._bad_since_s: float | None = None
+        self._bad_alerted = False
+
+    def measured(self, evidence: Evidence) -> Judgement:
+        """A frame from which a transform could be measured."""
+        settings = self._settings
+        alerts = self._recovered()
+        self._settled = 0 if evidence.jumped else self._settled + 1
+        if evidence.jumped and self.state not in (State.ACQUIRING, State.LOST):
+            alerts.append(_jump_alert(evidence))
+        confirmed = self._settled >= settings.confirm_frames
+        drifting = self.test.add(evidence.shift, evidence.sigma)
+        past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
+        recalibrate = False
+        if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
+            state = State.ACQUIRING if self.state is State.LOST else self.state
+        elif past_limit and settings.recalibrate:
+            state = State.RECALIBRATING
+            recalibrate = self._settled >= settings.settle_frames
+        elif drifting:
+            state = State.DRIFTING
+        else:
+            state = State.TRACKING
+        if drifting and not self._drift_alerted:
+            alerts.append(_drift_alert(evidence, past_limit))
+        elif self._drift_alerted and not drifting:
+            alerts.append(Alert(AlertKind.RECOVERED, evidence.cause, Severity.INFO, "the drift against the reference is gone"))
+        self._drift_alerted = drifting
+        self.state = state
+        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
+        return Judgement(state, Verdict.VALID if confirmed and sure else Verdict.SUSPECT, tuple(alerts), recalibrate)
+
+    def recalibrated(self, text: str) -> Alert:
+        """The reference was replaced: drift is reckoned from zero."""
+        self.test.reset()
+        self._drift_alerted = False
+        return Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.WARNING, text)
+
+    def unmeasured(self, stamp_s: float, refusal: str | None, has_transform: bool) -> Judgement:
+        """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper isn't seen in it."""
+        settings = self._settings
+        self._settled = 0
+        if self._bad_since_s is None:
+            self._bad_since_s = stamp_s
+        lasted_s = stamp_s - self._bad_since_s
+        held = has_transform and lasted_s <= settings.hold_s
+        alerts = []
+        before = self.state
+        if self.state is not State.ACQUIRING:
+            # A bad image says nothing about the gripper: only time makes it lost.
+            self.state = State.LOST if not held else (before if refusal and before is not State.LOST else State.OCCLUDED)
+        if self.state is State.LOST and before is not State.LOST:
+            what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
+            cause = Cause.IMAGE_BAD if refusal else Cause.VIEW_BLOCKED
+            alerts.append(Alert(AlertKind.LOST, cause, Severity.ERROR, f"{what} for {lasted_s:.1f} s; no transform is given"))
+        elif self.state is State.OCCLUDED and before is not State.OCCLUDED:
+            text = "too few edges of the gripper are seen; the last transform is held"
+            alerts.append(Alert(AlertKind.OCCLUDED, Cause.VIEW_BLOCKED, Severity.WARNING, text))
+        if refusal and lasted_s >= settings.image_alert_after_s and not self._bad_alerted:
+            self._bad_alerted = True
+            text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
+            alerts.append(Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text))
+        return Judgement(self.state, Verdict.SUSPECT if held else Verdict.UNKNOWN, tuple(alerts))
+
+    def hold_variance(self, held_s: float) -> Array:
+        """(6,) what a held transform's variances have grown by after ``held_s`` seconds."""
+        settings = self._settings
+        rates = [settings.hold_m_per_sqrt_s] * 3 + [settings.hold_rad_per_sqrt_s] * 3
+        return np.square(rates) * held_s
+
+    def _recovered(self) -> list[Alert]:
+        self._bad_since_s = None
+        if self._bad_alerted or self.state is State.LOST:
+            self._bad_alerted = False
+            return [Alert(AlertKind.RECOVERED, Cause.UNKNOWN, Severity.INFO, "the gripper is measured again")]
+        return []
+
+
+def _jump_alert(evidence: Evidence) -> Alert:
+    return Alert(AlertKind.JUMP, evidence.cause, Severity.WARNING, f"the transform jumped; {_shift_text(evidence)}")
+
+
+def _drift_alert(evidence: Evidence, past_limit: bool) -> Alert:
+    text = f"drift against the reference: {_shift_text(evidence)}" + ("; past the limit" if past_limit else "")
+    return Alert(AlertKind.DRIFT, evidence.cause, Severity.ERROR if past_limit else Severity.WARNING, text)
+
+
+def _shift_text(evidence: Evidence) -> str:
+    x, y, z = (1e3 * evidence.shift[:3]).tolist()
+    return f"TCP now {x:+.3f} {y:+.3f} {z:+.3f} mm, turned by {math.degrees(evidence.delta_rad):.3f} degrees against the reference"

@@ -1,0 +1,94 @@
+"""On-line recalibration: the full pose from measured corners, without the previous one.
+
+The start comes from OpenCV's closed forms (IPPE for coplanar corners, SQPNP else); the weighted refinement is ours, since it needs
+the corners' covariances and gives that of the pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from gripmon.geometry import make_transform, perturb, perturbation_between, skew
+from gripmon.records import Array
+
+COPLANAR_RATIO = 1e-3
+"""Corners whose thickness is below this part of their extent count as coplanar."""
+
+AMBIGUITY_RATIO = 2.0
+"""Of two poses whose weighted squared errors differ by less than this factor, corners alone can't tell which one is true."""
+
+
+class RecalibrationRefused(ValueError):
+    """The corners don't determine a pose; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recalibration:
+    """``cam_T_grip``, the covariance (6, 6) of its error, and the weighted rms of the residuals (1 if the corners' covariances hold)."""
+
+    cam_T_grip: Array
+    covariance: Array
+    weighted_rms: float
+
+
+def recalibrate(
+    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, expected_cam_T_grip: Array, iterations: int = 10
+) -> Recalibration:
+    """Pose from n >= 4 coplanar or n >= 6 general corners.
+
+    ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates with ``covariance_xy`` (n, 2, 2).  ``expected_cam_T_grip`` only decides between the two
+    poses of a plane that the residuals don't tell apart.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
+    """
+    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False) if len(points_grip_m) else []
+    coplanar = len(spread) == 3 and spread[2] <= COPLANAR_RATIO * spread[0]
+    needed = 4 if coplanar else 6
+    if len(points_grip_m) < needed:
+        raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least {needed} are needed")
+    if spread[1] <= COPLANAR_RATIO * spread[0]:
+        raise RecalibrationRefused("the corners lie on a line")
+    method = cv2.SOLVEPNP_IPPE if coplanar else cv2.SOLVEPNP_SQPNP
+    found, rotations, translations, _ = cv2.solvePnPGeneric(points_grip_m, measured_xy, np.eye(3), None, flags=method)
+    starts = [make_transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in zip(rotations, translations, strict=True)]
+    starts = [start for start in starts if (points_grip_m @ start[2, :3] + start[2, 3] > 0.0).all()]
+    if not found or not starts:
+        raise RecalibrationRefused("no pose has all corners in front of the camera")
+    weight_xy = np.linalg.inv(covariance_xy)
+    refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
+    return _choose(refined, expected_cam_T_grip)
+
+
+def _refine(cam_T_grip: Array, points_grip_m: Array, measured_xy: Array, weight_xy: Array, iterations: int) -> Recalibration:
+    """Gauss-Newton on the weighted image error, on the manifold."""
+    for _ in range(iterations):
+        levers = points_grip_m @ cam_T_grip[:3, :3].T
+        points = levers + cam_T_grip[:3, 3]
+        xy = points[:, :2] / points[:, 2:]
+        d_xy = np.zeros((len(points), 2, 3))
+        d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1.0 / points[:, 2]
+        d_xy[:, :, 2] = -xy / points[:, 2:]
+        jacobian = np.concatenate([d_xy, -d_xy @ skew(levers)], axis=2)
+        residual = measured_xy - xy
+        weighted = np.einsum("nki,nkl->nli", jacobian, weight_xy)
+        normal = np.einsum("nli,nlj->ij", weighted, jacobian)
+        try:
+            step = np.linalg.solve(normal, np.einsum("nli,nl->i", weighted, residual))
+        except np.linalg.LinAlgError:
+            raise RecalibrationRefused("the corners don't determine all six parameters") from None
+        cam_T_grip = perturb(cam_T_grip, step)
+        if np.abs(step[:3]).max() < 1e-10 and np.abs(step[3:]).max() < 1e-9:
+            break
+    error = float(np.einsum("nk,nkl,nl->", residual, weight_xy, residual))
+    return Recalibration(cam_T_grip, np.linalg.inv(normal), float(np.sqrt(error / residual.size)))
+
+
+def _choose(refined: list[Recalibration], expected_cam_T_grip: Array) -> Recalibration:
+    best = min(refined, key=lambda r: r.weighted_rms)
+    rivals = [r for r in refined if r.weighted_rms**2 <= AMBIGUITY_RATIO * best.weighted_rms**2]
+
+    def turn(candidate: Recalibration) -> float:
+        return float(np.linalg.norm(perturbation_between(expected_cam_T_grip, candidate.cam_T_grip)[3:]))
+
+    return min(rivals, key=turn)

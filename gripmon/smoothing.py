@@ -1,0 +1,71 @@
+"""The transform averaged over time: a Kalman filter for a camera that stands still or creeps.
+
+The state is the pose itself, its covariance that of ``xi = (rho, omega)``.  Between frames the pose may wander like a random walk;
+an innovation that the two covariances don't explain, twice in a row, starts the average anew.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.records import Array
+
+GATE = 37.7
+"""Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of freedom)."""
+
+
+class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How far the mount may creep between frames."""
+
+    creep_m_per_sqrt_s: Annotated[
+        float, Meta(ge=0.0, le=0.1, description="random walk of the TCP's position, each axis (m per square root of a second)")
+    ] = 1e-5
+    creep_rad_per_sqrt_s: Annotated[
+        float, Meta(ge=0.0, le=1.0, description="random walk of the rotation, each axis (rad per square root of a second)")
+    ] = 1e-4
+
+
+class PoseAverage:
+    """Running average of ``cam_T_grip``; ``cam_T_grip`` is None until the first measurement."""
+
+    def __init__(self, settings: SmoothingSettings):
+        rates = [settings.creep_m_per_sqrt_s] * 3 + [settings.creep_rad_per_sqrt_s] * 3
+        self._variance_per_s = np.square(rates)
+        self.cam_T_grip: Array | None = None
+        self.covariance: Array = np.zeros((6, 6))
+        self._suspicions = 0
+
+    def forget(self) -> None:
+        """Start anew with the next measurement."""
+        self.cam_T_grip = None
+
+    def wander(self, elapsed_s: float) -> None:
+        """Time passes: the covariance grows by the random walk."""
+        self.covariance.flat[::7] += self._variance_per_s * elapsed_s
+
+    def add(self, cam_T_grip: Array, covariance: Array) -> None:
+        """One measurement (4, 4) with the covariance (6, 6) of its error."""
+        if self.cam_T_grip is None:
+            self._restart(cam_T_grip, covariance)
+            return
+        innovation = perturbation_between(self.cam_T_grip, cam_T_grip)
+        # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
+        both = np.linalg.solve(self.covariance + covariance, np.column_stack([self.covariance, innovation]))
+        if float(innovation @ both[:, 6]) > GATE:
+            self._suspicions += 1
+            if self._suspicions >= 2:
+                self._restart(cam_T_grip, covariance)
+            return
+        self._suspicions = 0
+        self.cam_T_grip = perturb(self.cam_T_grip, both[:, :6].T @ innovation)
+        self.covariance = self.covariance - both[:, :6].T @ self.covariance
+        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+
+    def _restart(self, cam_T_grip: Array, covariance: Array) -> None:
+        self.cam_T_grip, self.covariance = cam_T_grip, covariance.copy()
+        self._suspicions = 0
