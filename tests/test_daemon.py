@@ -352,8 +352,7 @@ def test_lines_for_people_on_stderr(capsys: pytest.CaptureFixture[str]):
 # The judgement beside the monitor, as tables: what happens (and when, in seconds) -> the alerts.
 
 GOOD, BAD, NONE = "good", "bad", "none"
-SETTINGS = DaemonSettings(stale_after_s=0.5, no_camera_alert_after_s=3.0, image_alert_after_s=2.0)
-IMAGE_ALERT = Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.WARNING, "black for 1 s")
+SETTINGS = DaemonSettings(stale_after_s=0.5, no_camera_alert_after_s=3.0)
 
 
 @pytest.mark.parametrize(
@@ -368,12 +367,8 @@ IMAGE_ALERT = Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.WARNING, "black f
         ([(3.0, NONE), (5.0, GOOD), (5.1, GOOD)], [(3.0, "source"), (5.0, "recovered")], State.TRACKING),
         ([(1.0, NONE), (1.5, GOOD)], [], State.TRACKING),
         ([(3.0, NONE), (4.0, GOOD), (7.1, NONE)], [(3.0, "source"), (4.0, "recovered"), (7.1, "source")], State.STALE),
-        ([(1.0, BAD), (2.9, BAD)], [], State.TRACKING),
-        ([(1.0, BAD), (2.0, BAD), (3.0, BAD), (4.0, BAD)], [(3.0, "image")], State.TRACKING),
-        ([(1.0, BAD), (3.0, BAD), (3.5, GOOD)], [(3.0, "image"), (3.5, "recovered")], State.TRACKING),
-        ([(1.0, BAD), (2.0, GOOD), (2.1, BAD), (3.5, BAD)], [], State.TRACKING),
-        ([(1.0, IMAGE_ALERT), (3.5, BAD), (9.0, BAD)], [], State.TRACKING),
-        ([(1.0, IMAGE_ALERT), (3.5, GOOD)], [(3.5, "recovered")], State.TRACKING),
+        ([(1.0, BAD), (4.0, NONE), (4.1, BAD)], [(4.0, "source"), (4.1, "recovered")], State.TRACKING),
+        ([(1.0, BAD), (2.9, BAD), (9.0, BAD)], [], State.TRACKING),
     ],
 )  # fmt: skip
 def test_what_the_watch_says(events: list[tuple[float, object]], alerts: list[tuple[float, str]], state: State):
@@ -383,11 +378,24 @@ def test_what_the_watch_says(events: list[tuple[float, object]], alerts: list[tu
         if event == NONE:
             due = watch.no_frame("unplugged", now_s)
         else:
-            own = (event,) if isinstance(event, Alert) else ()
-            due = watch.frame(frame_record(**({"alerts": ()} if event == GOOD else REFUSED | {"alerts": own})), now_s)
+            due = watch.frame(frame_record(**({} if event == GOOD else REFUSED)), now_s)
         said += [(now_s, alert.kind.value) for alert in due]
     assert said == alerts
     assert watch.state is state
+
+
+def test_a_refusal_is_said_once_though_its_figures_change():
+    watch = Watch(SETTINGS, now_s=0.0)
+    messages = []
+    for reason in ("black: at most 1 %", "black: at most 2 %", "white: at least 99 %", "white: at least 98 %"):
+        watch.frame(frame_record(**(REFUSED | {"reason": reason})), now_s=1.0)
+        messages.append(watch.message)
+    assert messages == ["frames refused: black: at most 1 %"] * 2 + ["frames refused: white: at least 99 %"] * 2
+    assert watch.frames_refused == 4
+    watch.frame(frame_record(reason="too few edges agree"), now_s=1.0)
+    assert watch.message == "too few edges agree"
+    watch.frame(frame_record(), now_s=1.0)
+    assert watch.message == ""
 
 
 def test_the_rate_is_that_of_the_last_frames():

@@ -19,9 +19,6 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     no_camera_alert_after_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="no frame for this long: an alert (s)")
     ] = 3.0
-    image_alert_after_s: Annotated[
-        float, msgspec.Meta(gt=0.0, description="only refused frames for this long: an alert (s)")
-    ] = 2.0
     give_up_after_errors: Annotated[
         int, msgspec.Meta(ge=1, description="internal errors in so many frames in a row: stop, exit code 3")
     ] = 50

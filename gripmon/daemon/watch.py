@@ -1,4 +1,4 @@
-"""What there is to say besides the frames' own records: silence, refused frames that go on, internal errors."""
+"""What there is to say besides the frames' own records: counts, silence, internal errors."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ _RATE_OVER_FRAMES = 64
 class Watch:
     """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
 
-    ``state``, ``verdict`` and ``message`` are what the state message says now.  Each fault gives one alert when it has
-    lasted, and one when it is over.
+    ``state``, ``verdict`` and ``message`` are what the state message says now.  Alerts about images are the monitor's,
+    those about their absence come from here: one when it has lasted, one when it is over.
     """
 
     def __init__(self, settings: DaemonSettings, now_s: float) -> None:
@@ -29,8 +29,6 @@ class Watch:
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._silence_alerted = False
-        self._refused_since_s: float | None = None
-        self._image_alerted = False
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; the alerts that are due beside the record's own."""
@@ -42,11 +40,9 @@ class Watch:
         self.state, self.verdict = record.state, record.verdict
         if is_refused(record):
             self.frames_refused += 1
-            self.message = f"frames refused: {record.reason}"
-            alerts += self._refused(record, now_s)
+            self._keep_message(f"frames refused: {record.reason}")
         else:
-            self.message = ""
-            alerts += self._end_of_refusals(now_s)
+            self._keep_message(record.reason or "")
         return alerts
 
     def no_frame(self, reason: str, now_s: float) -> list[Alert]:
@@ -86,6 +82,11 @@ class Watch:
             return 0.0
         return (len(times_s) - 1) / (times_s[-1] - times_s[0])
 
+    def _keep_message(self, text: str) -> None:
+        """A reason's figures may change with every frame; it is said again only when its kind changes."""
+        if _kind(text) != _kind(self.message):
+            self.message = text
+
     def _end_of_silence(self, now_s: float) -> list[Alert]:
         if now_s - self._last_frame_s >= self._settings.stale_after_s:
             self._frame_times_s.clear()
@@ -95,25 +96,9 @@ class Watch:
         text = f"frames again after {now_s - self._last_frame_s:.1f} s"
         return [Alert(AlertKind.RECOVERED, Cause.NO_CAMERA, Severity.INFO, text)]
 
-    def _refused(self, record: FrameRecord, now_s: float) -> list[Alert]:
-        if self._refused_since_s is None:
-            self._refused_since_s = now_s
-        lasted_s = now_s - self._refused_since_s
-        if any(alert.kind is AlertKind.IMAGE for alert in record.alerts):
-            self._image_alerted = True  # the monitor said it
-        if self._image_alerted or lasted_s < self._settings.image_alert_after_s:
-            return []
-        self._image_alerted = True
-        text = f"every frame refused for {lasted_s:.1f} s: {record.reason}"
-        return [Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text)]
 
-    def _end_of_refusals(self, now_s: float) -> list[Alert]:
-        since_s, self._refused_since_s = self._refused_since_s, None
-        if since_s is None or not self._image_alerted:
-            return []
-        self._image_alerted = False
-        text = f"frames can be used again after {now_s - since_s:.1f} s"
-        return [Alert(AlertKind.RECOVERED, Cause.IMAGE_BAD, Severity.INFO, text)]
+def _kind(message: str) -> str:
+    return ":".join(message.split(":")[:2])
 
 
 def is_refused(record: FrameRecord) -> bool:
