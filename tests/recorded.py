@@ -54,7 +54,9 @@ def settings(**changes: Any) -> RecordingSettings:
     return msgspec.structs.replace(RecordingSettings(min_free_bytes=0, flush_period_s=0.1), **changes)
 
 
-def recorder(directory: Path, truth: Callable[[int], Any] | None = None, **changes: Any) -> ProcessRecorder:
+def recorder(
+    directory: Path, truth: Callable[[int], Any] | None = None, patience_s: float = 0.0, **changes: Any
+) -> ProcessRecorder:
     opened = open_recorder(
         settings(**changes),
         robot="arm",
@@ -65,6 +67,7 @@ def recorder(directory: Path, truth: Callable[[int], Any] | None = None, **chang
         directory=directory,
         name="run",
         truth_tcp_m=truth,
+        patience_s=patience_s,
     )
     assert isinstance(opened, ProcessRecorder)
     return opened

@@ -267,6 +267,16 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     assert set(told.by_seq(f"{OVERLAY}/edges/used", "positions")) == shown
 
 
+def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, patience_s=20.0, queue_frames=16, queue_images=2, image_rate_hz=1000.0)
+    for i in range(150):
+        writer.offer(frame(i), record(i), trace(i))
+    writer.close(10.0)
+    assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
+    (path,) = tmp_path.iterdir()
+    assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(150))
+
+
 def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0), None)

@@ -25,6 +25,7 @@ _log = logging.getLogger(__name__)
 HANDOVER_PERIOD_S = 0.05
 BATCH_FRAMES = 16
 LONGEST_RESTART_PAUSE_S = 30.0
+_ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
 _EVENTS_KEPT = 256
 
@@ -82,13 +83,15 @@ def open_recorder(
     directory: Path | None = None,
     name: str | None = None,
     truth_tcp_m: Truth | None = None,
+    patience_s: float = 0.0,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
 
     ``directory`` replaces the settings' one, ``name`` the default of robot, camera and time of day.  ``truth_tcp_m``,
     which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
-    the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  Raises OSError
-    when the directory can't be made.
+    the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  ``patience_s`` is
+    for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a frame.  A camera
+    can't wait: 0.  Raises OSError when the directory can't be made.
     """
     if not settings.enabled:
         return NullRecorder()
@@ -97,7 +100,7 @@ def open_recorder(
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
     scene = make_scene(settings, str(folder.resolve()), name, robot, camera_name, camera, gripper, reference)
-    return ProcessRecorder(scene, truth_tcp_m)
+    return ProcessRecorder(scene, truth_tcp_m, patience_s)
 
 
 class ProcessRecorder:
@@ -109,10 +112,11 @@ class ProcessRecorder:
     frames are dropped and counted.  When it dies, it is started again and begins a new file.
     """
 
-    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None):
+    def __init__(self, scene: Scene, truth_tcp_m: Truth | None = None, patience_s: float = 0.0):
         settings = scene.settings
         self._scene = scene
         self._truth_tcp_m = truth_tcp_m
+        self._patience_s = patience_s
         self._queue_frames = settings.queue_frames
         self._queue_images = settings.queue_images
         self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
@@ -130,6 +134,7 @@ class ProcessRecorder:
         # Written by the hand-over thread only.
         self._images_taken = 0
         self._images_without_slot = 0
+        self._slot_waited_from: float | None = None
         self._lost_earlier = 0
         self._written_earlier = 0
         self._newest_reference = scene.reference
@@ -177,6 +182,8 @@ class ProcessRecorder:
 
     def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
+        if self._patience_s > 0.0:
+            self._wait_for_room()
         if len(self._frames) >= self._queue_frames:
             self._not_queued += 1
             return
@@ -210,6 +217,14 @@ class ProcessRecorder:
         self._frames.clear()
         self._lost_earlier = self._queued - self.frames_written - self._status.frames_lost
 
+    def _wait_for_room(self) -> None:
+        end = time.monotonic() + self._patience_s
+        while time.monotonic() < end and self.failure is None:
+            images_waiting = self._images_offered - self._images_taken
+            if len(self._frames) < self._queue_frames and images_waiting < self._queue_images:
+                return
+            time.sleep(_ROOM_POLL_S)
+
     def _image_is_due(self, stamp_ns: int) -> bool:
         if self._image_interval_ns is None:
             return False
@@ -218,7 +233,7 @@ class ProcessRecorder:
 
     def _run(self) -> None:
         try:
-            while not self._closing.wait(HANDOVER_PERIOD_S):
+            while not self._closing.wait(HANDOVER_PERIOD_S if self._patience_s == 0.0 else _ROOM_POLL_S):
                 self._hand_over()
             self._hand_over_rest()
         except Exception as error:  # noqa: BLE001 - a recording that fails must not take the monitor with it
@@ -235,7 +250,10 @@ class ProcessRecorder:
         worker.read_reports()
         self._status = worker.status
         while worker.ready and (self._frames or self._alerts or self._references):
-            worker.send(self._encode(self._next_batch(worker)))
+            batch = self._next_batch(worker)
+            if not (batch.frames or batch.alerts or batch.references):
+                break
+            worker.send(self._encode(batch))
         if worker.gone:
             self._bury(worker, worker.reap(0.0) or "the recording process ended by itself")
 
@@ -262,7 +280,7 @@ class ProcessRecorder:
 
     def _next_batch(self, worker: WorkerProcess) -> Batch:
         frames: list[FrameNote] = []
-        while self._frames and len(frames) < BATCH_FRAMES:
+        while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0][2]):
             record, shown, image, trace = self._frames.popleft()
             self._images_taken += shown
             note = None if image is None else self._share(worker, image)
@@ -275,12 +293,24 @@ class ProcessRecorder:
             self._newest_reference = references[-1]
         return Batch(frames, _drain(self._alerts), references)
 
+    def _wait_for_slot(self, worker: WorkerProcess, image: Image | None) -> bool:
+        """Whether the next frame stays in the queue because its image has no room yet and patience is left."""
+        if self._patience_s == 0.0 or image is None or self._slot_free(worker):
+            self._slot_waited_from = None
+            return False
+        now = time.monotonic()
+        self._slot_waited_from = self._slot_waited_from or now
+        return now - self._slot_waited_from < self._patience_s
+
+    def _slot_free(self, worker: WorkerProcess) -> bool:
+        if worker.images_sent - worker.status.images_done >= self._ring.slots:
+            worker.read_reports()
+        return worker.images_sent - worker.status.images_done < self._ring.slots
+
     def _share(self, worker: WorkerProcess, image: Image) -> ImageNote | None:
         if not self._ring.takes(image):
             return None  # a refused frame: its record says why
-        if worker.images_sent - worker.status.images_done >= self._ring.slots:
-            worker.read_reports()
-        if worker.images_sent - worker.status.images_done >= self._ring.slots:
+        if not self._slot_free(worker):
             self._images_without_slot += 1
             return None
         note = self._ring.put(worker.images_sent % self._ring.slots, image)
