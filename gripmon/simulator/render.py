@@ -15,34 +15,19 @@ from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.records import Array
-from gripmon.simulator import textures
 from gripmon.simulator.background import TableView
 from gripmon.simulator.bodies import Bodies
 from gripmon.simulator.coverage import Coverage, CoverageRaster
-from gripmon.simulator.scenario import Cover, FingerLook, Scenario
+from gripmon.simulator.scenario import Scenario
 from gripmon.simulator.scene import Scene, SceneState
-from gripmon.simulator.solids import Solid
+from gripmon.simulator.surfaces import Painter, Surface
 from gripmon.simulator.viewing import RayGrid, enlarge_cells
 
-_LARGEST_TEXTURE_PX = 1200
 _CARRIER_GAIN = 0.9
-_OBJECT_LEVEL_DN = 150.0
-_SKIN_LEVEL_DN = 150.0
-_SHEET_LEVEL_DN = 205.0
 _COVER_BLUR_PX = 1.0
 _SMEAR_FROM_PX = 0.25
 _SMEAR_STEP_PX = 1.0
 _MOST_SUB_EXPOSURES = 8
-
-
-@dataclass(frozen=True)
-class _Surface:
-    """What a face looks like: brightness, texture (None: even), and the frame of its plane in the body's frame."""
-
-    level_dn: float
-    texture: NDArray[np.float32] | None
-    px_per_m: float
-    body_T_plane: Array
 
 
 @dataclass(frozen=True)
@@ -67,15 +52,13 @@ class Renderer:
         self._cover_raster = CoverageRaster(camera, _COVER_BLUR_PX)
         self._table = TableView(camera, self.rays, scenario.background, nominal_cam_T_grip, seed, psf_px)
         rng = np.random.default_rng([seed, 5])
-        px_per_m = camera.fx_px / float(nominal_cam_T_grip[2, 3])
-        painter = _Painter(rng, scenario.fingers, nominal_cam_T_grip[:3, :3], px_per_m)
+        painter = Painter(rng, scenario.fingers, nominal_cam_T_grip, camera.fx_px)
         self._surfaces = {solid.name: painter.metal(solid, 1.0) for solid in bodies.fingers}
         self._surfaces |= {solid.name: painter.metal(solid, _CARRIER_GAIN) for solid in bodies.carriers}
         if bodies.grasped is not None:
             self._surfaces[bodies.grasped.name] = painter.printed(bodies.grasped)
-        self._cover_surfaces = [
-            _cover_surface(rng, c, o, camera.fx_px) for c, o in zip(scenario.covers, bodies.cover_outlines, strict=True)
-        ]
+        outlines = zip(scenario.covers, bodies.cover_outlines, strict=True)
+        self._cover_surfaces = [painter.cover(cover, outline) for cover, outline in outlines]
         self._cache: tuple[bytes, list[_Layer]] = (b"", [])
 
     def render(self, time_s: float) -> NDArray[np.float32]:
@@ -143,7 +126,7 @@ class Renderer:
         self._cache = (key, layers)
         return layers
 
-    def _layer(self, parts: list[tuple[Coverage, _Surface]], cam_T_body: Array) -> _Layer:
+    def _layer(self, parts: list[tuple[Coverage, Surface]], cam_T_body: Array) -> _Layer:
         """Sum of a body's faces: they share their inner borders, so their masks add up to that of the body."""
         left, top = min(m.left for m, _ in parts), min(m.top for m, _ in parts)
         right = max(m.left + m.mask.shape[1] for m, _ in parts)
@@ -161,7 +144,7 @@ class Renderer:
                 cv2.accumulateProduct(self._shade(cover, surface, cam_T_body), cover.mask, light[part])
         return _Layer((slice(top, bottom), slice(left, right)), passes, light)
 
-    def _shade(self, cover: Coverage, surface: _Surface, cam_T_body: Array) -> NDArray[np.float32]:
+    def _shade(self, cover: Coverage, surface: Surface, cam_T_body: Array) -> NDArray[np.float32]:
         """A face's texture as it appears in the mask's window."""
         assert surface.texture is not None
         height, width = cover.mask.shape
@@ -170,73 +153,3 @@ class Renderer:
         large = [enlarge_cells(m)[inner] for m in maps]
         shade = cv2.remap(surface.texture, large[0], large[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(shade, dtype=np.float32)
-
-
-def _plane_frame(solid: Solid, face: int) -> tuple[Array, Array]:
-    """Frame of a face in the body's frame, x along its longest side, and the face's extent (2,) along x and y."""
-    corners = solid.vertices_m[solid.loops[face]]
-    sides = np.roll(corners, -1, axis=0) - corners
-    longest = int(np.linalg.norm(sides, axis=1).argmax())
-    x = sides[longest] / np.linalg.norm(sides[longest])
-    y = np.cross(x, solid.normals[face])  # down for somebody who looks at the face with x to the right
-    along, across = corners @ x, corners @ y
-    body_T_plane = np.eye(4)
-    body_T_plane[:3, :3] = np.column_stack([x, y, -solid.normals[face]])
-    body_T_plane[:3, 3] = along.min() * x + across.min() * y + solid.offsets_m[face] * solid.normals[face]
-    return body_T_plane, np.array([np.ptp(along), np.ptp(across)])
-
-
-class _Painter:
-    """Makes the surfaces of bodies: shades by the lamp's direction at the nominal pose, textures from one seed."""
-
-    def __init__(self, rng: np.random.Generator, look: FingerLook, cam_R_grip: Array, px_per_m: float) -> None:
-        self._rng, self._look, self._cam_R_grip, self._px_per_m = rng, look, cam_R_grip, px_per_m
-        self._lamp_cam = np.array(look.lamp_cam) / np.linalg.norm(look.lamp_cam)
-
-    def metal(self, solid: Solid, gain: float) -> tuple[_Surface, ...]:
-        """Surfaces of a metal body, one a face."""
-        look, surfaces = self._look, []
-        for face, bevel in enumerate(solid.bevel):
-            level = gain * look.level_dn * self._shade(solid, face) * (look.bevel_gain if bevel else 1.0)
-            body_T_plane, rows, columns, px_per_m = self._sheet(solid, face)
-            texture = None
-            if look.texture > 0.0:
-                texture = level * textures.metal(self._rng, rows, columns, px_per_m, look.texture)
-            surfaces.append(_Surface(level, texture, px_per_m, body_T_plane))
-        return tuple(surfaces)
-
-    def printed(self, solid: Solid) -> tuple[_Surface, ...]:
-        """Surfaces of a printed box, one a face."""
-        surfaces = []
-        for face in range(len(solid.loops)):
-            level = _OBJECT_LEVEL_DN * self._shade(solid, face)
-            body_T_plane, rows, columns, px_per_m = self._sheet(solid, face)
-            texture = level * textures.printed(self._rng, rows, columns, px_per_m)
-            surfaces.append(_Surface(level, texture, px_per_m, body_T_plane))
-        return tuple(surfaces)
-
-    def _shade(self, solid: Solid, face: int) -> float:
-        towards = float(self._cam_R_grip @ solid.normals[face] @ self._lamp_cam)
-        return self._look.ambient + (1.0 - self._look.ambient) * max(towards, 0.0)
-
-    def _sheet(self, solid: Solid, face: int) -> tuple[Array, int, int, float]:
-        """Frame of a face, and rows, columns and pixels a metre of its texture."""
-        body_T_plane, extent_m = _plane_frame(solid, face)
-        px_per_m = min(self._px_per_m, _LARGEST_TEXTURE_PX / float(extent_m.max()))
-        columns, rows = (max(math.ceil(float(e) * px_per_m), 4) for e in extent_m)
-        return body_T_plane, rows, columns, px_per_m
-
-
-def _cover_surface(rng: np.random.Generator, cover: Cover, outline: Array, focal_px: float) -> _Surface:
-    """Skin, or a printed sheet; beyond its texture the border's grey goes on."""
-    low, high = outline.min(axis=0), outline.max(axis=0)
-    length = float(high[0] - low[0])
-    px_per_m = min(focal_px / cover.distance_m * 0.5, _LARGEST_TEXTURE_PX / length)
-    columns, rows = math.ceil(length * px_per_m), math.ceil(float(high[1] - low[1]) * px_per_m)
-    if cover.kind == "sheet":
-        texture = _SHEET_LEVEL_DN * (0.9 + 0.1 * textures.printed(rng, rows, columns, px_per_m))
-    else:
-        texture = _SKIN_LEVEL_DN * textures.skin(rng, rows, columns, px_per_m)
-    body_T_plane = np.eye(4)
-    body_T_plane[:3, 3] = low
-    return _Surface(0.0, np.ascontiguousarray(texture, dtype=np.float32), px_per_m, body_T_plane)

@@ -164,9 +164,9 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     lamp_cam: Annotated[
         tuple[float, float, float], Meta(description="direction to the lamp, camera axes (no unit)")
     ] = (
-        0.6,
-        -0.5,
-        -0.8,
+        0.4,
+        -0.55,
+        -0.75,
     )
     texture: Annotated[
         Fraction, Meta(description="strength of the brushed texture and scratches (0 to 1; 0: even faces)")

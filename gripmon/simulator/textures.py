@@ -199,11 +199,17 @@ def _rectangle(rng: Rng, size: float) -> NDArray[np.float64]:
 
 def _paste(image: Grey, sheet: Grey, centre: NDArray[np.float64], turn_deg: float) -> None:
     height, width = sheet.shape
+    reach = math.ceil(0.5 * math.hypot(width, height)) + 1
+    left, top = (max(int(c) - reach, 0) for c in centre.tolist())
+    right, bottom = (min(int(c) + reach + 1, size) for c, size in zip(centre.tolist(), image.shape[::-1], strict=True))
+    if left >= right or top >= bottom:
+        return
     matrix = cv2.getRotationMatrix2D((0.5 * width, 0.5 * height), turn_deg, 1.0)
-    matrix[:, 2] += centre - (0.5 * width, 0.5 * height)
-    mask = cv2.warpAffine(np.full_like(sheet, 255), matrix, image.shape[::-1], flags=cv2.INTER_LINEAR)
-    warped = cv2.warpAffine(sheet, matrix, image.shape[::-1], flags=cv2.INTER_LINEAR)
-    np.copyto(image, warped, where=mask > 127)
+    matrix[:, 2] += centre - np.array([0.5 * width + left, 0.5 * height + top])
+    size = (right - left, bottom - top)
+    mask = cv2.warpAffine(np.full_like(sheet, 255), matrix, size, flags=cv2.INTER_LINEAR)
+    warped = cv2.warpAffine(sheet, matrix, size, flags=cv2.INTER_LINEAR)
+    np.copyto(image[top:bottom, left:right], warped, where=mask > 127)
 
 
 def _cable(rng: Rng, image: Grey, px_per_m: float) -> None:
