@@ -11,8 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.geometry import exp_rotation, log_rotation
+from gripmon.geometry import exp_rotation, log_rotation, skew
 from gripmon.records import Array
+
+SMALLEST_EIGENVALUE = 1e-12
+"""Of the normal matrix scaled to a unit diagonal; below, rounding decides."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,33 +61,32 @@ def differential_update(
     for _ in range(iterations):
         points = (points_cam_m - tcp_cam_m) @ rotation.T + tcp
         rows, sides = equation_17(points, measured_xy)
+        rows = _about_tcp(rows, tcp)
         # A row is the image error times the depth, so its covariance is depth squared times the image's.
         weight = weight_xy / (points[:, 2] ** 2)[:, None, None]
         weighted = np.einsum("nki,nkl->nli", rows, weight)
         normal = np.einsum("nli,nlj->ij", weighted, rows)
-        try:
-            motion = np.linalg.solve(normal, np.einsum("nli,nl->i", weighted, sides))
-        except np.linalg.LinAlgError:
-            raise DegenerateGeometry("the corners lie on a line") from None
-        turn = exp_rotation(motion[:3])
-        # (11): the motion turns about the camera's origin; the TCP goes along.
-        tcp = turn @ tcp + motion[3:]
-        rotation = turn @ rotation
-    covariance = _about_tcp(normal, tcp)
-    omega = log_rotation(rotation)
-    return Update(np.concatenate([tcp - tcp_cam_m, omega]), covariance)
+        covariance = _inverse(normal)
+        xi = covariance @ np.einsum("nli,nl->i", weighted, sides)
+        tcp = tcp + xi[:3]
+        rotation = exp_rotation(xi[3:]) @ rotation
+    return Update(np.concatenate([tcp - tcp_cam_m, log_rotation(rotation)]), covariance)
 
 
-def _about_tcp(normal: Array, tcp_cam_m: Array) -> Array:
-    """Covariance of (rho, omega) at the TCP from the normal matrix of (delta, d) at the camera: rho = d + delta x tcp."""
-    try:
-        covariance = np.linalg.inv(normal)
-    except np.linalg.LinAlgError:
-        raise DegenerateGeometry("the corners lie on a line") from None
-    x, y, z = tcp_cam_m.tolist()
-    transfer = np.zeros((6, 6))
-    transfer[:3, :3] = [[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]]
-    transfer[:3, 3:] = np.eye(3)
-    transfer[3:, :3] = np.eye(3)
-    return transfer @ covariance @ transfer.T
+def _about_tcp(rows: Array, tcp_cam_m: Array) -> Array:
+    """Rows for (delta, d), a motion about the camera's origin, as rows for (rho, omega) at the TCP: d = rho - omega x tcp."""
+    out = np.empty_like(rows)
+    out[..., :3] = rows[..., 3:]
+    out[..., 3:] = rows[..., :3] + rows[..., 3:] @ skew(tcp_cam_m)
+    return out
 
+
+def _inverse(normal: Array) -> Array:
+    """Inverse of a normal matrix whose unknowns have different units; :class:`DegenerateGeometry` if a direction is undetermined."""
+    scale = np.sqrt(np.diag(normal))
+    if not (scale > 0.0).all():
+        raise DegenerateGeometry("the corners don't determine all six parameters")
+    scaled = normal / np.outer(scale, scale)
+    if np.linalg.eigvalsh(scaled)[0] < SMALLEST_EIGENVALUE:
+        raise DegenerateGeometry("the corners lie on a line, or so nearly that a direction is undetermined")
+    return np.linalg.inv(scaled) / np.outer(scale, scale)

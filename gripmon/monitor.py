@@ -44,11 +44,11 @@ from gripmon.records import (
 )
 from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
 
-USUAL_SHARE = 0.9
+USUAL_SHARE = 0.8
 """Share of agreeing profiles that is expected before anything is known about this gripper."""
 
-USUAL_RATE = 0.1
-"""How fast the usual share follows the measured one, per frame."""
+USUAL_RATES = (0.02, 0.1)
+"""How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
 
 SATISFIED = 0.8
 """Part of the usual share below which the gripper is looked for elsewhere, too."""
@@ -160,7 +160,7 @@ class Monitor:
         share = measurement.consensus.share
         self._dissatisfied = self._dissatisfied + 1 if share < SATISFIED * self._usual_share else 0
         if measurement.trusted:
-            self._usual_share += USUAL_RATE * (share - self._usual_share)
+            self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         return measurement
 
     def _update(self, measurement: Measurement) -> tuple[Array, Array]:

@@ -129,7 +129,7 @@ class Policy:
         """A frame from which a transform could be measured."""
         settings = self._settings
         alerts = self._recovered()
-        self._settled = 0 if evidence.jumped else self._settled + 1
+        self._settled = 1 if evidence.jumped else self._settled + 1
         if evidence.jumped and self.state not in (State.ACQUIRING, State.LOST):
             alerts.append(_jump_alert(evidence))
         confirmed = self._settled >= settings.confirm_frames

@@ -36,14 +36,14 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
     ] = 0.3
     trusted_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of all profiles that must agree for a fit where the gripper was expected")
+        float, Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where the gripper was expected")
     ] = 0.3
     found_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of all profiles that must agree for a fit where it was looked for")
-    ] = 0.5
+        float, Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where it was looked for")
+    ] = 0.42
 
 
-GATE_PX = 0.8
+GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it."""
 
 _TUKEY = 4.685
@@ -56,8 +56,8 @@ class Consensus:
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in 1/px², zero for
     those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper
-    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).  ``share``: part of all profiles that agree, on edges that
-    are seen; zero with fewer than three such edges.
+    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring profiles in which
+    both agree, on edges that are seen; zero with fewer than three such edges.
     """
 
     xi: Array
@@ -248,8 +248,11 @@ def _judge(
         share = agreeing / profiles
         needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
-    total = int(np.count_nonzero(prediction.ok))
-    believed = float(agreeing[seen].sum()) / total if total and np.count_nonzero(seen) >= 3 else 0.0
+    # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
+    pair = (edge_of[1:] == edge_of[:-1]) & prediction.ok[1:] & prediction.ok[:-1]
+    agreeing_pair = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
+    pairs = int(np.count_nonzero(pair))
+    believed = float(np.count_nonzero(agreeing_pair)) / pairs if pairs and np.count_nonzero(seen) >= 3 else 0.0
     return Consensus(
         xi, weight, residual, information, scale_px, supported, share, seen, believed
     )

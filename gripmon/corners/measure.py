@@ -50,6 +50,14 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
+TRUSTED_PART = 0.6
+"""Part of the satisfying share below which a fit is not believed, whatever the settings allow."""
+
+
+CLEARLY_BETTER = 1.3
+"""Factor by which the share elsewhere must exceed a trusted one where the gripper was expected."""
+
+
 class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """From the image to edge points and corners."""
 
@@ -152,13 +160,19 @@ class FingertipMeter:
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
-        if effort >= Effort.GRID and best.consensus.share < satisfied_share:
-            best = max(best, self._from_grid(image, expected), key=_agreement)
-        if effort >= Effort.SEARCH and best.consensus.share < satisfied_share:
-            best = max(best, self._search(image, expected), key=_agreement)
         consensus = self._settings.consensus
+        if best.consensus.share >= consensus.trusted_share:
+            # Fingers look alike when they slide along themselves: elsewhere must be clearly better than here.
+            beat = CLEARLY_BETTER * best.consensus.share
+        else:
+            beat = best.consensus.share
+        for further, look in ((Effort.GRID, self._from_grid), (Effort.SEARCH, self._search)):
+            if effort >= further and best.consensus.share < satisfied_share:
+                other = look(image, expected)
+                if other.consensus.share > max(beat, best.consensus.share):
+                    best = other
         needed = consensus.trusted_share if best.effort == Effort.NARROW else consensus.found_share
-        return replace(best, trusted=best.consensus.share >= needed)
+        return replace(best, trusted=best.consensus.share >= max(needed, TRUSTED_PART * satisfied_share))
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at most."""

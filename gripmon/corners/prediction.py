@@ -95,7 +95,7 @@ class Prediction:
 
 
 def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings) -> EdgeLayout:
-    """Choose the sampled part of each visible edge: inside the image, away from its ends, density by projected length."""
+    """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its length."""
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
@@ -109,8 +109,10 @@ def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: 
     lengths = np.array([r[2] if r else 0.0 for r in ranges])
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
-        # At most one profile a pixel: closer ones see the same pixels again.
-        counts = np.minimum(np.round(settings.samples * lengths / lengths.sum()), lengths).astype(int)
+        # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most one
+        # profile a pixel: closer ones see the same pixels again.
+        share = np.sqrt(lengths)
+        counts = np.minimum(np.round(settings.samples * share / share.sum()), lengths).astype(int)
     counts[counts < 4] = 0
     edges = np.flatnonzero(counts)
     fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges, counts, strict=True) if n and r]
