@@ -137,3 +137,35 @@ def test_a_second_daemon_on_the_same_port_says_so(endpoint: str):
     assert second.stderr.splitlines()[-1].endswith(
         f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
     )
+
+
+def test_the_whole_daemon_from_camera_to_subscriber(endpoint: str, tmp_path: Path):
+    """``gripmon run`` as shipped, slower for slow machines: what was written down is what a subscriber got."""
+    from rerun.chunk import RrdReader
+
+    config = (HERE.parent / "configs" / "demo.yaml").read_text()
+    for before, after in (
+        ("tcp/127.0.0.1:7447", endpoint),
+        ("gripper: grippers/", f"gripper: {HERE.parent}/configs/grippers/"),
+        ("fps: 60.0", "fps: 15.0"),
+    ):
+        assert config.count(before) == 1
+        config = config.replace(before, after)
+    (tmp_path / "demo.yaml").write_text(config)
+    command = [sys.executable, "-m", "gripmon", "run", str(tmp_path / "demo.yaml"), "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=HERE.parent, start_new_session=True)
+    try:
+        wait_until(lambda: process.poll() is not None or accepts(endpoint), "the daemon to listen", 60.0)
+        messages = subscribe(endpoint, "gripmon/demo/wrist/transform", 45)
+        os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C reaches every process of the group
+        assert process.wait(WAIT_S) == 130
+    finally:
+        process.kill()
+        _, errors = process.communicate()
+    assert "Traceback" not in errors and "internal error" not in errors
+    lines = [json.loads(line) for line in (tmp_path / "out" / "estimates.jsonl").read_text().splitlines()]
+    first = [line["seq"] for line in lines].index(messages[0]["seq"])
+    assert messages == lines[first : first + 45]
+    assert {"valid"} <= {message["verdict"] for message in messages}
+    (recording,) = (tmp_path / "out").glob("*.rrd")
+    assert RrdReader(recording).store() is not None  # fails for a file that was not finished
