@@ -256,14 +256,14 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64)
     for i in range(60):
         state = State.DRIFTING if i in (31, 32) else State.TRACKING
-        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 45 else ()), trace(i))
+        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), trace(i))
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
     told = Recorded(path)
     assert told.seqs() == list(range(60))
     shown = set(told.by_seq(OVERLAY, "blob"))
     # Six frames to 100 ms; a change or an alert shows its frame and begins a new interval.
-    assert shown == {0, 6, 12, 18, 24, 30, 31, 33, 39, 45, 51, 57}
+    assert shown == {0, 6, 12, 18, 24, 30, 31, 33, 39, 43, 49, 55}
     assert set(told.by_seq(f"{OVERLAY}/edges/used", "positions")) == shown
 
 

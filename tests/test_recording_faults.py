@@ -166,6 +166,7 @@ def test_signals_for_the_daemon_s_group_don_t_end_the_recording(tmp_path: Path) 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         os.kill(worker, number)
     offer_and_wait(writer, 0, 5)
+    assert writer.process_id == worker
     writer.close(10.0)
     assert (writer.failure, writer.dropped) == (None, 0)
 
