@@ -60,7 +60,9 @@ class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     corner: bool = False
 
 
-class EdgeModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}):
+class EdgeModel(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}
+):
     start: str
     end: str
     kind: Literal["contour", "crease"] = "contour"
@@ -117,7 +119,9 @@ class Gripper:
         finger_index = {name: i for i, name in enumerate(self.finger_ids)}
         for name, point in model.points.items():
             if point.finger not in finger_index:
-                raise GripperError(f"points.{name}.finger: there is no finger '{point.finger}'; one of {', '.join(finger_index)}")
+                raise GripperError(
+                    f"points.{name}.finger: there is no finger '{point.finger}'; one of {', '.join(finger_index)}"
+                )
         self.point_finger = np.array([finger_index[p.finger] for p in model.points.values()], dtype=np.intp)
         self._nominal_points_m = np.array([p.xyz_m for p in model.points.values()], dtype=float).reshape(-1, 3)
         self.corner_points = np.flatnonzero([p.corner for p in model.points.values()])
@@ -177,7 +181,9 @@ class Gripper:
     def _ends(self, name: str, edge: EdgeModel) -> tuple[int, int]:
         for key, point in (("from", edge.start), ("to", edge.end)):
             if point not in self._point_index:
-                raise GripperError(f"edges.{name}.{key}: there is no point '{point}'; one of {', '.join(self.point_ids)}")
+                raise GripperError(
+                    f"edges.{name}.{key}: there is no point '{point}'; one of {', '.join(self.point_ids)}"
+                )
         i, j = self._point_index[edge.start], self._point_index[edge.end]
         if self.point_finger[i] != self.point_finger[j]:
             raise GripperError(f"edges.{name}: its ends lie on two fingers; an edge belongs to one finger")
@@ -188,17 +194,25 @@ class Gripper:
     def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> FaceLoop:
         unknown = [p for p in face.points if p not in self._point_index]
         if unknown:
-            raise GripperError(f"faces[{index}].points: there is no point '{unknown[0]}'; one of {', '.join(self.point_ids)}")
+            raise GripperError(
+                f"faces[{index}].points: there is no point '{unknown[0]}'; one of {', '.join(self.point_ids)}"
+            )
         if face.finger not in finger_index:
-            raise GripperError(f"faces[{index}].finger: there is no finger '{face.finger}'; one of {', '.join(finger_index)}")
+            raise GripperError(
+                f"faces[{index}].finger: there is no finger '{face.finger}'; one of {', '.join(finger_index)}"
+            )
         loop = np.array([self._point_index[p] for p in face.points], dtype=np.intp)
         strange = [p for p in face.points if self.model.points[p].finger != face.finger]
         if strange:
-            raise GripperError(f"faces[{index}].points: '{strange[0]}' is not on finger '{face.finger}'; points of that finger")
+            raise GripperError(
+                f"faces[{index}].points: '{strange[0]}' is not on finger '{face.finger}'; points of that finger"
+            )
         centre = self._nominal_points_m[self.point_finger == finger_index[face.finger]].mean(axis=0)
         corners = self._nominal_points_m[loop]
         if np.dot(_normal(corners), corners.mean(axis=0) - centre) < 0.0:
-            raise GripperError(f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside")
+            raise GripperError(
+                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside"
+            )
         return FaceLoop(finger_index[face.finger], loop)
 
     def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -258,7 +272,9 @@ class Gripper:
             raise GripperError(f"points.{name}.xyz_m: {far.max():g} m from the TCP; metres (millimetres were meant?)")
         corners = self._nominal_points_m[self.corner_points]
         if len(corners) < 3:
-            raise GripperError(f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line")
+            raise GripperError(
+                f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line"
+            )
         spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
         if spread[1] < SMALLEST_SPREAD_RATIO * spread[0]:
             raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
@@ -266,7 +282,9 @@ class Gripper:
             raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
         for i, name in enumerate(self.corner_ids):
             if len(self.edges_at_corner(i)) < 2:
-                raise GripperError(f"points.{name}: fewer than two edges end in this corner; a corner is where edges meet")
+                raise GripperError(
+                    f"points.{name}: fewer than two edges end in this corner; a corner is where edges meet"
+                )
 
 
 _POLARITY = {"any": 0, "right": 1, "left": -1}

@@ -21,10 +21,15 @@ def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, st
         return Refusal.WRONG_TYPE, f"shape {image.shape}; H x W, or H x W x 3 in the order BGR"
     if image.shape[:2] != (camera.height_px, camera.width_px):
         size = f"{image.shape[1]}x{image.shape[0]}"
-        return Refusal.WRONG_SIZE, f"{size} pixels; {camera.width_px}x{camera.height_px} as the camera's calibration says"
+        return (
+            Refusal.WRONG_SIZE,
+            f"{size} pixels; {camera.width_px}x{camera.height_px} as the camera's calibration says",
+        )
     if image.dtype not in (np.uint8, np.uint16, np.float32):
         return Refusal.WRONG_TYPE, f"pixels of type {image.dtype}; uint8, uint16 or float32 in 0 to 1"
-    return _grey_levels(image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]) or _jaw(frame, gripper)
+    return _grey_levels(image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]) or _jaw(
+        frame, gripper
+    )
 
 
 def _grey_levels(sparse: np.ndarray) -> tuple[Refusal, str] | None:

@@ -68,10 +68,12 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         float, Meta(ge=0.0, le=0.05, description="standard deviation of the reported jaw opening (m)")
     ] = 5e-5
     floor_m: Annotated[
-        float, Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)")
+        float,
+        Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)"),
     ] = 2e-6
     floor_rad: Annotated[
-        float, Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)")
+        float,
+        Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)"),
     ] = 5e-5
     corners: MeasurementSettings = MeasurementSettings()
     smoothing: SmoothingSettings = SmoothingSettings()

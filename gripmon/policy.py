@@ -22,7 +22,10 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """What is noticed, and what is done then."""
 
     smallest_drift_m: Annotated[
-        float, Meta(gt=0.0, le=0.1, description="smallest shift of the TCP, along any camera axis, that is worth an alert (m)")
+        float,
+        Meta(
+            gt=0.0, le=0.1, description="smallest shift of the TCP, along any camera axis, that is worth an alert (m)"
+        ),
     ] = 1e-4
     smallest_drift_rad: Annotated[
         float, Meta(gt=0.0, le=1.0, description="smallest rotation about any camera axis that is worth an alert (rad)")
@@ -30,14 +33,24 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     false_alarms_per_day: Annotated[
         float, Meta(gt=0.0, le=1000.0, description="drift alarms a day that an unmoved camera may give (1/day)")
     ] = 0.01
-    frames_per_s: Annotated[float, Meta(gt=0.0, le=2000.0, description="frame rate that this is reckoned for (1/s)")] = 60.0
+    frames_per_s: Annotated[
+        float, Meta(gt=0.0, le=2000.0, description="frame rate that this is reckoned for (1/s)")
+    ] = 60.0
     limit_m: Annotated[
-        float, Meta(gt=0.0, le=1.0, description="motion d of equation (14) past which the reference is measured anew (m)")
+        float,
+        Meta(gt=0.0, le=1.0, description="motion d of equation (14) past which the reference is measured anew (m)"),
     ] = 2.5e-3
     limit_rad: Annotated[
-        float, Meta(gt=0.0, le=3.0, description="rotation delta of equation (14) past which the reference is measured anew (rad)")
+        float,
+        Meta(
+            gt=0.0,
+            le=3.0,
+            description="rotation delta of equation (14) past which the reference is measured anew (rad)",
+        ),
     ] = 0.02
-    recalibrate: Annotated[bool, Meta(description="true: past the limit take the new pose as reference; false: only alert")] = True
+    recalibrate: Annotated[
+        bool, Meta(description="true: past the limit take the new pose as reference; false: only alert")
+    ] = True
     settle_frames: Annotated[
         int, Meta(ge=1, le=10000, description="frames that must agree after a jump before a recalibration")
     ] = 15
@@ -45,13 +58,18 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         int, Meta(ge=1, le=1000, description="frames that must agree after a jump before the transform counts as valid")
     ] = 2
     hold_s: Annotated[
-        float, Meta(ge=0.0, le=3600.0, description="how long the last transform is held when nothing can be measured (s)")
+        float,
+        Meta(ge=0.0, le=3600.0, description="how long the last transform is held when nothing can be measured (s)"),
     ] = 1.0
     hold_m_per_sqrt_s: Annotated[
-        float, Meta(gt=0.0, le=1.0, description="growth of a held transform's position sigma (m per square root of a second)")
+        float,
+        Meta(gt=0.0, le=1.0, description="growth of a held transform's position sigma (m per square root of a second)"),
     ] = 2e-4
     hold_rad_per_sqrt_s: Annotated[
-        float, Meta(gt=0.0, le=3.0, description="growth of a held transform's rotation sigma (rad per square root of a second)")
+        float,
+        Meta(
+            gt=0.0, le=3.0, description="growth of a held transform's rotation sigma (rad per square root of a second)"
+        ),
     ] = 2e-3
     image_alert_after_s: Annotated[
         float, Meta(ge=0.0, le=3600.0, description="refused frames for so long give an alert (s)")
@@ -148,7 +166,9 @@ class Policy:
         if drifting and not self._drift_alerted:
             alerts.append(_drift_alert(evidence, past_limit))
         elif self._drift_alerted and not drifting:
-            alerts.append(Alert(AlertKind.RECOVERED, evidence.cause, Severity.INFO, "the drift against the reference is gone"))
+            alerts.append(
+                Alert(AlertKind.RECOVERED, evidence.cause, Severity.INFO, "the drift against the reference is gone")
+            )
         self._drift_alerted = drifting
         self.state = state
         sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
@@ -172,11 +192,15 @@ class Policy:
         before = self.state
         if self.state is not State.ACQUIRING:
             # A bad image says nothing about the gripper: only time makes it lost.
-            self.state = State.LOST if not held else (before if refusal and before is not State.LOST else State.OCCLUDED)
+            self.state = (
+                State.LOST if not held else (before if refusal and before is not State.LOST else State.OCCLUDED)
+            )
         if self.state is State.LOST and before is not State.LOST:
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
             cause = Cause.IMAGE_BAD if refusal else Cause.VIEW_BLOCKED
-            alerts.append(Alert(AlertKind.LOST, cause, Severity.ERROR, f"{what} for {lasted_s:.1f} s; no transform is given"))
+            alerts.append(
+                Alert(AlertKind.LOST, cause, Severity.ERROR, f"{what} for {lasted_s:.1f} s; no transform is given")
+            )
         elif self.state is State.OCCLUDED and before is not State.OCCLUDED:
             text = "too few edges of the gripper are seen; the last transform is held"
             alerts.append(Alert(AlertKind.OCCLUDED, Cause.VIEW_BLOCKED, Severity.WARNING, text))

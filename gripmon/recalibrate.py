@@ -60,7 +60,9 @@ def recalibrate(
     return _choose(refined, expected_cam_T_grip)
 
 
-def _refine(cam_T_grip: Array, points_grip_m: Array, measured_xy: Array, weight_xy: Array, iterations: int) -> Recalibration:
+def _refine(
+    cam_T_grip: Array, points_grip_m: Array, measured_xy: Array, weight_xy: Array, iterations: int
+) -> Recalibration:
     """Gauss-Newton on the weighted image error, on the manifold."""
     for _ in range(iterations):
         levers = points_grip_m @ cam_T_grip[:3, :3].T

@@ -23,10 +23,14 @@ class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     """How far the mount may creep between frames."""
 
     creep_m_per_sqrt_s: Annotated[
-        float, Meta(ge=0.0, le=0.1, description="random walk of the TCP's position, each axis (m per square root of a second)")
+        float,
+        Meta(
+            ge=0.0, le=0.1, description="random walk of the TCP's position, each axis (m per square root of a second)"
+        ),
     ] = 1e-5
     creep_rad_per_sqrt_s: Annotated[
-        float, Meta(ge=0.0, le=1.0, description="random walk of the rotation, each axis (rad per square root of a second)")
+        float,
+        Meta(ge=0.0, le=1.0, description="random walk of the rotation, each axis (rad per square root of a second)"),
     ] = 1e-4
 
 

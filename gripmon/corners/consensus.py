@@ -27,24 +27,45 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         float, Meta(ge=0.5, le=10.0, description="width of the robust weight at the prediction (px)")
     ] = 2.5
     point_floor_px: Annotated[
-        float, Meta(ge=0.005, le=1.0, description="standard deviation of an edge point that image noise does not explain (px)")
+        float,
+        Meta(
+            ge=0.005, le=1.0, description="standard deviation of an edge point that image noise does not explain (px)"
+        ),
     ] = 0.05
+    edge_floor_px: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=1.0,
+            description="standard deviation of a whole edge's position that averaging along it does not remove (px)",
+        ),
+    ] = 0.03
     support_sigmas: Annotated[
-        float, Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen")
+        float,
+        Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen"),
     ] = 4.0
     support_share: Annotated[
         float, Meta(ge=0.05, le=0.95, description="share of an edge's profiles that must agree for it to count as seen")
     ] = 0.3
     trusted_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where the gripper was expected")
+        float,
+        Meta(
+            ge=0.05,
+            le=0.95,
+            description="share of neighbouring profiles that must agree where the gripper was expected",
+        ),
     ] = 0.3
     found_share: Annotated[
-        float, Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where it was looked for")
+        float,
+        Meta(ge=0.05, le=0.95, description="share of neighbouring profiles that must agree where it was looked for"),
     ] = 0.42
 
 
 GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it."""
+
+STRETCH = 10
+"""Neighbouring profiles of an edge whose errors are taken together."""
 
 _TUKEY = 4.685
 _LARGEST_SCALE_PX = 0.5
@@ -71,19 +92,25 @@ class Consensus:
     share: float
 
 
-def base_weights(candidates: Candidates, prediction: Prediction, polarity: NDArray[np.int8], bevel_m: Array, floor_px: float) -> Array:
+def base_weights(
+    candidates: Candidates,
+    prediction: Prediction,
+    polarity: NDArray[np.int8],
+    bevel_m: Array,
+    settings: ConsensusSettings,
+) -> Array:
     """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
 
-    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  A bevel moves a whole edge at once, so that n points on it are
-    worth no more than one with the bevel's spread (a uniform one, bevel / sqrt(12)).
+    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  What moves a whole edge at once (pixel grid, shading, a bevel with the spread
+    of a uniform distribution, bevel / sqrt(12)) makes n points on it worth no more than one with that spread.
     """
     edge = prediction.layout.edge[candidates.sample]
-    variance = candidates.sigma_px**2 + floor_px**2
+    points = np.bincount(prediction.layout.edge, minlength=len(bevel_m))
+    spread = np.full(len(bevel_m), float(settings.edge_floor_px**2))
     if bevel_m.any():
-        points = np.bincount(prediction.layout.edge, minlength=len(bevel_m))
-        scale_px_per_m = np.sqrt(np.einsum("ni,ni->n", prediction.jacobian[:, :3], prediction.jacobian[:, :3]))
-        spread_px = bevel_m[edge] * scale_px_per_m[candidates.sample] / np.sqrt(12.0)
-        variance += points[edge] * spread_px**2
+        spread += (bevel_m * prediction.pixels_per_m) ** 2 / 12.0
+    variance = candidates.sigma_px**2
+    variance += (settings.point_floor_px**2 + points * spread)[edge]
     weight = 1.0 / variance
     if polarity.any():
         wanted = polarity[edge]
@@ -151,13 +178,12 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
     Expressed as translations of the gripper across the axis, rotation about the optical axis, and translation along it.
     """
     middle = prediction.corners_cam_m.mean(axis=0)
-    pixels_per_m = float(np.median(np.sqrt(np.einsum("ni,ni->n", prediction.jacobian[:, :3], prediction.jacobian[:, :3]))))
     span_px = float(np.abs(prediction.uv_px - prediction.uv_px.mean(axis=0)).max())
     ticks = np.arange(-round(reach_px / step_px), round(reach_px / step_px) + 1) * step_px
     turns = np.array([-1.0, 0.0, 1.0]) * 0.6 * reach_px / span_px
     dx, dy, scale, turn = (a.ravel() for a in np.meshgrid(ticks, ticks, turns, turns, indexing="ij"))
     starts = np.zeros((len(dx), prediction.jacobian.shape[1]))
-    starts[:, 0], starts[:, 1] = dx / pixels_per_m, dy / pixels_per_m
+    starts[:, 0], starts[:, 1] = dx / prediction.pixels_per_m, dy / prediction.pixels_per_m
     starts[:, 2] = scale * middle[2]
     starts[:, 5] = turn
     return starts
@@ -181,25 +207,27 @@ def _step(
     return step, information, weight
 
 
-def noise_inflation(candidates: Candidates, prediction: Prediction, weights: Array, consensus: Consensus) -> float:
+def noise_inflation(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> float:
     """Factor >= 1 by which the fit's covariance must grow so that it matches the residuals.
 
-    Two things make edge points worth less than their image noise says: residuals larger than that (texture on and behind the edge), and
-    neighbours on an edge that err together.  The first is the normalised residual variance; the second is measured as the
-    correlation r of neighbours and counts (1 + r) / (1 - r), as in a first-order autoregressive sequence.
+    Edge points are worth less than their image noise says: texture on and behind an edge moves them, and neighbours err together.
+    Both show in the means of whole stretches of an edge: with independent errors of the assumed size the weighted squares of these
+    means add up to the number of stretches less the number of unknowns.
     """
     inlier = np.flatnonzero(consensus.weight)
-    if len(inlier) < 12:
+    sample = candidates.sample[inlier]
+    stretch = sample // STRETCH
+    edge_starts = np.zeros(len(prediction.uv_px), dtype=np.intp)
+    edge_starts[prediction.layout.first[1:]] = 1
+    stretch = stretch + np.cumsum(edge_starts)[sample]
+    weight = consensus.weight[inlier]
+    total = np.bincount(stretch, weight)
+    moment = np.bincount(stretch, weight * consensus.residual_px[inlier])
+    full = total > 0.0
+    freedom = int(np.count_nonzero(full)) - len(consensus.xi)
+    if freedom < 3:
         return 1.0
-    residual = consensus.residual_px[inlier] * np.sqrt(weights[inlier])
-    tukey = consensus.weight[inlier] / weights[inlier]
-    variance = float(tukey @ (residual * residual) / tukey.sum())
-    edge = prediction.layout.edge[candidates.sample[inlier]]
-    same = edge[1:] == edge[:-1]
-    products = residual[1:] * residual[:-1] * same
-    together = float(products.sum()) / (float((residual * residual).mean()) * max(int(same.sum()), 1))
-    together = min(max(together, 0.0), 0.95)
-    return max(1.0, variance) * (1.0 + together) / (1.0 - together)
+    return max(1.0, float((moment[full] ** 2 / total[full]).sum()) / freedom)
 
 
 def prior_information(jaw_sigma_m: float | None) -> Array:
@@ -253,12 +281,12 @@ def _judge(
     agreeing_pair = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
     pairs = int(np.count_nonzero(pair))
     believed = float(np.count_nonzero(agreeing_pair)) / pairs if pairs and np.count_nonzero(seen) >= 3 else 0.0
-    return Consensus(
-        xi, weight, residual, information, scale_px, supported, share, seen, believed
-    )
+    return Consensus(xi, weight, residual, information, scale_px, supported, share, seen, believed)
 
 
 def _reach_px(prediction: Prediction) -> float:
     if not len(prediction.uv_px):
         return 1.0
-    return float(np.hypot(prediction.map_x[0, -1] - prediction.uv_px[0, 0], prediction.map_y[0, -1] - prediction.uv_px[0, 1]))
+    return float(
+        np.hypot(prediction.map_x[0, -1] - prediction.uv_px[0, 0], prediction.map_y[0, -1] - prediction.uv_px[0, 1])
+    )

@@ -31,7 +31,8 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         float, Meta(ge=0.01, le=10.0, description="largest standard deviation of a corner that may be used (px)")
     ] = 1.0
     neighbourhood: Annotated[
-        int, Meta(ge=1, le=20, description="profiles next to the corner, half of which must be seen on each of its edges")
+        int,
+        Meta(ge=1, le=20, description="profiles next to the corner, half of which must be seen on each of its edges"),
     ] = 4
 
 
@@ -168,7 +169,11 @@ def _faults(
     angle_ok: NDArray[np.bool_],
     settings: CornerSettings,
 ) -> list[CornerFault | None]:
-    beside = np.zeros(edges.shape, dtype=bool) if len(prediction.layout.edges) == 0 else _seen_beside(prediction, consensus, edges, settings.neighbourhood)
+    beside = (
+        np.zeros(edges.shape, dtype=bool)
+        if len(prediction.layout.edges) == 0
+        else _seen_beside(prediction, consensus, edges, settings.neighbourhood)
+    )
     inside = np.isfinite(prediction.corners_uv_px).all(axis=1)
     sampled = (edges >= 0) & np.isfinite(prediction.line_origin[edges, 0])
     out: list[CornerFault | None] = []

@@ -191,7 +191,7 @@ class FingertipMeter:
             if moved_px <= self._settings.relinearise_px:
                 break
         corners = intersect_edges(candidates, prediction, consensus, self._topology, self._settings.corners)
-        inflation = noise_inflation(candidates, prediction, weights, consensus)
+        inflation = noise_inflation(candidates, prediction, consensus)
         return Measurement(
             prediction,
             candidates,
@@ -215,7 +215,9 @@ class FingertipMeter:
         prior_mean = self._prior_mean(prediction, expected)
         starts = grid_of_starts(prediction, settings.sampling.reach_px, settings.consensus.start_width_px)
         starts = starts + self._from_prediction(prediction, expected)
-        consensus = agree_from_grid(candidates, prediction, weights, starts, prior_mean, self._prior, settings.consensus)
+        consensus = agree_from_grid(
+            candidates, prediction, weights, starts, prior_mean, self._prior, settings.consensus
+        )
         return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
@@ -260,8 +262,8 @@ class FingertipMeter:
         profiles = read_profiles(image, prediction.map_x, prediction.map_y)
         noise = estimate_noise(profiles, quantum(image))
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges)
-        gripper, floor_px = self._gripper, settings.consensus.point_floor_px
-        return candidates, base_weights(candidates, prediction, gripper.edge_polarity, gripper.edge_bevel_m, floor_px)
+        polarity, bevel_m = self._gripper.edge_polarity, self._gripper.edge_bevel_m
+        return candidates, base_weights(candidates, prediction, polarity, bevel_m, settings.consensus)
 
     def _jaw_surprise(self, prediction: Prediction, xi: Array, prior_mean: Array) -> float:
         """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a jaw."""

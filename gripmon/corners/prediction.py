@@ -7,6 +7,7 @@ fraction of a pixel: in a standing scene they are computed once.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import msgspec
@@ -24,9 +25,16 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     """Where the image is sampled around the predicted edges."""
 
     samples: Annotated[int, Meta(ge=24, le=4096, description="profiles over all edges together")] = 320
-    reach_px: Annotated[float, Meta(ge=2.0, le=40.0, description="how far each profile reaches to both sides (px)")] = 7.0
+    reach_px: Annotated[float, Meta(ge=2.0, le=40.0, description="how far each profile reaches to both sides (px)")] = (
+        7.0
+    )
     end_margin_px: Annotated[
-        float, Meta(ge=0.0, le=40.0, description="part of an edge at each end that is left out: the neighbour edge shows there (px)")
+        float,
+        Meta(
+            ge=0.0,
+            le=40.0,
+            description="part of an edge at each end that is left out: the neighbour edge shows there (px)",
+        ),
     ] = 4.0
     creases: Annotated[bool, Meta(description="use edges between two visible faces too; bevels shift them")] = False
 
@@ -55,7 +63,7 @@ class EdgeLayout:
     inside_point_m: Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Prediction:
     """The predicted edges at one pose; n samples, v visible edges, c corners.
 
@@ -89,12 +97,19 @@ class Prediction:
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
 
+    @cached_property
+    def pixels_per_m(self) -> float:
+        """Scale of the image at the gripper: median over the edge points, across their edges (px/m)."""
+        return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
+
     def moved_px(self, xi: Array) -> float:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the linearisation pose."""
         return float(np.abs(self.jacobian[:, : len(xi)] @ xi).max(initial=0.0))
 
 
-def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings) -> EdgeLayout:
+def lay_out(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings
+) -> EdgeLayout:
     """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its length."""
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
@@ -102,10 +117,15 @@ def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: 
     start, end = points_cam_m[gripper.edge_points[:, 0]], points_cam_m[gripper.edge_points[:, 1]]
     wanted = view.visible & (settings.creases | ~view.crease)
     coarse = np.linspace(0.0, 1.0, 65)
-    uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(-1, 65, 2)
+    uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(
+        -1, 65, 2
+    )
     inside = _inside(camera, uv, settings.reach_px)
     step_px = np.linalg.norm(np.diff(uv, axis=1), axis=2)
-    ranges = [_sampled_range(coarse, inside[e], step_px[e], settings.end_margin_px) if wanted[e] else None for e in range(len(uv))]
+    ranges = [
+        _sampled_range(coarse, inside[e], step_px[e], settings.end_margin_px) if wanted[e] else None
+        for e in range(len(uv))
+    ]
     lengths = np.array([r[2] if r else 0.0 for r in ranges])
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:

@@ -107,7 +107,9 @@ def _kernel(samples: int, blur_px: float) -> _Kernel:
     response_noise = float(np.sqrt((effective**2).sum()))
     # A step blurred by the lens (about 0.6 px) answers with a Gaussian of this width; its peak moves by noise' / curvature.
     width_squared = blur_px**2 + 0.6**2
-    return _Kernel(matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared)
+    return _Kernel(
+        matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared
+    )
 
 
 def response_matrix(samples: int, blur_px: float) -> NDArray[np.float32]:

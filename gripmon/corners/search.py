@@ -27,12 +27,19 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """How far around the prediction a lost gripper is looked for."""
 
     reach_m: Annotated[
-        float, Meta(ge=0.0, le=0.1, description="shift of the TCP across the optical axis, and along it, that is searched (m)")
+        float,
+        Meta(
+            ge=0.0, le=0.1, description="shift of the TCP across the optical axis, and along it, that is searched (m)"
+        ),
     ] = 0.012
-    turn_rad: Annotated[float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")] = 0.08
+    turn_rad: Annotated[
+        float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")
+    ] = 0.08
     coarse_columns: Annotated[int, Meta(ge=64, le=1024, description="width of the reduced image (columns)")] = 192
     starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 10
-    eager_frames: Annotated[int, Meta(ge=1, le=1000, description="search in so many frames right after the gripper was lost")] = 4
+    eager_frames: Annotated[
+        int, Meta(ge=1, le=1000, description="search in so many frames right after the gripper was lost")
+    ] = 4
     patient_every: Annotated[int, Meta(ge=1, le=1000, description="later, search in one of so many frames")] = 6
 
 
@@ -49,8 +56,7 @@ def search_starts(image: Image, prediction: Prediction, settings: SearchSettings
     factor = max(1.0, image.shape[1] / settings.coarse_columns)
     answers = _edge_answers(image, factor)
     depth = float(prediction.corners_cam_m[:, 2].mean())
-    pixels_per_m = _pixels_per_m(prediction)
-    reach = math.ceil(settings.reach_m * pixels_per_m / factor)
+    reach = math.ceil(settings.reach_m * prediction.pixels_per_m / factor)
     centre = prediction.uv_px[points].mean(axis=0)
     spread_px = float(np.abs(prediction.uv_px[points] - centre).max())
     turns = _ticks(settings.turn_rad, 1.5 * factor / spread_px)
@@ -73,10 +79,6 @@ def search_starts(image: Image, prediction: Prediction, settings: SearchSettings
 def _ticks(reach: float, step: float) -> list[float]:
     count = math.ceil(reach / step) if reach > 0.0 else 0
     return [reach * k / count for k in range(-count, count + 1)] if count else [0.0]
-
-
-def _pixels_per_m(prediction: Prediction) -> float:
-    return float(np.median(np.sqrt(np.einsum("ni,ni->n", prediction.jacobian[:, :3], prediction.jacobian[:, :3]))))
 
 
 def _shift_of_tcp(
@@ -130,7 +132,9 @@ def _votes(
     # Pixel centres are integers in both images.
     places = ((1.0 + scale) * arms @ rotation.T + centre + 0.5) / factor - 0.5
     normals = prediction.normal[points] @ rotation.T
-    orientation = np.round(np.arctan2(normals[:, 1], normals[:, 0]) / math.pi * _ORIENTATIONS).astype(int) % _ORIENTATIONS
+    orientation = (
+        np.round(np.arctan2(normals[:, 1], normals[:, 0]) / math.pi * _ORIENTATIONS).astype(int) % _ORIENTATIONS
+    )
     height, width = answers.shape[1:]
     column, row = np.round(places).astype(int).T
     votes = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
