@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
+from loopback import WAIT_S, state_record
 from stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
 
-from gripmon.daemon import DaemonSettings, log_to_stderr, run
+from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
 from gripmon.geometry import make_transform, to_record
 from gripmon.publish import PublishSettings, ZenohPublisher
 
@@ -23,15 +25,22 @@ if __name__ == "__main__":
     endpoint, kind, *rest = sys.argv[1:]
     log_to_stderr()
     transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
-    sys.exit(
-        run(
-            ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
-            TickingSource(FRAMES_PER_S) if kind == "ticking" else SilentSource(FRAMES_PER_S),
-            ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist"),
-            Listener(),
-            DaemonSettings(no_camera_alert_after_s=0.5),
-            robot="arm",
-            camera="wrist",
-            estimates=Path(rest[0]) if rest else None,
+    with sigterm_exits():
+        publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+        if kind == "forgetful":
+            raise SystemExit(5)  # without closing the publisher
+        if kind == "starting":
+            publisher.state(state_record())
+            time.sleep(WAIT_S)
+        sys.exit(
+            run(
+                ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
+                TickingSource(FRAMES_PER_S) if kind == "ticking" else SilentSource(FRAMES_PER_S),
+                publisher,
+                Listener(),
+                DaemonSettings(no_camera_alert_after_s=0.5),
+                robot="arm",
+                camera="wrist",
+                estimates=Path(rest[0]) if rest else None,
+            )
         )
-    )

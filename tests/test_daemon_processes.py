@@ -105,7 +105,10 @@ def test_a_signal_ends_it_with_everything_closed(
         with plain_session(connect=endpoint) as session:
             tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
             assert tokens.recv().kind == zenoh.SampleKind.PUT
-            wait_until(lambda: kind == "silent" or any(s["frames"] for s in ask(session, f"{PREFIX}/state")), "a frame")
+            expected = {"ticking": lambda state: state["frames"], "silent": lambda state: state["state"] == "stale"}[
+                kind
+            ]
+            wait_until(lambda: any(expected(state) for state in ask(session, f"{PREFIX}/state")), "the loop to run")
             process.send_signal(number)
             assert process.wait(WAIT_S) == code
             assert tokens.recv().kind == zenoh.SampleKind.DELETE
@@ -115,6 +118,19 @@ def test_a_signal_ends_it_with_everything_closed(
     assert f"stopped after {len(frames)} frames" in last
     assert [frame["seq"] for frame in frames] == list(range(len(frames)))
     wait_until(lambda: can_bind(endpoint), "the port to be free")
+
+
+def test_sigterm_before_the_loop_runs_ends_it_too(endpoint: str):
+    with daemon(endpoint, "starting") as process:
+        wait_until(lambda: ask_in_another_session(endpoint, f"{PREFIX}/state"), "the start-up to be under way")
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(WAIT_S) == 0
+
+
+def test_a_process_that_forgets_to_close_its_publisher_ends(endpoint: str):
+    command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, "forgetful"]
+    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    assert subprocess.run(command, timeout=WAIT_S, env=environment).returncode == 5
 
 
 def test_a_missing_camera_is_said_on_the_network(endpoint: str):

@@ -80,7 +80,7 @@ def run_daemon(
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
     monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
-    with contextlib.ExitStack() as opened:
+    with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
         publisher, jaw = _open_publisher(config)
         opened.callback(publisher.close)
         on_network()

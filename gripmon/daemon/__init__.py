@@ -13,7 +13,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
 
@@ -36,6 +36,7 @@ __all__ = [
     "StopRequest",
     "log_to_stderr",
     "run",
+    "sigterm_exits",
 ]
 
 EXIT_INTERRUPTED = 130
@@ -90,6 +91,17 @@ def log_to_stderr(*, verbose: bool = False) -> None:
     logger.propagate = False
 
 
+@contextlib.contextmanager
+def sigterm_exits() -> Iterator[None]:
+    """Around the start-up before :func:`run`: SIGTERM then closes what is open, as Ctrl-C does, with exit code 0."""
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        raise SystemExit(EXIT_DONE)
+
+    with _handling({signal.SIGTERM: handle}):
+        yield
+
+
 def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
     if stop.requested_s is None:
         return _UNHURRIED_S
@@ -98,20 +110,27 @@ def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
 
 @contextlib.contextmanager
 def _signals(stop: StopRequest) -> Iterator[None]:
-    """SIGINT and SIGTERM ask for a stop.  Python allows that in the main thread only; elsewhere they are left alone."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+    """SIGINT and SIGTERM ask for a stop."""
 
     def handle(number: int, frame: FrameType | None) -> None:
         stop.request(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_DONE)
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    with _handling({signal.SIGINT: handle, signal.SIGTERM: handle}):
+        yield
+
+
+@contextlib.contextmanager
+def _handling(handlers: dict[signal.Signals, Callable[[int, FrameType | None], None]]) -> Iterator[None]:
+    """Handlers for a while.  Python allows that in the main thread only; elsewhere signals are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
     try:
         yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, former in before.items():
+            signal.signal(number, former)
 
 
 @contextlib.contextmanager

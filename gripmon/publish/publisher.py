@@ -191,7 +191,9 @@ class _LastValue:
         self._key = key
         self._last: bytes | None = None
         self._publisher = _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1)
-        self._queryable = session.declare_queryable(key, self._answer, complete=True)
+        # Answered in Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        answer = zenoh.handlers.Callback(self._answer, indirect=False)
+        self._queryable = session.declare_queryable(key, answer, complete=True)
 
     def put(self, payload: bytes) -> None:
         self._last = payload
