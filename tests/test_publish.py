@@ -139,7 +139,7 @@ def test_a_port_that_is_taken_is_said_with_its_key(publisher: ZenohPublisher, en
 
 
 def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str):
-    settings = PublishSettings(mode="client", connect=(endpoint,), retry_first_s=0.02, retry_max_s=0.1)
+    settings = PublishSettings(mode="client", connect=(endpoint,), retry_first_s=0.02, retry_longest_s=0.1)
     publisher = ZenohPublisher(settings, "arm", "wrist")
     try:
         assert not publisher.connected

@@ -157,7 +157,7 @@ class ZenohPublisher:
                     _log.warning("no Zenoh session yet, trying again: %s", text)
                     said = text
                 self._closing.wait(pause_s)
-                pause_s = min(2.0 * pause_s, self._settings.retry_max_s)
+                pause_s = min(2.0 * pause_s, self._settings.retry_longest_s)
                 continue
             if self._closing.is_set():
                 session.close()

@@ -40,7 +40,7 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     retry_first_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="client without a router: first pause before the next attempt (s)")
     ] = 0.25
-    retry_max_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 8.0
+    retry_longest_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 8.0
     jaw_max_age_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="a jaw opening received longer ago than this is not used (s)")
     ] = 1.0
