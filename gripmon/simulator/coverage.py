@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,6 +28,8 @@ _STEP_SIGMAS = 1.6
 _GAUSS_POINTS = 0.5 + np.array([-0.5, 0.5]) / math.sqrt(3.0)
 _VIEW_MARGIN = 1.06
 _FARTHEST_IDEAL = 100.0
+_OUTSIDE_PX = 16.0
+_PROBES = 8
 
 Mask = NDArray[np.float32]
 
@@ -45,7 +48,7 @@ class CoverageRaster:
 
     def __init__(self, camera: Camera, psf_sigma_px: float) -> None:
         self._camera = camera
-        self._step_px = _STEP_SIGMAS * psf_sigma_px / _magnification(camera)
+        self._step_px = _STEP_SIGMAS * psf_sigma_px
         self._radius = _lens_radius(camera)
         self._reach = math.ceil(0.5 + _REACH_SIGMAS * psf_sigma_px)
         self._rows, self._columns = _kernel_tables(psf_sigma_px, self._reach)
@@ -84,9 +87,11 @@ class CoverageRaster:
         np.multiply((weights_v * dy[:, None])[:, :, None], weights_u[:, None, :], out=what)
         rows = bottom - top + 2 * pad
         slopes = np.bincount(where.ravel(), what.ravel(), minlength=rows * stride).reshape(rows, stride)
-        inside = slopes[pad : rows - pad, : stride - pad]
-        np.cumsum(inside, axis=1, out=inside)
-        return Coverage(left, top, inside[:, pad:].astype(np.float32))
+        # Running sums along the rows, by way of sums over rectangles: much faster than a cumulative sum.
+        sums = np.asarray(cv2.integral(slopes))[pad : rows - pad + 1, pad + 1 : stride - pad + 1]
+        mask = np.empty((bottom - top, right - left), np.float32)
+        np.subtract(sums[1:], sums[:-1], out=mask)
+        return Coverage(left, top, mask)
 
     def _scratch(self, count: int) -> tuple[NDArray[np.intp], Array]:
         """Index and weight arrays (count, rows, columns) of patches; kept: fresh memory costs more than the sums."""
@@ -113,13 +118,7 @@ def _kernel_tables(sigma_px: float, reach: int) -> tuple[Array, Array]:
 
 def _view_planes(camera: Camera) -> Array:
     """Planes (p, 3) through the camera's centre, ``a·X >= 0`` inside: a convex cone, a little wider than the view."""
-    u, v = camera.width_px - 0.5, camera.height_px - 0.5
-    share = np.linspace(0.0, 1.0, 49)[:-1]
-    zero, one = np.zeros_like(share), np.ones_like(share)
-    sides = ((share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share))
-    border = np.concatenate([np.stack(side, axis=1) for side in sides])
-    xy = camera.undistort(border * (u + 0.5, v + 0.5) - 0.5)
-    xy = xy[np.isfinite(xy).all(axis=1)]
+    xy = _view_border(camera)
     centre = 0.5 * (xy.min(axis=0) + xy.max(axis=0))
     angle = np.linspace(0.0, 2.0 * np.pi, 17)[:-1]
     directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -128,25 +127,38 @@ def _view_planes(camera: Camera) -> Array:
     return np.column_stack([-directions, support + directions @ centre])
 
 
-def _magnification(camera: Camera) -> float:
-    """Largest scale of the lens in the image: how much longer than f times its ideal length a short line can appear."""
-    u, v = np.meshgrid(np.linspace(0, camera.width_px - 1, 17), np.linspace(0, camera.height_px - 1, 17))
-    _, d_xy_d_uv = camera.undistort_with_jacobian(np.stack([u.ravel(), v.ravel()], axis=1))
-    inverse = d_xy_d_uv[np.isfinite(d_xy_d_uv).all(axis=(1, 2))] * max(camera.fx_px, camera.fy_px)
-    return max(1.0, 1.0 / float(np.linalg.svd(inverse, compute_uv=False).min()))
+def _view_border(camera: Camera) -> Array:
+    """Ideal coordinates (n, 2) of the image's border, as far as the lens sees it."""
+    share = np.linspace(0.0, 1.0, 49)[:-1]
+    zero, one = np.zeros_like(share), np.ones_like(share)
+    sides = ((share, zero), (one, share), (1.0 - share, one), (zero, 1.0 - share))
+    border = np.concatenate([np.stack(side, axis=1) for side in sides])
+    xy = camera.undistort(border * (camera.width_px, camera.height_px) - 0.5)
+    return xy[np.isfinite(xy).all(axis=1)]
 
 
 def _lens_radius(camera: Camera) -> float:
-    """Ideal radius up to which the lens model holds in all directions; infinite if it does everywhere."""
+    """Ideal radius up to which outlines are followed: the end of the lens model, or earlier, just outside the image.
+
+    Infinite for a model without end.  A model stretches without bounds towards its end: hence not further than needed.
+    """
     turn = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
     ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    good, bad = 0.0, _FARTHEST_IDEAL
-    if np.isfinite(camera.distort(bad * ring)).all():
+    centre = np.array([camera.cx_px, camera.cy_px])
+    corner = np.maximum(centre, np.array([camera.width_px, camera.height_px]) - 1.0 - centre)
+    enough_px = float(np.hypot(*corner)) + _OUTSIDE_PX
+
+    def within(radius: float) -> bool:
+        reach = np.hypot(*(camera.distort(radius * ring) - centre).T)
+        return bool(np.isfinite(reach).all() and reach.min() < enough_px)
+
+    if np.isfinite(camera.distort(_FARTHEST_IDEAL * ring)).all():
         return math.inf
+    good, bad = 0.0, _FARTHEST_IDEAL
     for _ in range(60):
         middle = 0.5 * (good + bad)
-        good, bad = (middle, bad) if np.isfinite(camera.distort(middle * ring)).all() else (good, middle)
-    return good * (1.0 - 1e-7)  # the last bisection step and rounding stay inside
+        good, bad = (middle, bad) if within(middle) else (good, middle)
+    return good * (1.0 - 1e-7)
 
 
 def _clip(polygon: Array, planes: Array) -> Array:
@@ -185,16 +197,12 @@ def _trace(camera: Camera, loops: list[Array], step_px: float, radius: float) ->
     starts = np.concatenate([loops[k] for k in visible])
     ends = np.concatenate([np.roll(loops[k], -1, axis=0) for k in visible])
     a, b = starts[:, :2] / starts[:, 2:], ends[:, :2] / ends[:, 2:]
-    focal = np.array([camera.fx_px, camera.fy_px])
-    counts = np.ceil(np.linalg.norm((b - a) * focal, axis=1) / step_px).astype(np.intp) + 1
+    counts = _piece_counts(camera, a, b, step_px, radius)
     nodes = counts + 1
     edge = np.repeat(np.arange(len(a)), nodes)
     index = np.arange(len(edge)) - np.repeat(np.cumsum(nodes) - nodes, nodes)
     share = (index / counts[edge])[:, None]
-    xy = a[edge] + share * (b - a)[edge]
-    if math.isfinite(radius):  # what lies beyond the lens stays beyond the image, at the end of the lens
-        xy *= np.minimum(1.0, radius / np.maximum(np.hypot(xy[:, 0], xy[:, 1]), radius))[:, None]
-    uv = camera.distort(xy)
+    uv = _distort(camera, a[edge] + share * (b - a)[edge], radius)
     pieces = np.flatnonzero(index[1:] > 0)
     begin, extent = uv[pieces], uv[pieces + 1] - uv[pieces]
     points = (begin[:, None] + _GAUSS_POINTS[:, None] * extent[:, None]).reshape(-1, 2)
@@ -204,3 +212,19 @@ def _trace(camera: Camera, loops: list[Array], step_px: float, radius: float) ->
     for k, end, size in zip(visible, limits.tolist(), loop_pieces.tolist(), strict=True):
         out[k] = (points[end - size : end], dy[end - size : end])
     return out
+
+
+def _piece_counts(camera: Camera, a: Array, b: Array, step_px: float, radius: float) -> NDArray[np.intp]:
+    """Into how many pieces (e,) the lines from a to b (e, 2) have to be cut, so that none is longer than the step."""
+    share = np.linspace(0.0, 1.0, _PROBES + 1)[None, :, None]
+    probes = a[:, None] + share * (b - a)[:, None]
+    uv = _distort(camera, probes.reshape(-1, 2), radius).reshape(len(a), _PROBES + 1, 2)
+    longest = np.linalg.norm(np.diff(uv, axis=1), axis=2).max(axis=1)
+    return np.ceil(longest * (_PROBES / step_px)).astype(np.intp) + 1
+
+
+def _distort(camera: Camera, xy: Array, radius: float) -> Array:
+    """Ideal points (n, 2) -> pixels; what lies beyond the radius goes to it, which is still outside the image."""
+    if math.isfinite(radius):
+        xy = xy * np.minimum(1.0, radius / np.maximum(np.hypot(xy[:, 0], xy[:, 1]), radius))[:, None]
+    return camera.distort(xy)
