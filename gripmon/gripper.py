@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from gripmon.records import Array
 
 LARGEST_EXTENT_M = 1.0
+LARGEST_WARP_M = 5e-4
 SMALLEST_SPREAD_RATIO = 0.02
 
 _T = TypeVar("_T")
@@ -124,6 +125,7 @@ class Gripper:
                 )
         self.point_finger = np.array([finger_index[p.finger] for p in model.points.values()], dtype=np.intp)
         self._nominal_points_m = np.array([p.xyz_m for p in model.points.values()], dtype=float).reshape(-1, 3)
+        self._check_places()
         self.corner_points = np.flatnonzero([p.corner for p in model.points.values()])
         self.corner_ids = tuple(self.point_ids[i] for i in self.corner_points)
         self.edge_points = np.array([self._ends(n, e) for n, e in model.edges.items()], dtype=np.intp).reshape(-1, 2)
@@ -132,11 +134,13 @@ class Gripper:
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
         self.faces = tuple(self._face(i, f, finger_index) for i, f in enumerate(model.faces))
-        self._face_first = np.array([f.points[:3] for f in self.faces], dtype=np.intp).reshape(-1, 3)
+        self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._corner_faces = self._adjacency()
         jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
         self.has_jaw = model.jaw is not None
         self.jaw_nominal_m, self.jaw_min_m, self.jaw_max_m = jaw.nominal_m, jaw.min_m, jaw.max_m
+        if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
+            raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
         self._motion = [self._finger_motion(n, f.motion) for n, f in model.fingers.items()]
         self._check()
 
@@ -213,7 +217,19 @@ class Gripper:
             raise GripperError(
                 f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside"
             )
+        off_m = np.abs((corners - corners.mean(axis=0)) @ _normal(corners)).max() / np.linalg.norm(_normal(corners))
+        if not off_m <= LARGEST_WARP_M:
+            raise GripperError(
+                f"faces[{index}].points: {1e3 * off_m:.1f} mm off a plane; points in one plane (or several faces)"
+            )
         return FaceLoop(finger_index[face.finger], loop)
+
+    def _spanning(self, face: FaceLoop) -> NDArray[np.intp]:
+        """Three consecutive points (3,) of a face that tell its plane best: others may lie on a straight line."""
+        loop = self._nominal_points_m[face.points]
+        ahead, behind = np.roll(loop, -1, axis=0) - loop, np.roll(loop, 1, axis=0) - loop
+        best = int(np.argmax(np.cross(ahead, behind) @ _normal(loop)))
+        return np.roll(face.points, 1 - best)[:3]
 
     def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
         """Faces at each edge (e, 2), -1 for none, and whether a face touches a corner (c, f)."""
@@ -231,7 +247,7 @@ class Gripper:
         """(f + 1,) which faces look at the eye; the last is False and stands for "no face" (index -1)."""
         out = np.zeros(len(self.faces) + 1, dtype=bool)
         if self.faces:
-            first = points_grip_m[self._face_first]
+            first = points_grip_m[self._face_span]
             normals = np.cross(first[:, 1] - first[:, 0], first[:, 2] - first[:, 0])
             np.greater(np.einsum("ij,ij->i", normals, eye_grip_m - first[:, 0]), 0.0, out=out[:-1])
         return out
@@ -245,11 +261,15 @@ class Gripper:
             raise GripperError(f"{key}: the gripper has no jaw; a section `jaw` with nominal_m, min_m, max_m")
         if set(motion) == {"axis"}:
             axis = np.array(_convert(motion, AxisMotion, key).axis)
+            if not np.isfinite(axis).all():
+                raise GripperError(f"{key}.axis: holds a value that is not finite; three ordinary numbers")
             ends = np.array([self.jaw_min_m, self.jaw_max_m])
             return np.column_stack([ends, (ends - self.jaw_nominal_m)[:, None] * axis])
         if set(motion) != {"table"}:
             raise GripperError(f"{key}: has the keys {', '.join(motion) or 'none'}; either `axis` or `table`")
         table = np.array(_convert(motion, TableMotion, key).table)
+        if not np.isfinite(table).all():
+            raise GripperError(f"{key}.table: holds a value that is not finite; ordinary numbers")
         if not (np.diff(table[:, 0]) > 0.0).all():
             raise GripperError(f"{key}.table: openings don't ascend; rows sorted by opening_m")
         if table[0, 0] > self.jaw_min_m + 1e-9 or table[-1, 0] < self.jaw_max_m - 1e-9:
@@ -261,15 +281,19 @@ class Gripper:
     def _finger_offsets_m(self, jaw_opening_m: float) -> Array:
         return np.array([_interpolate(table, jaw_opening_m) for table in self._motion])
 
-    def _check(self) -> None:
-        if not self.finger_ids:
-            raise GripperError("fingers: there are none; at least one finger")
-        if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
-            raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
+    def _check_places(self) -> None:
+        strange = ~np.isfinite(self._nominal_points_m).all(axis=1)
+        if strange.any():
+            name = self.point_ids[int(strange.argmax())]
+            raise GripperError(f"points.{name}.xyz_m: holds a value that is not finite; three ordinary numbers")
         far = np.abs(self._nominal_points_m).max(axis=1, initial=0.0)
         if far.max(initial=0.0) > LARGEST_EXTENT_M:
             name = self.point_ids[int(far.argmax())]
             raise GripperError(f"points.{name}.xyz_m: {far.max():g} m from the TCP; metres (millimetres were meant?)")
+
+    def _check(self) -> None:
+        if not self.finger_ids:
+            raise GripperError("fingers: there are none; at least one finger")
         corners = self._nominal_points_m[self.corner_points]
         if len(corners) < 3:
             raise GripperError(
