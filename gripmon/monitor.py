@@ -50,7 +50,7 @@ USUAL_SHARE = 0.8
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
 
-SATISFIED = 0.8
+SATISFIED = 0.65
 """Part of the usual share below which the gripper is looked for elsewhere, too."""
 
 JAW_SURPRISE = 5.0
@@ -97,7 +97,8 @@ class Monitor:
         self._measured_s = 0.0
         self._stamp_s: float | None = None
         self._usual_share = USUAL_SHARE
-        self._dissatisfied = 0
+        self._credit = float(settings.corners.search.eager_frames)
+        self._untrusted = 0
         self._newest: Measurement | None = None
 
     @property
@@ -146,21 +147,28 @@ class Monitor:
         return self._stamp_s
 
     def _measure(self, frame: Frame) -> Measurement:
-        """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually."""
+        """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually.
+
+        Looking further takes the time of many frames, so it is paid from a credit that satisfying frames refill slowly; a gripper that is
+        lost altogether is searched for all the same, in one of several frames.
+        """
         search = self._settings.corners.search
-        eager = self._dissatisfied < search.eager_frames or self._dissatisfied % search.patient_every == 0
         reported_m = frame.jaw_opening_m
         assert frame.image is not None
+        patient = self._untrusted > 0 and self._untrusted % search.patient_every == 0
         measurement = self._meter.measure(
             frame.image,
             self._cam_T_grip,
             self._jaw_opening_m if reported_m is None else reported_m,
             SATISFIED * self._usual_share,
-            Effort.SEARCH if eager else Effort.GRID,
+            Effort.SEARCH if self._credit >= 1.0 or patient else Effort.NARROW,
             jaw_reported=reported_m is not None,
         )
         share = measurement.consensus.share
-        self._dissatisfied = self._dissatisfied + 1 if share < SATISFIED * self._usual_share else 0
+        self._credit = max(self._credit - 1.0, 0.0) if measurement.looked_far else self._credit
+        if share >= SATISFIED * self._usual_share:
+            self._credit = min(self._credit + 1.0 / search.refill_frames, float(search.eager_frames))
+        self._untrusted = 0 if measurement.trusted else self._untrusted + 1
         if measurement.trusted:
             self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         return measurement
@@ -188,10 +196,10 @@ class Monitor:
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
         drift = self._drift()
         # Motion that the profiles can follow from frame to frame is no jump.
-        moved_px = measurement.prediction.moved_px(perturbation_between(before_T, self._cam_T_grip))
-        jumped = moved_px > self._settings.corners.sampling.reach_px
-        cause = self._cause(measurement) if jumped or self._policy.test.suspicious else Cause.UNKNOWN
-        sigma = np.sqrt(np.diag(self._covariance))
+        looked_far = measurement.effort is not Effort.NARROW
+        jumped = looked_far and self._meter.moved_px(measurement, before_T) > self._settings.corners.sampling.reach_px
+        cause = self._cause(measurement) if jumped or self._policy.wants_cause else Cause.UNKNOWN
+        sigma = np.sqrt(self._covariance.diagonal())
         return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause)
 
     def _drift(self) -> Drift:

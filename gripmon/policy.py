@@ -113,11 +113,16 @@ class DriftTest:
     def add(self, shift: Array, sigma: Array) -> bool:
         """One frame's shift against the reference (6,) and its standard deviations; True while a drift is established."""
         gain = self._smallest / sigma**2
-        evidence = np.stack([gain * (shift - 0.5 * self._smallest), gain * (-shift - 0.5 * self._smallest)])
+        centred, half = gain * shift, 0.5 * gain * self._smallest
         # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
         limit = 0.2 * self.threshold
-        self._sums = np.clip(self._sums + np.clip(evidence, -limit, limit), 0.0, self.threshold)
-        return bool((self._sums >= self.threshold).any())
+        for sums, evidence in ((self._sums[0], centred - half), (self._sums[1], -centred - half)):
+            np.maximum(evidence, -limit, out=evidence)
+            np.minimum(evidence, limit, out=evidence)
+            sums += evidence
+        np.maximum(self._sums, 0.0, out=self._sums)
+        np.minimum(self._sums, self.threshold, out=self._sums)
+        return float(self._sums.max()) >= self.threshold
 
     @property
     def suspicious(self) -> bool:
@@ -179,6 +184,11 @@ class Policy:
         self.test.reset()
         self._drift_alerted = False
         return Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.WARNING, text)
+
+    @property
+    def wants_cause(self) -> bool:
+        """Whether the next judgement may have to name the cause of a drift."""
+        return not self._drift_alerted and self.test.suspicious
 
     def unmeasured(self, stamp_s: float, refusal: str | None, has_transform: bool) -> Judgement:
         """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper isn't seen in it."""

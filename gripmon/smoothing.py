@@ -11,6 +11,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
+from scipy.linalg.lapack import dposv
 
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array
@@ -59,15 +60,20 @@ class PoseAverage:
             return
         innovation = perturbation_between(self.cam_T_grip, cam_T_grip)
         # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
-        both = np.linalg.solve(self.covariance + covariance, np.column_stack([self.covariance, innovation]))
+        sides = np.empty((6, 7))
+        sides[:, :6], sides[:, 6] = self.covariance, innovation
+        _, both, failed = dposv(self.covariance + covariance, sides)
+        if failed:
+            raise ValueError("a covariance that is not positive definite")
         if float(innovation @ both[:, 6]) > GATE:
             self._suspicions += 1
             if self._suspicions >= 2:
                 self._restart(cam_T_grip, covariance)
             return
         self._suspicions = 0
-        self.cam_T_grip = perturb(self.cam_T_grip, both[:, :6].T @ innovation)
-        self.covariance = self.covariance - both[:, :6].T @ self.covariance
+        gain = both[:, :6].T
+        self.cam_T_grip = perturb(self.cam_T_grip, gain @ innovation)
+        self.covariance = self.covariance - gain @ self.covariance
         self.covariance = 0.5 * (self.covariance + self.covariance.T)
 
     def _restart(self, cam_T_grip: Array, covariance: Array) -> None:

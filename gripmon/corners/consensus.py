@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
@@ -64,11 +65,10 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 GATE_PX = 0.5
 """A profile supports a fit if a candidate lies this close to it."""
 
-STRETCH = 10
-"""Neighbouring profiles of an edge whose errors are taken together."""
-
 _TUKEY = 4.685
 _LARGEST_SCALE_PX = 0.5
+_ROUNDS = 6
+_CONVERGED = 1e-3  # squared step over its covariance: three hundredths of a standard deviation
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ class Consensus:
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in 1/px², zero for
     those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper
-    ``edge_share`` (e,) share of its profiles that agree, NaN where it is not sampled, and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring profiles in which
+    ``edge_share`` (e,) share of its profiles that agree and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring profiles in which
     both agree, on edges that are seen; zero with fewer than three such edges.
     """
 
@@ -132,22 +132,22 @@ def agree(
     ``weights`` (k,) from :func:`base_weights`; ``prior`` (m,) holds each unknown at ``prior_mean`` by that much (1/m², 1/rad²), as
     a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
-    jacobian = np.ascontiguousarray(prediction.jacobian[candidates.sample].T)
+    jacobian = prediction.jacobian_by_unknown[:, candidates.sample]
     offset = candidates.offset_px
+    active = None if weights.all() else weights > 0.0
     xi = start
-    width = settings.start_width_px
-    scale = _LARGEST_SCALE_PX
-    for round_ in range(5):
-        residual = offset - xi @ jacobian
-        if round_ >= 2:
-            scale = _scale(residual, weights, width, settings.point_floor_px)
-            width = min(_TUKEY * scale, settings.start_width_px)
-        elif round_ == 1:
-            width = 0.5 * settings.start_width_px
+    residual = offset - xi @ jacobian
+    width, scale = settings.start_width_px, _LARGEST_SCALE_PX
+    for round_ in range(_ROUNDS):
+        if round_:
+            scale = _scale(residual, active, width, settings.point_floor_px)
+            width = min(_TUKEY * scale, width)
         step, information, weight = _step(jacobian, residual, weights, width, prior_mean - xi, prior)
         xi = xi + step
-    residual = offset - xi @ jacobian
-    return _judge(candidates, prediction, weights, xi, weight, residual, information, scale, settings)
+        residual = offset - xi @ jacobian
+        if round_ >= 2 and step @ information @ step < _CONVERGED:
+            break
+    return _judge(candidates, prediction, active, xi, weight, residual, information, scale, settings)
 
 
 def agree_from_grid(
@@ -203,7 +203,9 @@ def _step(
     information = weighted @ jacobian.T
     normal = information.copy()
     normal.flat[:: len(normal) + 1] += prior
-    step = np.linalg.solve(normal, weighted @ residual + prior * to_prior)
+    _, step, failed = dposv(normal, weighted @ residual + prior * to_prior)
+    if failed:
+        raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
     return step, information, weight
 
 
@@ -215,11 +217,7 @@ def noise_inflation(candidates: Candidates, prediction: Prediction, consensus: C
     means add up to the number of stretches less the number of unknowns.
     """
     inlier = np.flatnonzero(consensus.weight)
-    sample = candidates.sample[inlier]
-    stretch = sample // STRETCH
-    edge_starts = np.zeros(len(prediction.uv_px), dtype=np.intp)
-    edge_starts[prediction.layout.first[1:]] = 1
-    stretch = stretch + np.cumsum(edge_starts)[sample]
+    stretch = prediction.layout.stretch[candidates.sample[inlier]]
     weight = consensus.weight[inlier]
     total = np.bincount(stretch, weight)
     moment = np.bincount(stretch, weight * consensus.residual_px[inlier])
@@ -240,19 +238,20 @@ def prior_information(jaw_sigma_m: float | None) -> Array:
     return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
 
 
-def _scale(residual: Array, weights: Array, width: float, floor_px: float) -> float:
+def _scale(residual: Array, active: NDArray[np.bool_] | None, width: float, floor_px: float) -> float:
     """Robust standard deviation (px) of the residuals inside the present width: 1.4826 times their median size."""
-    size = np.abs(residual[weights > 0.0])
+    size = np.abs(residual if active is None else residual[active])
     size = size[size < width]
     if len(size) < 12:
         return _LARGEST_SCALE_PX
-    return float(min(max(1.4826 * np.partition(size, len(size) // 2)[len(size) // 2], floor_px), _LARGEST_SCALE_PX))
+    middle = len(size) // 2
+    return min(max(1.4826 * float(np.partition(size, middle)[middle]), floor_px), _LARGEST_SCALE_PX)
 
 
 def _judge(
     candidates: Candidates,
     prediction: Prediction,
-    weights: Array,
+    active: NDArray[np.bool_] | None,
     xi: Array,
     weight: Array,
     residual: Array,
@@ -263,30 +262,22 @@ def _judge(
     """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate anyway."""
     edges = len(prediction.line_origin)
     edge_of = prediction.layout.edge
-    close = (np.abs(residual) < GATE_PX) & (weights > 0.0)
+    sample = candidates.sample if active is None else candidates.sample[active]
+    close = sample[np.abs(residual if active is None else residual[active]) < GATE_PX]
     supported = np.zeros(len(edge_of), dtype=bool)
-    supported[candidates.sample[close]] = True
-    profiles = np.bincount(edge_of[prediction.ok], minlength=edges)
+    supported[close] = True
+    profiles = prediction.profiles
     agreeing = np.bincount(edge_of[supported], minlength=edges)
-    others = np.bincount(edge_of[candidates.sample[~close & (weights > 0.0)]], minlength=edges)
-    reach_px = _reach_px(prediction)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        density = others / (profiles * max(2.0 * (reach_px - GATE_PX), 1.0))
-        chance = 1.0 - np.exp(-2.0 * GATE_PX * density)
-        share = agreeing / profiles
-        needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
+    others = np.bincount(edge_of[sample], minlength=edges) - np.bincount(edge_of[close], minlength=edges)
+    some = np.maximum(profiles, 1)
+    chance = 1.0 - np.exp(others * (-2.0 * GATE_PX / max(2.0 * (prediction.reach_px - GATE_PX), 1.0)) / some)
+    needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
+    share = agreeing / some
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
     # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
-    pair = (edge_of[1:] == edge_of[:-1]) & prediction.ok[1:] & prediction.ok[:-1]
-    agreeing_pair = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
+    pair = prediction.pair
     pairs = int(np.count_nonzero(pair))
-    believed = float(np.count_nonzero(agreeing_pair)) / pairs if pairs and np.count_nonzero(seen) >= 3 else 0.0
+    believed = 0.0
+    if pairs and np.count_nonzero(seen) >= 3:
+        believed = int(np.count_nonzero(pair & supported[1:] & supported[:-1] & seen[edge_of[1:]])) / pairs
     return Consensus(xi, weight, residual, information, scale_px, supported, share, seen, believed)
-
-
-def _reach_px(prediction: Prediction) -> float:
-    if not len(prediction.uv_px):
-        return 1.0
-    return float(
-        np.hypot(prediction.map_x[0, -1] - prediction.uv_px[0, 0], prediction.map_y[0, -1] - prediction.uv_px[0, 1])
-    )

@@ -54,156 +54,162 @@ class Corners:
 
 
 @dataclass(frozen=True, slots=True)
-class _Lines:
-    """``offset`` (e,), ``slope`` (e,) and their covariance (e, 3: var a, cov, var b); NaN where an edge has too few points."""
+class CornerGeometry:
+    """What of the intersections doesn't depend on the image, for one prediction; c corners with at most three edges each.
 
-    offset: Array
-    slope: Array
-    covariance: Array
-
-
-@dataclass(frozen=True, slots=True)
-class CornerTopology:
-    """Which edges meet in each corner: ``edges`` (c, 3) indices, -1 where there are fewer, for one gripper."""
+    ``edges`` (c, 3) indices, -1 where there are fewer; ``slot`` (c, 3) their places among the sampled edges, -1 for none; ``along``
+    (c, 3) the predicted corner on each line; ``direction`` and ``right`` (c, 3, 2) of the lines; ``beside`` (c, 3, 2) first and last + 1 of the profiles
+    next to the corner; ``fault`` the reason why a corner can't be measured in this view, whatever the image.
+    """
 
     edges: NDArray[np.intp]
+    slot: NDArray[np.intp]
+    along: Array
+    direction: Array
+    right: Array
+    beside: NDArray[np.intp]
+    fault: tuple[CornerFault | None, ...]
 
     @classmethod
-    def of(cls, gripper: Gripper) -> CornerTopology:
-        edges = np.full((len(gripper.corner_ids), 3), -1, dtype=np.intp)
-        for i in range(len(edges)):
+    def of(cls, gripper: Gripper, prediction: Prediction, settings: CornerSettings) -> CornerGeometry:
+        layout = prediction.layout
+        corners = len(gripper.corner_ids)
+        edges = np.full((corners, 3), -1, dtype=np.intp)
+        for i in range(corners):
             at = gripper.edges_at_corner(i)[:3]
             edges[i, : len(at)] = at
-        return cls(edges)
+        slots = np.full(len(gripper.edge_ids) + 1, -1, dtype=np.intp)
+        slots[layout.edges] = np.arange(len(layout.edges))
+        slot = slots[edges]
+        direction = prediction.line_direction[edges]
+        from_origin = prediction.corners_xy[:, None, :] - prediction.line_origin[edges]
+        bounds = np.append(layout.first, len(layout.edge))
+        first, last = bounds[slot], bounds[slot + 1]
+        at_start = gripper.edge_points[edges, 0] == gripper.corner_points[:, None]
+        begin = np.where(at_start, first, np.maximum(last - settings.neighbourhood, first))
+        end = np.where(at_start, np.minimum(first + settings.neighbourhood, last), last)
+        return cls(
+            edges,
+            slot,
+            np.einsum("cki,cki->ck", from_origin, direction),
+            direction,
+            np.stack([-direction[..., 1], direction[..., 0]], axis=-1),
+            np.stack([begin, end], axis=-1),
+            tuple(
+                CornerFault.OUTSIDE
+                if not inside
+                else CornerFault.SELF_HIDDEN
+                if not visible
+                else CornerFault.FEW_POINTS
+                if sampled < 2
+                else None
+                for inside, visible, sampled in zip(
+                    prediction.corner_inside.tolist(),
+                    prediction.corner_visible.tolist(),
+                    (slot >= 0).sum(axis=1).tolist(),
+                    strict=True,
+                )
+            ),
+        )
 
 
 def intersect_edges(
     candidates: Candidates,
     prediction: Prediction,
     consensus: Consensus,
-    topology: CornerTopology,
+    geometry: CornerGeometry,
     settings: CornerSettings,
 ) -> Corners:
-    """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges meet."""
-    lines = _fit_lines(candidates, prediction, consensus)
-    edges = topology.edges
-    seen = (edges >= 0) & consensus.edge_seen[edges] & np.isfinite(lines.offset[edges])
-    direction = prediction.line_direction[edges]
-    right = np.stack([-direction[..., 1], direction[..., 0]], axis=-1)
-    row = right - lines.slope[edges][..., None] * direction
-    from_origin = prediction.corners_xy[:, None, :] - prediction.line_origin[edges]
-    along = np.einsum("cki,cki->ck", from_origin, direction)
-    var_a, cov_ab, var_b = np.moveaxis(lines.covariance[edges], -1, 0)
-    variance = var_a + 2.0 * along * cov_ab + along * along * var_b
-    distance = lines.offset[edges] - np.einsum("cki,cki->ck", row, from_origin)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        weight = np.where(seen, 1.0 / variance, 0.0)
-        row = np.where(seen[..., None], row, 0.0)
-        distance = np.where(seen, distance, 0.0)
-    information = np.einsum("ck,cki,ckj->cij", weight, row, row)
-    right_side = np.einsum("ck,ck,cki->ci", weight, distance, row)
-    angle_ok = _largest_sine(row, seen) >= np.sin(settings.smallest_angle_rad)
-    fault = _faults(prediction, consensus, edges, seen, angle_ok, settings)
+    """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges meet.
+
+    A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift of the corner with
+    ``(right - slope * direction) . shift = offset + slope * along``.
+    """
+    lines = _fit_lines(candidates, prediction, consensus)[:, geometry.slot]
+    offset, slope, var_offset, covariance, var_slope = lines
+    seen = (geometry.slot >= 0) & consensus.edge_seen[geometry.edges] & np.isfinite(offset)
+    along = geometry.along
+    row = geometry.right - slope[..., None] * geometry.direction
+    row[~seen] = 0.0
+    weight = np.zeros(seen.shape)
+    np.divide(1.0, var_offset + along * (2.0 * covariance + along * var_slope), out=weight, where=seen)
+    wanted = np.where(seen, offset + slope * along, 0.0)
+    weighted = weight[..., None] * row
+    information = weighted.transpose(0, 2, 1) @ row
+    fault = _faults(consensus, geometry, seen, row, settings)
     good = np.array([f is None for f in fault], dtype=bool)
-    information[~good] = np.eye(2)
-    covariance = np.linalg.inv(information)
-    covariance[~good] = np.nan
-    shift = np.einsum("cij,cj->ci", covariance, right_side)
-    lens = prediction.corners_d_uv_d_xy
-    covariance_px = lens @ covariance @ lens.transpose(0, 2, 1)
-    half_trace = 0.5 * (covariance_px[:, 0, 0] + covariance_px[:, 1, 1])
-    determinant = covariance_px[:, 0, 0] * covariance_px[:, 1, 1] - covariance_px[:, 0, 1] ** 2
-    with np.errstate(invalid="ignore"):
-        sigma_px = np.sqrt(half_trace + np.sqrt(np.maximum(half_trace**2 - determinant, 0.0)))
-        uncertain = sigma_px > settings.largest_sigma_px
+    covariance_xy = np.full((len(good), 2, 2), np.nan)
+    covariance_xy[good] = np.linalg.inv(information[good])
+    shift = (covariance_xy @ (weighted * wanted[..., None]).sum(axis=1)[..., None])[..., 0]
+    sigma_px = _largest_sigma(prediction.corners_d_uv_d_xy, covariance_xy)
     return Corners(
         prediction.corners_xy + shift,
-        covariance,
-        prediction.corners_uv_px + np.einsum("cij,cj->ci", lens, shift),
+        covariance_xy,
+        prediction.corners_uv_px + (prediction.corners_d_uv_d_xy @ shift[..., None])[..., 0],
         sigma_px,
-        tuple(CornerFault.UNCERTAIN if u else f for f, u in zip(fault, uncertain.tolist(), strict=True)),
+        tuple(
+            CornerFault.UNCERTAIN if f is None and not s <= settings.largest_sigma_px else f
+            for f, s in zip(fault, sigma_px.tolist(), strict=True)
+        ),
     )
 
 
-def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> _Lines:
-    """Weighted straight lines through the agreed points of every edge at once, by sums over edges."""
-    edges = len(prediction.line_origin)
+def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> Array:
+    """Weighted straight lines ``e = offset + slope * along`` through the agreed points of every sampled edge at once.
+
+    (5, v + 1): offset, slope, variance of the offset, covariance, variance of the slope; NaN for edges with fewer than four points
+    and in the last column, which stands for "no edge" (slot -1).
+    """
+    first = prediction.layout.first
     inlier = np.flatnonzero(consensus.weight)
     sample = candidates.sample[inlier]
-    edge = prediction.layout.edge[sample]
     gain = prediction.gain[sample]
     along = prediction.along[sample]
-    offset = gain * candidates.offset_px[inlier]
-    weight = consensus.weight[inlier] / gain**2
-    if len(edge) == 0:
-        nothing = np.full(edges, np.nan)
-        return _Lines(nothing, nothing, np.full((edges, 3), np.nan))
-    s0 = np.bincount(edge, weight, edges)
-    s1 = np.bincount(edge, weight * along, edges)
-    s2 = np.bincount(edge, weight * along * along, edges)
-    t0 = np.bincount(edge, weight * offset, edges)
-    t1 = np.bincount(edge, weight * along * offset, edges)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = s0 * s2 - s1 * s1
-        determinant[np.bincount(edge, minlength=edges) < 4] = np.nan
-        offset_at_origin = (s2 * t0 - s1 * t1) / determinant
-        slope = (s0 * t1 - s1 * t0) / determinant
-        covariance = np.stack([s2, -s1, s0], axis=-1) / determinant[:, None]
-    return _Lines(offset_at_origin, slope, covariance)
-
-
-def _largest_sine(row: Array, seen: NDArray[np.bool_]) -> Array:
-    """(c,) sine of the largest angle between any two of a corner's seen lines; zero with fewer than two."""
-    length = np.sqrt(np.einsum("cki,cki->ck", row, row))
-    length[~seen] = 1.0
-    unit = row / length[..., None]
-    cross = unit[:, :, None, 0] * unit[:, None, :, 1] - unit[:, :, None, 1] * unit[:, None, :, 0]
-    return np.abs(cross).max(axis=(1, 2))
-
-
-def _faults(
-    prediction: Prediction,
-    consensus: Consensus,
-    edges: NDArray[np.intp],
-    seen: NDArray[np.bool_],
-    angle_ok: NDArray[np.bool_],
-    settings: CornerSettings,
-) -> list[CornerFault | None]:
-    beside = (
-        np.zeros(edges.shape, dtype=bool)
-        if len(prediction.layout.edges) == 0
-        else _seen_beside(prediction, consensus, edges, settings.neighbourhood)
-    )
-    inside = np.isfinite(prediction.corners_uv_px).all(axis=1)
-    sampled = (edges >= 0) & np.isfinite(prediction.line_origin[edges, 0])
-    out: list[CornerFault | None] = []
-    for i in range(len(edges)):
-        if not prediction.corner_visible[i]:
-            out.append(CornerFault.SELF_HIDDEN if inside[i] and prediction.corner_inside[i] else CornerFault.OUTSIDE)
-        elif sampled[i].sum() < 2:
-            out.append(CornerFault.FEW_POINTS)
-        elif seen[i].sum() < 2 or (beside[i] & seen[i]).sum() < 2:
-            out.append(CornerFault.HIDDEN)
-        elif not angle_ok[i]:
-            out.append(CornerFault.PARALLEL)
-        else:
-            out.append(None)
+    terms = np.zeros((5, len(inlier) + 1))
+    weight, weighted_along, weighted_square, weighted_offset, weighted_both = terms[:, 1:]
+    np.divide(consensus.weight[inlier], gain * gain, out=weight)
+    np.multiply(weight, along, out=weighted_along)
+    np.multiply(weighted_along, along, out=weighted_square)
+    np.multiply(weight, gain * candidates.offset_px[inlier], out=weighted_offset)
+    np.multiply(weighted_offset, along, out=weighted_both)
+    # Points come sorted by edge: sums over edges are differences of running sums.
+    bounds = np.append(np.searchsorted(sample, first), len(inlier))
+    sums = np.cumsum(terms, axis=1)[:, bounds]
+    s0, s1, s2, t0, t1 = sums[:, 1:] - sums[:, :-1]
+    out = np.full((5, len(first) + 1), np.nan)
+    determinant = s0 * s2 - s1 * s1
+    fit = (np.diff(bounds) >= 4) & (determinant > 0.0)
+    np.divide(np.stack([s2 * t0 - s1 * t1, s0 * t1 - s1 * t0, s2, -s1, s0]), determinant, out=out[:, :-1], where=fit)
     return out
 
 
-def _seen_beside(
-    prediction: Prediction, consensus: Consensus, edges: NDArray[np.intp], neighbourhood: int
-) -> NDArray[np.bool_]:
-    """(c, 3) whether at least half of the profiles nearest to the corner agree, on each of its edges."""
-    layout = prediction.layout
-    last = np.append(layout.first[1:], len(layout.edge))
-    slot = np.full(len(prediction.line_origin), -1, dtype=np.intp)
-    slot[layout.edges] = np.arange(len(layout.edges))
-    count = np.concatenate([[0], np.cumsum(consensus.supported)])
-    at = slot[edges]
-    known = (edges >= 0) & (at >= 0)
-    low, high = layout.first[at], last[at]
-    near_start = prediction.corner_at_start[np.arange(len(edges))[:, None], np.where(edges >= 0, edges, 0)]
-    begin = np.where(near_start, low, np.maximum(high - neighbourhood, low))
-    end = np.where(near_start, np.minimum(low + neighbourhood, high), high)
-    return known & (2 * (count[end] - count[begin]) >= end - begin)
+def _largest_sigma(lens: Array, covariance_xy: Array) -> Array:
+    """(c,) standard deviation along the larger axis of each corner's covariance, px."""
+    covariance_px = lens @ covariance_xy @ lens.transpose(0, 2, 1)
+    a, b, c = covariance_px[:, 0, 0], covariance_px[:, 0, 1], covariance_px[:, 1, 1]
+    sigma_px: Array = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)))
+    return sigma_px
+
+
+def _faults(
+    consensus: Consensus,
+    geometry: CornerGeometry,
+    seen: NDArray[np.bool_],
+    row: Array,
+    settings: CornerSettings,
+) -> list[CornerFault | None]:
+    """One reason or None for every corner: hidden if fewer than two of its edges are seen right beside it."""
+    count = np.concatenate([[0], np.cumsum(consensus.supported)])[geometry.beside]
+    width = geometry.beside[..., 1] - geometry.beside[..., 0]
+    beside = seen & (2 * (count[..., 1] - count[..., 0]) >= width)
+    seen_beside = beside.sum(axis=1).tolist()
+    # Sine of the angle between any two of the (up to three) lines; rows have nearly unit length relative to each other.
+    x, y = row[..., 0], row[..., 1]
+    length = np.sqrt(x * x + y * y)
+    following = [1, 2, 0]
+    cross = np.abs(x * y[:, following] - y * x[:, following])
+    angle_ok = (cross > np.sin(settings.smallest_angle_rad) * length * length[:, following]).any(axis=1).tolist()
+    return [
+        fault or (CornerFault.HIDDEN if near < 2 else None if wide else CornerFault.PARALLEL)
+        for fault, near, wide in zip(geometry.fault, seen_beside, angle_ok, strict=True)
+    ]

@@ -25,7 +25,7 @@ from gripmon.corners.consensus import (
     noise_inflation,
     prior_information,
 )
-from gripmon.corners.lines import Corners, CornerSettings, CornerTopology, intersect_edges
+from gripmon.corners.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
 from gripmon.corners.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
 from gripmon.corners.profiles import (
     Candidates,
@@ -50,7 +50,7 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
-TRUSTED_PART = 0.6
+TRUSTED_PART = 0.75
 """Part of the satisfying share below which a fit is not believed, whatever the settings allow."""
 
 
@@ -87,6 +87,7 @@ class Measurement:
     the image noise; ``jaw_surprise``: the seen jaw opening against the reported one, in standard deviations of the latter.
 
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
+    ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
 
     prediction: Prediction
@@ -100,6 +101,7 @@ class Measurement:
     jaw_surprise: float
     effort: Effort
     trusted: bool = False
+    looked_far: bool = False
 
     @property
     def corners_cam_m(self) -> Array:
@@ -136,7 +138,6 @@ class FingertipMeter:
     def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
         self._camera, self._gripper, self._settings = camera, gripper, settings
         self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
-        self._topology = CornerTopology.of(gripper)
         self._prior_reported = prior_information(jaw_sigma_m if gripper.has_jaw else None)
         self._prior_unreported = prior_information(JAW_UNREPORTED_SIGMA_M if gripper.has_jaw else None)
         self._prior = self._prior_reported
@@ -166,20 +167,22 @@ class FingertipMeter:
             beat = CLEARLY_BETTER * best.consensus.share
         else:
             beat = best.consensus.share
+        looked_far = False
         for further, look in ((Effort.GRID, self._from_grid), (Effort.SEARCH, self._search)):
             if effort >= further and best.consensus.share < satisfied_share:
+                looked_far = True
                 other = look(image, expected)
                 if other.consensus.share > max(beat, best.consensus.share):
                     best = other
         needed = consensus.trusted_share if best.effort == Effort.NARROW else consensus.found_share
-        return replace(best, trusted=best.consensus.share >= max(needed, TRUSTED_PART * satisfied_share))
+        trusted = best.consensus.share >= max(needed, TRUSTED_PART * satisfied_share)
+        return replace(best, trusted=trusted, looked_far=looked_far)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at most."""
         for _ in range(3):
-            prediction = self._predicted(expected)
+            prediction, start = self._predicted(expected)
             candidates, weights = self._look(image, prediction)
-            start = self._from_prediction(prediction, expected)
             prior_mean = self._prior_mean(prediction, expected)
             consensus = agree(candidates, prediction, weights, start, prior_mean, self._prior, self._settings.consensus)
             moved_px = prediction.moved_px(consensus.xi)
@@ -190,7 +193,7 @@ class FingertipMeter:
             expected = self._moved(prediction, consensus.xi, expected)
             if moved_px <= self._settings.relinearise_px:
                 break
-        corners = intersect_edges(candidates, prediction, consensus, self._topology, self._settings.corners)
+        corners = intersect_edges(candidates, prediction, consensus, self._geometry, self._settings.corners)
         inflation = noise_inflation(candidates, prediction, consensus)
         return Measurement(
             prediction,
@@ -207,7 +210,7 @@ class FingertipMeter:
 
     def _from_grid(self, image: Image, expected: _Expected) -> Measurement:
         """Starts all over the reach of the profiles; the best one settled."""
-        prediction = self._predicted(expected)
+        prediction, start = self._predicted(expected)
         if not prediction.ok.any():
             return self._settle(image, expected)
         candidates, weights = self._look(image, prediction)
@@ -222,17 +225,18 @@ class FingertipMeter:
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
         """Starts from the reduced image; the best of them settled."""
-        prediction = self._predicted(expected)
+        prediction, here = self._predicted(expected)
         starts = search_starts(image, prediction, self._settings.search)
-        found = [self._from_grid(image, self._moved(prediction, start, expected)) for start in starts]
+        found = [self._from_grid(image, self._moved(prediction, here + start, expected)) for start in starts]
         return replace(max(found, key=_agreement) if found else self._settle(image, expected), effort=Effort.SEARCH)
 
-    def _predicted(self, expected: _Expected) -> Prediction:
-        """The kept prediction while it holds, else a new one at the expected pose."""
+    def _predicted(self, expected: _Expected) -> tuple[Prediction, Array]:
+        """The kept prediction while it holds, else a new one at the expected pose; and the unknowns (m,) from it to there."""
         kept = self._prediction
         if kept is not None and len(kept.uv_px):
-            if kept.moved_px(self._from_prediction(kept, expected)) <= self._settings.relinearise_px:
-                return kept
+            start = self._from_prediction(kept, expected)
+            if kept.moved_px(start) <= self._settings.relinearise_px:
+                return kept, start
         cam_T_grip, jaw_opening_m = expected.cam_T_grip, expected.jaw_opening_m
         if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
             layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.sampling)
@@ -246,7 +250,8 @@ class FingertipMeter:
             self._offsets_px,
             jaw_unknown=len(self._prior) == 7,
         )
-        return self._prediction
+        self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
+        return self._prediction, np.zeros(len(self._prior))
 
     def _layout_moved_px(self, expected: _Expected) -> float:
         assert self._laid_out is not None
@@ -273,6 +278,10 @@ class FingertipMeter:
         """(m,) from the prediction's pose and opening to the expected ones."""
         xi = perturbation_between(prediction.cam_T_grip, expected.cam_T_grip)
         return np.append(xi, expected.jaw_opening_m - prediction.jaw_opening_m) if len(self._prior) == 7 else xi
+
+    def moved_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
+        """How far the measured gripper shows from where ``cam_T_grip`` had put it, px."""
+        return measurement.prediction.moved_px(perturbation_between(cam_T_grip, measurement.cam_T_grip))
 
     def _prior_mean(self, prediction: Prediction, expected: _Expected) -> Array:
         mean = np.zeros(len(self._prior))

@@ -39,6 +39,9 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     creases: Annotated[bool, Meta(description="use edges between two visible faces too; bevels shift them")] = False
 
 
+STRETCH = 10
+"""Neighbouring profiles of an edge whose errors are taken together."""
+
 STEP_PX = 0.5
 """Distance of samples along a profile, px."""
 
@@ -46,7 +49,7 @@ CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class EdgeLayout:
     """Which part of which edge is sampled how densely; holds while the view changes by some pixels only.
 
@@ -62,6 +65,13 @@ class EdgeLayout:
     crease: NDArray[np.bool_]
     inside_point_m: Array
 
+    @cached_property
+    def stretch(self) -> NDArray[np.intp]:
+        """(n,) number of the stretch that a profile belongs to: some :data:`STRETCH` neighbours on one edge."""
+        starts = np.zeros(len(self.edge), dtype=np.intp)
+        starts[self.first[1:]] = 1
+        return np.arange(len(self.edge)) // STRETCH + np.cumsum(starts)
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -72,7 +82,7 @@ class Prediction:
     unknown too, by the opening (px/m).
     ``along`` (n,) and ``gain`` (n,): ideal coordinate along the edge's line, and ideal distance from the line for each px of offset along the
     normal.  ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies in the image.
-    ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.  ``corner_at_start`` (c, e): the corner is the first end of the edge.
+    ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.
     """
 
     cam_T_grip: Array
@@ -92,7 +102,6 @@ class Prediction:
     corners_d_uv_d_xy: Array
     corner_visible: NDArray[np.bool_]
     corner_inside: NDArray[np.bool_]
-    corner_at_start: NDArray[np.bool_]
     ok: NDArray[np.bool_]
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
@@ -101,6 +110,30 @@ class Prediction:
     def pixels_per_m(self) -> float:
         """Scale of the image at the gripper: median over the edge points, across their edges (px/m)."""
         return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
+
+    @cached_property
+    def jacobian_by_unknown(self) -> Array:
+        """(6 or 7, n): the Jacobian by rows, for fits."""
+        return np.ascontiguousarray(self.jacobian.T)
+
+    @cached_property
+    def profiles(self) -> NDArray[np.intp]:
+        """(e,) profiles inside the image, for every edge of the gripper."""
+        return np.bincount(self.layout.edge[self.ok], minlength=len(self.line_origin))
+
+    @cached_property
+    def pair(self) -> NDArray[np.bool_]:
+        """(n - 1,) whether a profile and the next one lie on the same edge, both inside the image."""
+        edge = self.layout.edge
+        return (edge[1:] == edge[:-1]) & self.ok[1:] & self.ok[:-1]
+
+    @cached_property
+    def reach_px(self) -> float:
+        """How far the profiles reach to both sides, px."""
+        if not len(self.uv_px):
+            return 0.0
+        end = self.map_x[0, -1] - self.uv_px[0, 0], self.map_y[0, -1] - self.uv_px[0, 1]
+        return float(np.hypot(*end))
 
     def moved_px(self, xi: Array) -> float:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the linearisation pose."""
@@ -229,7 +262,6 @@ def predict(
         corners_d_uv_d_xy=corners_d_uv[:, :, :2] * corners_cam_m[:, 2][:, None, None],
         corner_visible=corner_visible & corner_inside,
         corner_inside=corner_inside,
-        corner_at_start=gripper.corner_points[:, None] == gripper.edge_points[None, :, 0],
         ok=ok,
         map_x=uv32[:, 0:1] + normal32[:, 0:1] * offsets,
         map_y=uv32[:, 1:2] + normal32[:, 1:2] * offsets,

@@ -38,9 +38,14 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     coarse_columns: Annotated[int, Meta(ge=64, le=1024, description="width of the reduced image (columns)")] = 192
     starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 10
     eager_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="search in so many frames right after the gripper was lost")
+        int, Meta(ge=1, le=1000, description="so many frames may look further one after the other")
     ] = 4
-    patient_every: Annotated[int, Meta(ge=1, le=1000, description="later, search in one of so many frames")] = 6
+    refill_frames: Annotated[
+        int, Meta(ge=1, le=100000, description="good frames after which one more frame may look further")
+    ] = 60
+    patient_every: Annotated[
+        int, Meta(ge=1, le=1000, description="a lost gripper is then searched for in one of so many frames")
+    ] = 6
 
 
 def search_starts(image: Image, prediction: Prediction, settings: SearchSettings) -> Array:
