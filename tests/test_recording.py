@@ -130,6 +130,7 @@ def test_the_gripper_moves_as_estimated(told: Recorded) -> None:
 
 def test_the_reference_stands_where_it_was_calibrated(told: Recorded) -> None:
     (cell,) = told.timed("rig/reference")
+    assert (cell.seq, cell.stamp_ns) == (0, START_NS)  # not at the reference's own stamp, which is none
     np.testing.assert_allclose(cell.values["translation"][0], REFERENCE.cam_T_grip.translation_m, rtol=1e-6)
     np.testing.assert_allclose(cell.values["quaternion"][0], REFERENCE.cam_T_grip.rotation_xyzw, rtol=1e-6)
 
@@ -275,6 +276,45 @@ def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
     assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
     (path,) = tmp_path.iterdir()
     assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(150))
+
+
+def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> None:
+    moved = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2)
+    writer = recorder(tmp_path)
+    for i in range(12):
+        writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), None)
+    writer.reference(moved)
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    told = Recorded(path)
+    assert [cell.seq for cell in told.timed("rig/reference")] == [0, 7]
+    assert [c.seq for c in told.timed("events") if c.values["text"] == ["reference second (configuration)"]] == [7]
+
+
+def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> None:
+    writer = recorder(tmp_path)
+    for i in range(3):
+        writer.offer(frame(i), record(i), None)
+    wait_until(lambda: writer.frames_written == 3)
+    writer.alert(
+        AlertRecord(
+            robot="arm",
+            camera="wrist",
+            seq=2,
+            stamp_ns=START_NS + 10**18,
+            state=State.STALE,
+            reference_id="first",
+            revision=1,
+            kind=AlertKind.SOURCE,
+            cause=Cause.NO_CAMERA,
+            severity=Severity.WARNING,
+            text="years later",
+        )
+    )
+    writer.close(10.0)
+    (path,) = tmp_path.iterdir()
+    stamps = {cell.stamp_ns for cells in Recorded(path).cells.values() for cell in cells if cell.stamp_ns is not None}
+    assert stamps == {START_NS + i * INTERVAL_NS for i in range(3)}
 
 
 def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:

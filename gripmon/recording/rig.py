@@ -65,14 +65,11 @@ class RigWriter:
         if pictured:
             self._write_shift(pictured)
 
-    def write_references(self, references: Sequence[ReferenceRecord], rows: Sequence[Row]) -> None:
-        """Where the gripper was calibrated to be, from the frame that is being written on."""
-        for reference in references:
-            stamp_ns, seq = (rows[0].record.stamp_ns, rows[0].record.seq) if rows else (reference.stamp_ns, 0)
-            columns = rr.Transform3D.columns(
-                translation=[reference.cam_T_grip.translation_m], quaternion=[reference.cam_T_grip.rotation_xyzw]
-            )
-            self._send.columns("rig/reference", [stamp_ns], [seq], columns)
+    def write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> None:
+        """Where the gripper was calibrated to be, from frame ``first`` on."""
+        transform = reference.cam_T_grip
+        columns = rr.Transform3D.columns(translation=[transform.translation_m], quaternion=[transform.rotation_xyzw])
+        self._send.columns("rig/reference", [first.stamp_ns], [first.seq], columns)
 
     def _write_fingers(self, row: Row) -> None:
         """Redraw the fingers when the jaws moved or the verdict changed; without estimate there is nothing to show."""

@@ -31,6 +31,7 @@ from gripmon.recording.rig import RigWriter
 from gripmon.recording.wire import Scene, TraceNote
 from gripmon.records import Alert, AlertRecord, FrameRecord, ReferenceRecord, Severity, State, Verdict, to_json
 
+_LONGEST_SILENCE_NS = 86_400_000_000_000  # between a frame and an alert that belongs to no frame: a day
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 
 
@@ -99,21 +100,24 @@ class RowWriter:
         self._rig = RigWriter(self._send, scene)
         self._state = ""
         self._verdict = ""
+        self._references: list[ReferenceRecord] = []
+        self._newest_stamp_ns: int | None = None
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
         self._log_static(scene)
 
     def write(self, rows: Sequence[Row], alerts: Sequence[AlertRecord], references: Sequence[ReferenceRecord]) -> None:
-        """Send everything that was gathered since the last call."""
-        events = [_event(a.stamp_ns, a.seq, a) for a in alerts]
-        events += [
-            Event(r.stamp_ns, rows[0].record.seq if rows else 0, "INFO", f"reference {r.reference_id} ({r.origin})")
-            for r in references
-        ]
+        """Send everything that was gathered since the last call.
+
+        References wait for a frame: their own stamp may lie long before the recording, or be no time at all.
+        """
         for r in references:
             self._reference_tcp_m[r.reference_id, r.revision] = r.cam_T_grip.translation_m
-        if references:
-            self._rig.write_references(references, rows)
+        self._references += references
+        events = [_event(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in alerts]
         if rows:
+            self._newest_stamp_ns = rows[-1].record.stamp_ns
+            events += [self._write_reference(r, _first_with(r, rows)) for r in self._references]
+            self._references.clear()
             events += self._status(rows)
             self._curves(rows)
             self._records(rows)
@@ -122,6 +126,16 @@ class RowWriter:
         if events:
             columns = rr.TextLog.columns(text=[e.text for e in events], level=[e.level for e in events])
             self._send.columns("events", [e.stamp_ns for e in events], [e.seq for e in events], columns)
+
+    def _on_frames_clock(self, stamp_ns: int) -> int:
+        """Frames of old files have old stamps: an alert of today among them would stretch the timeline over years."""
+        if self._newest_stamp_ns is None or abs(stamp_ns - self._newest_stamp_ns) < _LONGEST_SILENCE_NS:
+            return stamp_ns
+        return self._newest_stamp_ns
+
+    def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Event:
+        self._rig.write_reference(reference, first)
+        return Event(first.stamp_ns, first.seq, "INFO", f"reference {reference.reference_id} ({reference.origin})")
 
     def _log_static(self, scene: Scene) -> None:
         static = self._send.static
@@ -196,6 +210,13 @@ class RowWriter:
     def _records(self, rows: Sequence[Row]) -> None:
         lines = [to_json(row.record).decode() for row in rows]
         self._send.frames("record", rows, rr.AnyValues.columns(json=lines))
+
+
+def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
+    """The first frame that names the reference; else the first of all."""
+    key = (reference.reference_id, reference.revision)
+    records = [row.record for row in rows]
+    return next((r for r in records if (r.reference_id, r.revision) == key), records[0])
 
 
 def _millimetres(metres: Sequence[float] | None) -> list[float]:

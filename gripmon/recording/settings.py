@@ -38,7 +38,7 @@ class RecordingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     ] = 0.5
     min_free_bytes: Annotated[
         int, Meta(ge=0, description="space that the disk keeps; recording pauses below it (bytes)")
-    ] = 1_000_000_000
+    ] = 200_000_000
     max_file_bytes: Annotated[
         int, Meta(ge=100_000, description="a file this long is closed and the next begun (bytes)")
     ] = 500_000_000
