@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.camera import Camera
-from gripmon.corners import Effort, FingertipMeter, Measurement, MeasurementSettings, finger_shares, trace_of
+from gripmon.corners import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience, finger_shares, trace_of
 from gripmon.differential import DegenerateGeometry, differential_update
 from gripmon.geometry import (
     from_record,
@@ -49,9 +49,6 @@ USUAL_SHARE = 0.8
 
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
-
-SATISFIED = 0.65
-"""Part of the usual share below which the gripper is looked for elsewhere, too."""
 
 JAW_SURPRISE = 5.0
 """Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
@@ -119,8 +116,11 @@ class Monitor:
         before_T = self._cam_T_grip
         self._cam_T_grip, self._covariance = self._update(measurement)
         self._jaw_opening_m, self._measured_s = measurement.jaw_opening_m, self._now_s
+        evidence = self._evidence(measurement, before_T)
+        if evidence.jumped:
+            self._average.forget()
         self._average.add(self._cam_T_grip, self._covariance)
-        judgement = self._policy.measured(self._evidence(measurement, before_T))
+        judgement = self._policy.measured(evidence)
         origin, alerts = Origin.UPDATE, judgement.alerts
         if judgement.recalibrate:
             recalibrated = self._recalibrate(measurement, frame.stamp_ns)
@@ -149,25 +149,26 @@ class Monitor:
     def _measure(self, frame: Frame) -> Measurement:
         """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually.
 
-        Looking further takes the time of many frames, so it is paid from a credit that satisfying frames refill slowly; a gripper that is
-        lost altogether is searched for all the same, in one of several frames.
+        A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for in the first
+        frames, then in one of several.
         """
         search = self._settings.corners.search
         reported_m = frame.jaw_opening_m
         assert frame.image is not None
-        patient = self._untrusted > 0 and self._untrusted % search.patient_every == 0
         measurement = self._meter.measure(
             frame.image,
             self._cam_T_grip,
             self._jaw_opening_m if reported_m is None else reported_m,
-            SATISFIED * self._usual_share,
-            Effort.SEARCH if self._credit >= 1.0 or patient else Effort.NARROW,
+            self._usual_share,
+            Patience(
+                when_doubtful=self._credit >= 1.0,
+                when_lost=self._untrusted < search.eager_frames or self._untrusted % search.patient_every == 0,
+            ),
             jaw_reported=reported_m is not None,
         )
         share = measurement.consensus.share
-        self._credit = max(self._credit - 1.0, 0.0) if measurement.looked_far else self._credit
-        if share >= SATISFIED * self._usual_share:
-            self._credit = min(self._credit + 1.0 / search.refill_frames, float(search.eager_frames))
+        earned = -1.0 if measurement.looked_far else 1.0 / search.refill_frames
+        self._credit = min(max(self._credit + earned, 0.0), float(search.eager_frames))
         self._untrusted = 0 if measurement.trusted else self._untrusted + 1
         if measurement.trusted:
             self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)

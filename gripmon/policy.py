@@ -52,8 +52,11 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         bool, Meta(description="true: past the limit take the new pose as reference; false: only alert")
     ] = True
     settle_frames: Annotated[
-        int, Meta(ge=1, le=10000, description="frames that must agree after a jump before a recalibration")
-    ] = 15
+        int,
+        Meta(
+            ge=1, le=10000, description="frames that the gripper must stand still in the image before a recalibration"
+        ),
+    ] = 20
     confirm_frames: Annotated[
         int, Meta(ge=1, le=1000, description="frames that must agree after a jump before the transform counts as valid")
     ] = 2
@@ -105,15 +108,15 @@ class DriftTest:
     """Twelve one-sided CUSUMs: three shifts and three rotations, both signs."""
 
     def __init__(self, settings: PolicySettings):
-        self._smallest = np.array([settings.smallest_drift_m] * 3 + [settings.smallest_drift_rad] * 3)
+        self.smallest = np.array([settings.smallest_drift_m] * 3 + [settings.smallest_drift_rad] * 3)
         frames_a_day = 86400.0 * settings.frames_per_s
-        self.threshold = math.log(2 * len(self._smallest) * frames_a_day / settings.false_alarms_per_day)
+        self.threshold = math.log(2 * len(self.smallest) * frames_a_day / settings.false_alarms_per_day)
         self._sums = np.zeros((2, 6))
 
     def add(self, shift: Array, sigma: Array) -> bool:
         """One frame's shift against the reference (6,) and its standard deviations; True while a drift is established."""
-        gain = self._smallest / sigma**2
-        centred, half = gain * shift, 0.5 * gain * self._smallest
+        gain = self.smallest / sigma**2
+        centred, half = gain * shift, 0.5 * gain * self.smallest
         # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
         limit = 0.2 * self.threshold
         for sums, evidence in ((self._sums[0], centred - half), (self._sums[1], -centred - half)):
@@ -143,7 +146,9 @@ class Policy:
         self._settings = settings
         self.test = DriftTest(settings)
         self.state = State.ACQUIRING
-        self._settled = 0
+        self._since_jump = 0
+        self._still = 0
+        self._still_shift = np.zeros(6)
         self._drift_alerted = False
         self._bad_since_s: float | None = None
         self._bad_alerted = False
@@ -152,10 +157,11 @@ class Policy:
         """A frame from which a transform could be measured."""
         settings = self._settings
         alerts = self._recovered()
-        self._settled = 1 if evidence.jumped else self._settled + 1
+        self._since_jump = 1 if evidence.jumped else self._since_jump + 1
+        self._count_still(evidence)
         if evidence.jumped and self.state not in (State.ACQUIRING, State.LOST):
             alerts.append(_jump_alert(evidence))
-        confirmed = self._settled >= settings.confirm_frames
+        confirmed = self._since_jump >= settings.confirm_frames
         drifting = self.test.add(evidence.shift, evidence.sigma)
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
         recalibrate = False
@@ -163,7 +169,7 @@ class Policy:
             state = State.ACQUIRING if self.state is State.LOST else self.state
         elif past_limit and settings.recalibrate:
             state = State.RECALIBRATING
-            recalibrate = self._settled >= settings.settle_frames
+            recalibrate = self._still >= settings.settle_frames
         elif drifting:
             state = State.DRIFTING
         else:
@@ -193,7 +199,7 @@ class Policy:
     def unmeasured(self, stamp_s: float, refusal: str | None, has_transform: bool) -> Judgement:
         """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper isn't seen in it."""
         settings = self._settings
-        self._settled = 0
+        self._since_jump = self._still = 0
         if self._bad_since_s is None:
             self._bad_since_s = stamp_s
         lasted_s = stamp_s - self._bad_since_s
@@ -225,6 +231,14 @@ class Policy:
         settings = self._settings
         rates = [settings.hold_m_per_sqrt_s] * 3 + [settings.hold_rad_per_sqrt_s] * 3
         return np.square(rates) * held_s
+
+    def _count_still(self, evidence: Evidence) -> None:
+        """Frames since the transform last left the place where it came to rest: by half the smallest drift, and beyond its noise."""
+        leeway = np.maximum(0.5 * self.test.smallest, 5.0 * evidence.sigma)
+        if evidence.jumped or self._still == 0 or (np.abs(evidence.shift - self._still_shift) > leeway).any():
+            self._still, self._still_shift = 1, evidence.shift
+        else:
+            self._still += 1
 
     def _recovered(self) -> list[Alert]:
         self._bad_since_s = None

@@ -1,6 +1,6 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
-from gripmon.corners.measure import Effort, FingertipMeter, Measurement, MeasurementSettings
+from gripmon.corners.measure import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.corners.views import finger_shares, trace_of
 
-__all__ = ["Effort", "FingertipMeter", "Measurement", "MeasurementSettings", "finger_shares", "trace_of"]
+__all__ = ["Effort", "FingertipMeter", "Measurement", "MeasurementSettings", "Patience", "finger_shares", "trace_of"]

@@ -50,9 +50,14 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
-TRUSTED_PART = 0.75
-"""Part of the satisfying share below which a fit is not believed, whatever the settings allow."""
+SETTLED_STARTS = 3
+"""Starts of a wide search that are followed to the end."""
 
+SATISFIED = 0.65
+"""Part of the usual share below which the gripper may be elsewhere."""
+
+TRUSTED = 0.5
+"""Part of the usual share below which a fit is not believed, whatever the settings allow."""
 
 CLEARLY_BETTER = 1.3
 """Factor by which the share elsewhere must exceed a trusted one where the gripper was expected."""
@@ -72,11 +77,19 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
 
 
 class Effort(enum.IntEnum):
-    """How far a measurement may look for the gripper."""
+    """How far the gripper had to be looked for."""
 
     NARROW = 0
     GRID = 1
     SEARCH = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where there is none."""
+
+    when_doubtful: bool
+    when_lost: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,34 +162,38 @@ class FingertipMeter:
         image: Image,
         cam_T_grip: Array,
         jaw_opening_m: float,
-        satisfied_share: float,
-        effort: Effort,
+        usual_share: float,
+        patience: Patience,
         jaw_reported: bool = True,
     ) -> Measurement:
         """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to start from).
 
-        Where less than ``satisfied_share`` of the profiles agree the gripper is looked for elsewhere as far as ``effort`` allows, and
-        the place with the largest share is returned.
+        ``usual_share`` of the profiles agree when all is well.  With clearly less, and where ``patience`` allows, the gripper is looked for
+        elsewhere, and the place with the largest share is returned.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
+        satisfied = SATISFIED * usual_share
+        if best.consensus.share >= satisfied:
+            return replace(best, trusted=best.consensus.share >= self._settings.consensus.trusted_share)
+        trusted = self._trusted(best, usual_share)
+        if not (patience.when_doubtful if trusted else patience.when_lost):
+            return replace(best, trusted=trusted)
+        # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may be true.
+        beat = CLEARLY_BETTER * best.consensus.share if trusted else best.consensus.share
+        for look in (self._from_grid, self._search):
+            other = look(image, expected)
+            if other.consensus.share > max(beat, best.consensus.share):
+                best = other
+            if best.consensus.share >= satisfied:
+                break
+        return replace(best, trusted=self._trusted(best, usual_share), looked_far=True)
+
+    def _trusted(self, measurement: Measurement, usual_share: float) -> bool:
         consensus = self._settings.consensus
-        if best.consensus.share >= consensus.trusted_share:
-            # Fingers look alike when they slide along themselves: elsewhere must be clearly better than here.
-            beat = CLEARLY_BETTER * best.consensus.share
-        else:
-            beat = best.consensus.share
-        looked_far = False
-        for further, look in ((Effort.GRID, self._from_grid), (Effort.SEARCH, self._search)):
-            if effort >= further and best.consensus.share < satisfied_share:
-                looked_far = True
-                other = look(image, expected)
-                if other.consensus.share > max(beat, best.consensus.share):
-                    best = other
-        needed = consensus.trusted_share if best.effort == Effort.NARROW else consensus.found_share
-        trusted = best.consensus.share >= max(needed, TRUSTED_PART * satisfied_share)
-        return replace(best, trusted=trusted, looked_far=looked_far)
+        needed = consensus.trusted_share if measurement.effort is Effort.NARROW else consensus.found_share
+        return measurement.consensus.share >= max(needed, TRUSTED * usual_share)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at most."""
@@ -224,10 +241,22 @@ class FingertipMeter:
         return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
-        """Starts from the reduced image; the best of them settled."""
+        """Starts from the reduced image: all are tried roughly, with the edges sampled as before; the most promising are settled."""
         prediction, here = self._predicted(expected)
-        starts = search_starts(image, prediction, self._settings.search)
-        found = [self._from_grid(image, self._moved(prediction, here + start, expected)) for start in starts]
+        settings = self._settings
+        tried = []
+        for start in search_starts(image, prediction, settings.search):
+            there = self._moved(prediction, here + start, expected)
+            seen = self._predict(prediction.layout, there)
+            candidates, weights = self._look(image, seen)
+            starts = grid_of_starts(seen, settings.sampling.reach_px, settings.consensus.start_width_px)
+            prior_mean = self._prior_mean(seen, there)
+            fit = agree_from_grid(
+                candidates, seen, weights, starts, prior_mean, self._prior, settings.consensus, refine=3
+            )
+            tried.append((fit.share, self._moved(seen, fit.xi, there)))
+        tried.sort(key=lambda item: -item[0])
+        found = [self._settle(image, there) for _, there in tried[:SETTLED_STARTS]]
         return replace(max(found, key=_agreement) if found else self._settle(image, expected), effort=Effort.SEARCH)
 
     def _predicted(self, expected: _Expected) -> tuple[Prediction, Array]:
@@ -241,17 +270,21 @@ class FingertipMeter:
         if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
             layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.sampling)
             self._laid_out = layout, self._corner_pixels(expected)
-        self._prediction = predict(
-            self._camera,
-            self._gripper,
-            self._laid_out[0],
-            cam_T_grip,
-            jaw_opening_m,
-            self._offsets_px,
-            jaw_unknown=len(self._prior) == 7,
-        )
+        self._prediction = self._predict(self._laid_out[0], expected)
         self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
         return self._prediction, np.zeros(len(self._prior))
+
+    def _predict(self, layout: EdgeLayout, expected: _Expected) -> Prediction:
+        jaw_unknown = len(self._prior) == 7
+        return predict(
+            self._camera,
+            self._gripper,
+            layout,
+            expected.cam_T_grip,
+            expected.jaw_opening_m,
+            self._offsets_px,
+            jaw_unknown,
+        )
 
     def _layout_moved_px(self, expected: _Expected) -> float:
         assert self._laid_out is not None

@@ -1,6 +1,6 @@
 """Finding the gripper again after a jump that is wider than the profiles reach.
 
-In an image reduced to some 200 columns, every predicted edge point asks for a gradient across its edge.  The answers, limited so that strong
+In an image reduced to some 160 columns, every predicted edge point asks for a gradient across its edge.  The answers, limited so that strong
 texture counts no more than a clear edge, are added up over shifts, turns about the optical axis and scales; the best places
 become starts for the joint fit on the full image.
 """
@@ -22,6 +22,12 @@ from gripmon.records import Array, Image
 
 _ORIENTATIONS = 16
 
+POINTS = 80
+"""Edge points that vote; more cost more and tell little."""
+
+TICK = 2.0
+"""Step of turn and scale: so many coarse pixels of motion at the farthest edge point."""
+
 
 class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How far around the prediction a lost gripper is looked for."""
@@ -35,8 +41,8 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     turn_rad: Annotated[
         float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")
     ] = 0.08
-    coarse_columns: Annotated[int, Meta(ge=64, le=1024, description="width of the reduced image (columns)")] = 192
-    starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 10
+    coarse_columns: Annotated[int, Meta(ge=64, le=1024, description="width of the reduced image (columns)")] = 160
+    starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
     eager_frames: Annotated[
         int, Meta(ge=1, le=1000, description="so many frames may look further one after the other")
     ] = 4
@@ -45,7 +51,7 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 60
     patient_every: Annotated[
         int, Meta(ge=1, le=1000, description="a lost gripper is then searched for in one of so many frames")
-    ] = 6
+    ] = 15
 
 
 def search_starts(image: Image, prediction: Prediction, settings: SearchSettings) -> Array:
@@ -57,19 +63,19 @@ def search_starts(image: Image, prediction: Prediction, settings: SearchSettings
     usable = np.flatnonzero(prediction.ok)
     if len(usable) < 8:
         return np.zeros((0, unknowns))
-    points = usable[:: max(1, len(usable) // 128)]
+    points = usable[:: max(1, len(usable) // POINTS)]
     factor = max(1.0, image.shape[1] / settings.coarse_columns)
-    answers = _edge_answers(image, factor)
     depth = float(prediction.corners_cam_m[:, 2].mean())
     reach = math.ceil(settings.reach_m * prediction.pixels_per_m / factor)
+    padded = np.pad(_edge_answers(image, factor), ((0, 0), (reach, reach), (reach, reach)))
     centre = prediction.uv_px[points].mean(axis=0)
     spread_px = float(np.abs(prediction.uv_px[points] - centre).max())
-    turns = _ticks(settings.turn_rad, 1.5 * factor / spread_px)
-    scales = _ticks(settings.reach_m / depth, 1.5 * factor / spread_px)
+    turns = _ticks(settings.turn_rad, TICK * factor / spread_px)
+    scales = _ticks(settings.reach_m / depth, TICK * factor / spread_px)
     found: list[tuple[float, Array]] = []
     for turn in turns:
         for scale in scales:
-            votes = _votes(answers, prediction, points, centre, turn, scale, factor, reach)
+            votes = _votes(padded, prediction, points, centre, turn, scale, factor, reach)
             for score, dx, dy in _peaks(votes, 2):
                 start = np.zeros(unknowns)
                 # A scale s about the camera's axis is a depth z / s; shift and turn act at that depth.
@@ -121,7 +127,7 @@ def _edge_answers(image: Image, factor: float) -> NDArray[np.float32]:
 
 
 def _votes(
-    answers: NDArray[np.float32],
+    padded: NDArray[np.float32],
     prediction: Prediction,
     points: NDArray[np.intp],
     centre: Array,
@@ -130,7 +136,10 @@ def _votes(
     factor: float,
     reach: int,
 ) -> NDArray[np.float32]:
-    """(2 reach + 1, 2 reach + 1) summed answers over shifts in coarse pixels; rows are shifts along v."""
+    """(2 reach + 1, 2 reach + 1) summed answers over shifts in coarse pixels; rows are shifts along v.
+
+    ``padded`` are the answers with ``reach`` more pixels all around; points that fall outside even so have no vote.
+    """
     c, s = math.cos(turn), math.sin(turn)
     arms = prediction.uv_px[points] - centre
     rotation = np.array([[c, -s], [s, c]])
@@ -140,16 +149,13 @@ def _votes(
     orientation = (
         np.round(np.arctan2(normals[:, 1], normals[:, 0]) / math.pi * _ORIENTATIONS).astype(int) % _ORIENTATIONS
     )
-    height, width = answers.shape[1:]
     column, row = np.round(places).astype(int).T
-    votes = np.zeros((2 * reach + 1, 2 * reach + 1), dtype=np.float32)
-    for k, u, v in zip(orientation.tolist(), column.tolist(), row.tolist(), strict=True):
-        top, left = max(v - reach, 0), max(u - reach, 0)
-        bottom, right = min(v + reach + 1, height), min(u + reach + 1, width)
-        if top < bottom and left < right:
-            votes[top - v + reach : bottom - v + reach, left - u + reach : right - u + reach] += answers[
-                k, top:bottom, left:right
-            ]
+    height, width = padded.shape[1] - 2 * reach, padded.shape[2] - 2 * reach
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    size = 2 * reach + 1
+    votes = np.zeros((size, size), dtype=np.float32)
+    for k, u, v in np.column_stack([orientation, column, row])[inside].tolist():
+        votes += padded[k, v : v + size, u : u + size]
     return votes
 
 
