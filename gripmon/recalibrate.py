@@ -17,8 +17,10 @@ from gripmon.records import Array
 COPLANAR_RATIO = 1e-3
 """Corners whose thickness is below this part of their extent count as coplanar."""
 
-AMBIGUITY_RATIO = 2.0
-"""Of two poses whose weighted squared errors differ by less than this factor, corners alone can't tell which one is true."""
+AMBIGUITY = 16.0
+"""Corners can't tell two poses apart whose weighted squared errors differ by less than this: the worse one is less likely by a
+factor of exp(8) at most.
+"""
 
 
 class RecalibrationRefused(ValueError):
@@ -50,14 +52,19 @@ def recalibrate(
     if spread[1] <= COPLANAR_RATIO * spread[0]:
         raise RecalibrationRefused("the corners lie on a line")
     method = cv2.SOLVEPNP_IPPE if coplanar else cv2.SOLVEPNP_SQPNP
-    found, rotations, translations, _ = cv2.solvePnPGeneric(points_grip_m, measured_xy, np.eye(3), None, flags=method)
+    try:
+        found, rotations, translations, _ = cv2.solvePnPGeneric(
+            points_grip_m, measured_xy, np.eye(3), None, flags=method
+        )
+    except cv2.error as error:
+        raise RecalibrationRefused(f"the corners' images don't determine a pose ({error.err})") from None
     starts = [make_transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in zip(rotations, translations, strict=True)]
     starts = [start for start in starts if (points_grip_m @ start[2, :3] + start[2, 3] > 0.0).all()]
     if not found or not starts:
         raise RecalibrationRefused("no pose has all corners in front of the camera")
     weight_xy = np.linalg.inv(covariance_xy)
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
-    return _choose(refined, expected_cam_T_grip)
+    return _choose(refined, expected_cam_T_grip, len(points_grip_m))
 
 
 def _refine(
@@ -86,9 +93,12 @@ def _refine(
     return Recalibration(cam_T_grip, np.linalg.inv(normal), float(np.sqrt(error / residual.size)))
 
 
-def _choose(refined: list[Recalibration], expected_cam_T_grip: Array) -> Recalibration:
+def _choose(refined: list[Recalibration], expected_cam_T_grip: Array, corners: int) -> Recalibration:
     best = min(refined, key=lambda r: r.weighted_rms)
-    rivals = [r for r in refined if r.weighted_rms**2 <= AMBIGUITY_RATIO * best.weighted_rms**2]
+    squares, freedom = 2 * corners * best.weighted_rms**2, 2 * corners - 6
+    # Where even the best pose fits badly, the corners' covariances are too small and so are differences in their units.
+    largest = squares + AMBIGUITY * max(1.0, squares / freedom)
+    rivals = [r for r in refined if 2 * corners * r.weighted_rms**2 <= largest]
 
     def turn(candidate: Recalibration) -> float:
         return float(np.linalg.norm(perturbation_between(expected_cam_T_grip, candidate.cam_T_grip)[3:]))
