@@ -1,8 +1,9 @@
 """The differential update: equation (17) of the self-viewing method, weighted and re-linearised on the manifold.
 
-With a corner predicted at ``(x, y, z)`` in the camera frame and measured at ``(X, Y)`` (undistorted), ``X z' = f x'`` and ``Y z' = f y'`` are linear
-in the motion ``(delta, d)`` of equations (11)-(13).  Here f = 1: image points are normalised.  The paper stops at the
-matrix ``I + Delta``, which is a rotation to first order only; the motion is applied as a rotation here and the equations set up again.
+With a corner predicted at ``(x, y, z)`` in the camera frame and measured at ``(X, Y)`` (undistorted), ``X z' = f x'``
+and ``Y z' = f y'`` are linear in the motion ``(delta, d)`` of equations (11)-(13).  Here f = 1: image points are
+normalised.  The paper stops at the matrix ``I + Delta``, which is a rotation to first order only; the motion is
+applied as a rotation here and the equations set up again.
 """
 
 from __future__ import annotations
@@ -50,9 +51,9 @@ def differential_update(
 ) -> Update:
     """Motion of the gripper in the camera frame from n >= 3 corners that are not collinear.
 
-    ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2) and ``covariance_xy`` (n, 2, 2): where they were
-    measured, ideal coordinates; ``tcp_cam_m`` (3,): the transform's translation.  Raises :class:`DegenerateGeometry` for fewer
-    than three corners or a singular system.
+    ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2) and ``covariance_xy``
+    (n, 2, 2): where they were measured, ideal coordinates; ``tcp_cam_m`` (3,): the transform's translation.  Raises
+    :class:`DegenerateGeometry` for fewer than three corners or a singular system.
     """
     if len(points_cam_m) < 3:
         raise DegenerateGeometry(f"{len(points_cam_m)} corners; the update needs at least 3")
@@ -74,7 +75,9 @@ def differential_update(
 
 
 def _about_tcp(rows: Array, tcp_cam_m: Array) -> Array:
-    """Rows for (delta, d), a motion about the camera's origin, as rows for (rho, omega) at the TCP: d = rho - omega x tcp."""
+    """Rows for (delta, d), a motion about the camera's origin, as rows for (rho, omega) at the TCP: d = rho - omega x
+    tcp.
+    """
     out = np.empty_like(rows)
     out[..., :3] = rows[..., 3:]
     out[..., 3:] = rows[..., :3] + rows[..., 3:] @ skew(tcp_cam_m)
@@ -82,7 +85,9 @@ def _about_tcp(rows: Array, tcp_cam_m: Array) -> Array:
 
 
 def _inverse(normal: Array) -> Array:
-    """Inverse of a normal matrix whose unknowns have different units; :class:`DegenerateGeometry` if a direction is undetermined."""
+    """Inverse of a normal matrix whose unknowns have different units; :class:`DegenerateGeometry` if a direction is
+    undetermined.
+    """
     scale = np.sqrt(np.diag(normal))
     if not (scale > 0.0).all():
         raise DegenerateGeometry("the corners don't determine all six parameters")

@@ -1,8 +1,8 @@
 """SE(3) in plain arrays, for the per-frame path.  Off that path use ``scipy.spatial.transform``.
 
-A transform is a 4x4 float64 array ``a_T_b`` that maps homogeneous coordinates in frame b to frame a.  A perturbation of a
-transform is ``xi = (rho, omega)``: ``t_true = t + rho`` and ``R_true = exp(omega) R``, both in axes of frame a, as in the published
-covariance.
+A transform is a 4x4 float64 array ``a_T_b`` that maps homogeneous coordinates in frame b to frame a.  A perturbation
+of a transform is ``xi = (rho, omega)``: ``t_true = t + rho`` and ``R_true = exp(omega) R``, both in axes of frame a,
+as in the published covariance.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """What the camera sees of the gripper: corners, edges and faces of its fingers, and how they move with the jaws.
 
-Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes from a YAML
-file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or as a
-table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
+Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes
+from a YAML file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or
+as a table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
 """
 
 from __future__ import annotations
@@ -98,8 +98,9 @@ class EdgeView:
     """How the edges show from one viewpoint: arrays over all edges of the gripper.
 
     ``visible``: at least one adjacent face looks at the camera (or the gripper has no faces there).  ``crease``: both
-    adjacent faces do, so that the edge is a line between two shades of the finger, not its outline.  ``inside_point_m`` (e, 3):
-    a point of the visible adjacent face, gripper frame, that tells on which side of an outline the finger lies; NaN if unknown.
+    adjacent faces do, so that the edge is a line between two shades of the finger, not its outline.
+    ``inside_point_m`` (e, 3): a point of the visible adjacent face, gripper frame, that tells on which side of an
+    outline the finger lies; NaN if unknown.
     """
 
     visible: NDArray[np.bool_]
@@ -145,7 +146,9 @@ class Gripper:
         self._check()
 
     def points_grip_m(self, jaw_opening_m: float | None = None) -> Array:
-        """All points (p, 3) in the gripper frame at an opening (nominal if None); outside the jaw's range: ValueError."""
+        """All points (p, 3) in the gripper frame at an opening (nominal if None); outside the jaw's range:
+        ValueError.
+        """
         if jaw_opening_m is None or not self.has_jaw:
             return self._nominal_points_m
         if not self.jaw_min_m - 1e-9 <= jaw_opening_m <= self.jaw_max_m + 1e-9:
@@ -153,7 +156,9 @@ class Gripper:
         return self._nominal_points_m + self._finger_offsets_m(jaw_opening_m)[self.point_finger]
 
     def point_motion(self, jaw_opening_m: float) -> Array:
-        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is piecewise linear)."""
+        """Derivative (p, 3) of all points by the jaw opening, m/m (central difference over 0.1 mm: motion is
+        piecewise linear).
+        """
         low, high = max(jaw_opening_m - 5e-5, self.jaw_min_m), min(jaw_opening_m + 5e-5, self.jaw_max_m)
         if not high > low:
             return np.zeros_like(self._nominal_points_m)
@@ -171,12 +176,12 @@ class Gripper:
         for i in np.flatnonzero(seen.sum(axis=1) == 1):
             face = self.faces[self._edge_faces[i, 0 if seen[i, 0] else 1]]
             inside[i] = points_grip_m[face.points].mean(axis=0)
-        return EdgeView(visible, crease, inside)
+        return EdgeView(np.asarray(visible), crease, inside)
 
     def corners_visible(self, points_grip_m: Array, eye_grip_m: Array) -> NDArray[np.bool_]:
         """(c,) whether a face at the corner looks at the camera; True for corners without faces."""
         facing = self._facing(points_grip_m, eye_grip_m)
-        return ~self._corner_faces.any(axis=1) | (self._corner_faces & facing[:-1]).any(axis=1)
+        return np.asarray(~self._corner_faces.any(axis=1) | (self._corner_faces & facing[:-1]).any(axis=1))
 
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
         """Indices of the edges that end in a corner (index into ``corner_ids``)."""

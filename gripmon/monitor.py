@@ -44,7 +44,7 @@ from gripmon.records import (
 )
 from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
 
-USUAL_SHARE = 0.8
+USUAL_SHARE = 0.9
 """Share of agreeing profiles that is expected before anything is known about this gripper."""
 
 USUAL_RATES = (0.02, 0.1)
@@ -149,8 +149,8 @@ class Monitor:
     def _measure(self, frame: Frame) -> Measurement:
         """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually.
 
-        A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for in the first
-        frames, then in one of several.
+        A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is
+        searched for in the first frames, then in one of several.
         """
         search = self._settings.corners.search
         reported_m = frame.jaw_opening_m
@@ -175,7 +175,9 @@ class Monitor:
         return measurement
 
     def _update(self, measurement: Measurement) -> tuple[Array, Array]:
-        """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation (17)."""
+        """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation
+        (17).
+        """
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         usable = measurement.corners.usable
         if self._settings.measurement == "corners" and np.count_nonzero(usable) >= 3:
@@ -242,8 +244,9 @@ class Monitor:
         before = self._drift()
         self._set_reference(new_T, new_covariance + self._floor, stamp_ns, "recalibration")
         return self._policy.recalibrated(
-            f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} degrees; "
-            f"it was calibrated anew from {np.count_nonzero(usable)} corners: revision {self._reference.revision}"
+            f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} "
+            f"degrees; it was calibrated anew from {np.count_nonzero(usable)} corners: "
+            f"revision {self._reference.revision}"
         )
 
     def _set_reference(self, cam_T_grip: Array, covariance: Array, stamp_ns: int, origin: str) -> None:

@@ -1,8 +1,9 @@
 """Judging what was measured: states, verdicts, alerts, and when to recalibrate.
 
-Drift is decided by a sequential test, not by a bare threshold.  For every axis and sign the log-likelihood ratio of "shifted by the smallest
-drift worth noticing" against "not shifted" is summed up and cut at zero (CUSUM, Page 1954).  Without drift such a sum of independent frames
-reaches ``h`` after exp(h) frames on average or later (Lorden 1971), so that ``h`` follows from the false alarms a day that are tolerated.
+Drift is decided by a sequential test, not by a bare threshold.  For every axis and sign the log-likelihood ratio of
+"shifted by the smallest drift worth noticing" against "not shifted" is summed up and cut at zero (CUSUM, Page 1954).
+Without drift such a sum of independent frames reaches ``h`` after exp(h) frames on average or later (Lorden 1971), so
+that ``h`` follows from the false alarms a day that are tolerated.
 """
 
 from __future__ import annotations
@@ -84,8 +85,9 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the motion ``d_m`` and
-    ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, and what would explain a drift.
+    """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
+    motion ``d_m`` and ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, and what
+    would explain a drift.
     """
 
     shift: Array
@@ -114,7 +116,9 @@ class DriftTest:
         self._sums = np.zeros((2, 6))
 
     def add(self, shift: Array, sigma: Array) -> bool:
-        """One frame's shift against the reference (6,) and its standard deviations; True while a drift is established."""
+        """One frame's shift against the reference (6,) and its standard deviations; True while a drift is
+        established.
+        """
         gain = self.smallest / sigma**2
         centred, half = gain * shift, 0.5 * gain * self.smallest
         # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
@@ -148,7 +152,7 @@ class Policy:
         self.state = State.ACQUIRING
         self._since_jump = 0
         self._still = 0
-        self._still_shift = np.zeros(6)
+        self._still_shift: Array = np.zeros(6)
         self._drift_alerted = False
         self._bad_since_s: float | None = None
         self._bad_alerted = False
@@ -166,7 +170,7 @@ class Policy:
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
         recalibrate = False
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
-            state = State.ACQUIRING if self.state is State.LOST else self.state
+            state: State = State.ACQUIRING if self.state is State.LOST else self.state
         elif past_limit and settings.recalibrate:
             state = State.RECALIBRATING
             recalibrate = self._still >= settings.settle_frames
@@ -197,7 +201,9 @@ class Policy:
         return not self._drift_alerted and self.test.suspicious
 
     def unmeasured(self, stamp_s: float, refusal: str | None, has_transform: bool) -> Judgement:
-        """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper isn't seen in it."""
+        """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper
+        isn't seen in it.
+        """
         settings = self._settings
         self._since_jump = self._still = 0
         if self._bad_since_s is None:
@@ -233,7 +239,9 @@ class Policy:
         return np.square(rates) * held_s
 
     def _count_still(self, evidence: Evidence) -> None:
-        """Frames since the transform last left the place where it came to rest: by half the smallest drift, and beyond its noise."""
+        """Frames since the transform last left the place where it came to rest: by half the smallest drift, and
+        beyond its noise.
+        """
         leeway = np.maximum(0.5 * self.test.smallest, 5.0 * evidence.sigma)
         if evidence.jumped or self._still == 0 or (np.abs(evidence.shift - self._still_shift) > leeway).any():
             self._still, self._still_shift = 1, evidence.shift
@@ -259,4 +267,5 @@ def _drift_alert(evidence: Evidence, past_limit: bool) -> Alert:
 
 def _shift_text(evidence: Evidence) -> str:
     x, y, z = (1e3 * evidence.shift[:3]).tolist()
-    return f"TCP now {x:+.3f} {y:+.3f} {z:+.3f} mm, turned by {math.degrees(evidence.delta_rad):.3f} degrees against the reference"
+    turned = f"turned by {math.degrees(evidence.delta_rad):.3f} degrees"
+    return f"TCP now {x:+.3f} {y:+.3f} {z:+.3f} mm, {turned} against the reference"

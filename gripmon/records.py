@@ -1,24 +1,27 @@
 """The records that travel between rooms, and what of them goes over the wire.
 
 Everything here is a value: frozen, without behaviour beyond packing.  The structs are encoded by ``msgspec``; the field
-names of :class:`FrameRecord` are the contract of one JSON line a frame (``gripmon replay``) and of the ``transform`` key.
+names of :class:`FrameRecord` are the contract of one JSON line a frame (``gripmon replay``) and of the ``transform``
+key.
 
-Conventions: ``a_T_b`` maps coordinates in frame b to frame a; quaternions are ``x, y, z, w``; SI units; ``*_ns`` are Unix
-nanoseconds for capture time.  A covariance is 6x6, row by row: first the error of the TCP's position in camera axes
-(m²), then the rotation error vector in camera axes (rad²), that is ``t_true = t + rho`` and ``R_true = exp(omega) R``.
+Conventions: ``a_T_b`` maps coordinates in frame b to frame a; quaternions are ``x, y, z, w``; SI units; ``*_ns`` are
+Unix nanoseconds for capture time.  A covariance is 6x6, row by row: first the error of the TCP's position in camera
+axes (m²), then the rotation error vector in camera axes (rad²), that is ``t_true = t + rho`` and ``R_true =
+exp(omega) R``.
 """
 
 from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Image = NDArray[np.generic]
+Array = NDArray[np.floating[Any]]
+Image = NDArray[np.integer[Any] | np.floating[Any]]
 
 
 class Verdict(enum.StrEnum):
@@ -114,8 +117,8 @@ class Frame:
     """One camera frame as a source hands it over.
 
     ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
-    (truncated file, failed read); ``fault`` then says why in a few words.  ``jaw_opening_m`` is what the robot reported for this
-    frame, None if nobody did.  ``name`` is the file or stream that the frame came from.
+    (truncated file, failed read); ``fault`` then says why in a few words.  ``jaw_opening_m`` is what the robot
+    reported for this frame, None if nobody did.  ``name`` is the file or stream that the frame came from.
     """
 
     seq: int
@@ -138,7 +141,9 @@ class Smoothed(msgspec.Struct, frozen=True):
 
 
 class Drift(msgspec.Struct, frozen=True):
-    """Motion against the reference: ``d`` and ``delta`` of equation (14) and the TCP's displacement in the camera frame."""
+    """Motion against the reference: ``d`` and ``delta`` of equation (14) and the TCP's displacement in the camera
+    frame.
+    """
 
     translation_m: float
     rotation_rad: float
@@ -146,7 +151,9 @@ class Drift(msgspec.Struct, frozen=True):
 
 
 class CornerRecord(msgspec.Struct, frozen=True):
-    """A corner in one frame: where it was measured (None if it was not), its standard deviation in px (the larger axis)."""
+    """A corner in one frame: where it was measured (None if it was not), its standard deviation in px (the larger
+    axis).
+    """
 
     id: str
     uv_px: tuple[float, float] | None
@@ -238,9 +245,9 @@ class AlertRecord(msgspec.Struct, frozen=True):
 class MeasurementTrace:
     """Pixels behind the newest record, for people who look: all positions in the distorted image, px.
 
-    ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether the fit believed them, ``edge_index`` (n,)
-    the gripper edge each belongs to; ``predicted_edges_uv_px`` one polyline (k, 2) a visible edge; ``predicted_corners_uv_px`` (c, 2)
-    in the order of the gripper model, NaN where a corner is not visible.
+    ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether the fit believed them,
+    ``edge_index`` (n,) the gripper edge each belongs to; ``predicted_edges_uv_px`` one polyline (k, 2) a visible
+    edge; ``predicted_corners_uv_px`` (c, 2) in the order of the gripper model, NaN where a corner is not visible.
     """
 
     edge_uv_px: Array

@@ -1,7 +1,7 @@
 """The transform averaged over time: a Kalman filter for a camera that stands still or creeps.
 
-The state is the pose itself, its covariance that of ``xi = (rho, omega)``.  Between frames the pose may wander like a random walk;
-an innovation that the two covariances don't explain, twice in a row, starts the average anew.
+The state is the pose itself, its covariance that of ``xi = (rho, omega)``.  Between frames the pose may wander like a
+random walk; an innovation that the two covariances don't explain, twice in a row, starts the average anew.
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array
 
 GATE = 37.7
-"""Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of freedom)."""
+"""Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of
+freedom).
+"""
 
 
 class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

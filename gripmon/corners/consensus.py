@@ -1,8 +1,9 @@
 """Step 4 of the corner measurement: one robust fit of all edge candidates in the six parameters of the motion.
 
-Lines that are fitted one by one lock onto straight edges of the background; a rigid gripper leaves only six ways to be wrong.
-Candidates vote with Tukey's biweight about a hypothesis; hypotheses come from the prediction or, after a jump, from a grid of starts.
-The residual of a candidate is its offset along the profile minus ``jacobian @ xi``, in px.
+Lines that are fitted one by one lock onto straight edges of the background; a rigid gripper leaves only six ways to
+be wrong. Candidates vote with Tukey's biweight about a hypothesis; hypotheses come from the prediction or, after a
+jump, from a grid of starts. The residual of a candidate is its offset along the profile minus ``jacobian @ xi``, in
+px.
 """
 
 from __future__ import annotations
@@ -75,10 +76,11 @@ _CONVERGED = 1e-3  # squared step over its covariance: three hundredths of a sta
 class Consensus:
     """The common motion of the edge candidates.
 
-    ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in 1/px², zero for
-    those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper
-    ``edge_share`` (e,) share of its profiles that agree and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring profiles in which
-    both agree, on edges that are seen; zero with fewer than three such edges.
+    ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in
+    1/px², zero for those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust
+    spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper ``edge_share``
+    (e,) share of its profiles that agree and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring
+    profiles in which both agree, on edges that are seen; zero with fewer than three such edges.
     """
 
     xi: Array
@@ -101,8 +103,9 @@ def base_weights(
 ) -> Array:
     """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
 
-    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  What moves a whole edge at once (pixel grid, shading, a bevel with the spread
-    of a uniform distribution, bevel / sqrt(12)) makes n points on it worth no more than one with that spread.
+    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  What moves a whole edge at once (pixel grid,
+    shading, a bevel with the spread of a uniform distribution, bevel / sqrt(12)) makes n points on it worth no more
+    than one with that spread.
     """
     edge = prediction.layout.edge[candidates.sample]
     points = np.bincount(prediction.layout.edge, minlength=len(bevel_m))
@@ -127,10 +130,12 @@ def agree(
     prior: Array,
     settings: ConsensusSettings,
 ) -> Consensus:
-    """Robust fit from one start: iteratively re-weighted, the width shrinking from ``start_width_px`` to the measured scale.
+    """Robust fit from one start: iteratively re-weighted, the width shrinking from ``start_width_px`` to the measured
+    scale.
 
-    ``weights`` (k,) from :func:`base_weights`; ``prior`` (m,) holds each unknown at ``prior_mean`` by that much (1/m², 1/rad²), as
-    a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start and supports nothing.
+    ``weights`` (k,) from :func:`base_weights`; ``prior`` (m,) holds each unknown at ``prior_mean`` by that much
+    (1/m², 1/rad²), as a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start
+    and supports nothing.
     """
     jacobian = prediction.jacobian_by_unknown[:, candidates.sample]
     offset = candidates.offset_px
@@ -173,7 +178,8 @@ def agree_from_grid(
 
 
 def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> Array:
-    """Starts (g, m) that shift the image by a grid of ``step_px``, turn it and scale it: the motions that a camera shows at first order.
+    """Starts (g, m) that shift the image by a grid of ``step_px``, turn it and scale it: the motions that a camera
+    shows at first order.
 
     Expressed as translations of the gripper across the axis, rotation about the optical axis, and translation along it.
     """
@@ -212,9 +218,9 @@ def _step(
 def noise_inflation(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> float:
     """Factor >= 1 by which the fit's covariance must grow so that it matches the residuals.
 
-    Edge points are worth less than their image noise says: texture on and behind an edge moves them, and neighbours err together.
-    Both show in the means of whole stretches of an edge: with independent errors of the assumed size the weighted squares of these
-    means add up to the number of stretches less the number of unknowns.
+    Edge points are worth less than their image noise says: texture on and behind an edge moves them, and neighbours
+    err together. Both show in the means of whole stretches of an edge: with independent errors of the assumed size
+    the weighted squares of these means add up to the number of stretches less the number of unknowns.
     """
     inlier = np.flatnonzero(consensus.weight)
     stretch = prediction.layout.stretch[candidates.sample[inlier]]
@@ -231,8 +237,8 @@ def noise_inflation(candidates: Candidates, prediction: Prediction, consensus: C
 def prior_information(jaw_sigma_m: float | None) -> Array:
     """Prior information (m,): far below what any usable view gives, it only keeps a view without information solvable.
 
-    With a ``jaw_sigma_m`` the jaw opening is the seventh unknown, and the reported one is worth that standard deviation (at least a
-    micrometre, which stands for "exact").
+    With a ``jaw_sigma_m`` the jaw opening is the seventh unknown, and the reported one is worth that standard
+    deviation (at least a micrometre, which stands for "exact").
     """
     pose = [1.0 / 0.1**2] * 3 + [1.0] * 3
     return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
@@ -259,7 +265,9 @@ def _judge(
     scale_px: float,
     settings: ConsensusSettings,
 ) -> Consensus:
-    """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate anyway."""
+    """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate
+    anyway.
+    """
     edges = len(prediction.line_origin)
     edge_of = prediction.layout.edge
     sample = candidates.sample if active is None else candidates.sample[active]

@@ -1,7 +1,8 @@
-"""Step 5 of the corner measurement: a line for each edge through the points that agreed, corners where adjacent lines meet.
+"""Step 5 of the corner measurement: a line for each edge through the points that agreed, corners where adjacent lines
+meet.
 
-Lines live in ideal coordinates, where a straight edge is straight: the offset ``e`` of a point from its predicted line is fitted by
-``e = a + b * along``.  Corners come with a 2x2 covariance each, and a reason when they are refused.
+Lines live in ideal coordinates, where a straight edge is straight: the offset ``e`` of a point from its predicted
+line is fitted by ``e = a + b * along``.  Corners come with a 2x2 covariance each, and a reason when they are refused.
 """
 
 from __future__ import annotations
@@ -38,8 +39,9 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 @dataclass(frozen=True, slots=True)
 class Corners:
-    """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy`` (c, 2, 2),
-    ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each; NaN where there is a fault.
+    """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy``
+    (c, 2, 2), ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each; NaN where there
+    is a fault.
     """
 
     xy: Array
@@ -55,11 +57,13 @@ class Corners:
 
 @dataclass(frozen=True, slots=True)
 class CornerGeometry:
-    """What of the intersections doesn't depend on the image, for one prediction; c corners with at most three edges each.
+    """What of the intersections doesn't depend on the image, for one prediction; c corners with at most three edges
+    each.
 
-    ``edges`` (c, 3) indices, -1 where there are fewer; ``slot`` (c, 3) their places among the sampled edges, -1 for none; ``along``
-    (c, 3) the predicted corner on each line; ``direction`` and ``right`` (c, 3, 2) of the lines; ``beside`` (c, 3, 2) first and last + 1 of the profiles
-    next to the corner; ``fault`` the reason why a corner can't be measured in this view, whatever the image.
+    ``edges`` (c, 3) indices, -1 where there are fewer; ``slot`` (c, 3) their places among the sampled edges, -1 for
+    none; ``along`` (c, 3) the predicted corner on each line; ``direction`` and ``right`` (c, 3, 2) of the lines;
+    ``beside`` (c, 3, 2) first and last + 1 of the profiles next to the corner; ``fault`` the reason why a corner
+    can't be measured in this view, whatever the image.
     """
 
     edges: NDArray[np.intp]
@@ -120,10 +124,11 @@ def intersect_edges(
     geometry: CornerGeometry,
     settings: CornerSettings,
 ) -> Corners:
-    """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges meet.
+    """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges
+    meet.
 
-    A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift of the corner with
-    ``(right - slope * direction) . shift = offset + slope * along``.
+    A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
+    of the corner with ``(right - slope * direction) . shift = offset + slope * along``.
     """
     lines = _fit_lines(candidates, prediction, consensus)[:, geometry.slot]
     offset, slope, var_offset, covariance, var_slope = lines
@@ -157,8 +162,8 @@ def intersect_edges(
 def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> Array:
     """Weighted straight lines ``e = offset + slope * along`` through the agreed points of every sampled edge at once.
 
-    (5, v + 1): offset, slope, variance of the offset, covariance, variance of the slope; NaN for edges with fewer than four points
-    and in the last column, which stands for "no edge" (slot -1).
+    (5, v + 1): offset, slope, variance of the offset, covariance, variance of the slope; NaN for edges with fewer than
+    four points and in the last column, which stands for "no edge" (slot -1).
     """
     first = prediction.layout.first
     inlier = np.flatnonzero(consensus.weight)

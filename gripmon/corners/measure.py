@@ -1,7 +1,7 @@
 """The corner measurement as one: from an image and an expected pose to edge points that agree, and corners.
 
-The cheap way is tried first: profiles about the expected pose and one robust fit.  Only when too few profiles agree are other starts
-tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
+The cheap way is tried first: profiles about the expected pose and one robust fit.  Only when too few profiles agree
+are other starts tried, and only when those fail, too, is the gripper searched for in the whole neighbourhood.
 """
 
 from __future__ import annotations
@@ -86,7 +86,9 @@ class Effort(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Patience:
-    """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where there is none."""
+    """Whether to look further, which takes the time of many frames: where the fit may be true but is poor, and where
+    there is none.
+    """
 
     when_doubtful: bool
     when_lost: bool
@@ -96,8 +98,9 @@ class Patience:
 class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
-    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening), already multiplied by ``inflation``, the factor by which the residuals exceed
-    the image noise; ``jaw_surprise``: the seen jaw opening against the reported one, in standard deviations of the latter.
+    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening), already multiplied by ``inflation``, the factor by
+    which the residuals exceed the image noise; ``jaw_surprise``: the seen jaw opening against the reported one, in
+    standard deviations of the latter.
 
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
@@ -124,7 +127,9 @@ class Measurement:
         return prediction.corners_cam_m + opened_m * prediction.corners_jaw_rate
 
     def corner_rms_px(self, cam_T_grip: Array) -> float | None:
-        """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without corners."""
+        """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without
+        corners.
+        """
         usable = self.corners.usable
         if not usable.any():
             return None
@@ -146,7 +151,9 @@ class _Expected:
 
 
 class FingertipMeter:
-    """Measures one gripper with one camera.  Keeps the prediction between calls and nothing that depends on the images."""
+    """Measures one gripper with one camera.  Keeps the prediction between calls and nothing that depends on the
+    images.
+    """
 
     def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
         self._camera, self._gripper, self._settings = camera, gripper, settings
@@ -166,10 +173,11 @@ class FingertipMeter:
         patience: Patience,
         jaw_reported: bool = True,
     ) -> Measurement:
-        """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to start from).
+        """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to
+        start from).
 
-        ``usual_share`` of the profiles agree when all is well.  With clearly less, and where ``patience`` allows, the gripper is looked for
-        elsewhere, and the place with the largest share is returned.
+        ``usual_share`` of the profiles agree when all is well.  With clearly less, and where ``patience`` allows, the
+        gripper is looked for elsewhere, and the place with the largest share is returned.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
@@ -180,7 +188,8 @@ class FingertipMeter:
         trusted = self._trusted(best, usual_share)
         if not (patience.when_doubtful if trusted else patience.when_lost):
             return replace(best, trusted=trusted)
-        # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may be true.
+        # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
+        # be true.
         beat = CLEARLY_BETTER * best.consensus.share if trusted else best.consensus.share
         for look in (self._from_grid, self._search):
             other = look(image, expected)
@@ -196,7 +205,9 @@ class FingertipMeter:
         return measurement.consensus.share >= max(needed, TRUSTED * usual_share)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
-        """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at most."""
+        """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
+        most.
+        """
         for _ in range(3):
             prediction, start = self._predicted(expected)
             candidates, weights = self._look(image, prediction)
@@ -234,14 +245,15 @@ class FingertipMeter:
         settings = self._settings
         prior_mean = self._prior_mean(prediction, expected)
         starts = grid_of_starts(prediction, settings.sampling.reach_px, settings.consensus.start_width_px)
-        starts = starts + self._from_prediction(prediction, expected)
         consensus = agree_from_grid(
-            candidates, prediction, weights, starts, prior_mean, self._prior, settings.consensus
+            candidates, prediction, weights, starts + start, prior_mean, self._prior, settings.consensus
         )
         return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
-        """Starts from the reduced image: all are tried roughly, with the edges sampled as before; the most promising are settled."""
+        """Starts from the reduced image: all are tried roughly, with the edges sampled as before; the most promising
+        are settled.
+        """
         prediction, here = self._predicted(expected)
         settings = self._settings
         tried = []
@@ -260,7 +272,9 @@ class FingertipMeter:
         return replace(max(found, key=_agreement) if found else self._settle(image, expected), effort=Effort.SEARCH)
 
     def _predicted(self, expected: _Expected) -> tuple[Prediction, Array]:
-        """The kept prediction while it holds, else a new one at the expected pose; and the unknowns (m,) from it to there."""
+        """The kept prediction while it holds, else a new one at the expected pose; and the unknowns (m,) from it to
+        there.
+        """
         kept = self._prediction
         if kept is not None and len(kept.uv_px):
             start = self._from_prediction(kept, expected)
@@ -304,7 +318,9 @@ class FingertipMeter:
         return candidates, base_weights(candidates, prediction, polarity, bevel_m, settings.consensus)
 
     def _jaw_surprise(self, prediction: Prediction, xi: Array, prior_mean: Array) -> float:
-        """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a jaw."""
+        """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a
+        jaw.
+        """
         return float((xi[6] - prior_mean[6]) * np.sqrt(self._prior[6])) if len(self._prior) == 7 else 0.0
 
     def _from_prediction(self, prediction: Prediction, expected: _Expected) -> Array:

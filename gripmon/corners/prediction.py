@@ -53,8 +53,8 @@ CORNER_MARGIN_PX = 2.0
 class EdgeLayout:
     """Which part of which edge is sampled how densely; holds while the view changes by some pixels only.
 
-    ``edge`` (n,) ascending edge indices, ``fraction`` (n,) position between the edge's two ends, ``first`` (v,) index of each visible edge's
-    first sample and ``edges`` (v,) the visible edges themselves.
+    ``edge`` (n,) ascending edge indices, ``fraction`` (n,) position between the edge's two ends, ``first`` (v,) index
+    of each visible edge's first sample and ``edges`` (v,) the visible edges themselves.
     """
 
     edge: NDArray[np.intp]
@@ -77,12 +77,12 @@ class EdgeLayout:
 class Prediction:
     """The predicted edges at one pose; n samples, v visible edges, c corners.
 
-    ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking along the edge.
-    ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform and, where the jaw opening is an
-    unknown too, by the opening (px/m).
-    ``along`` (n,) and ``gain`` (n,): ideal coordinate along the edge's line, and ideal distance from the line for each px of offset along the
-    normal.  ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies in the image.
-    ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.
+    ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking
+    along the edge. ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform
+    and, where the jaw opening is an unknown too, by the opening (px/m). ``along`` (n,) and ``gain`` (n,): ideal
+    coordinate along the edge's line, and ideal distance from the line for each px of offset along the normal.
+    ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
+    in the image. ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.
     """
 
     cam_T_grip: Array
@@ -136,14 +136,18 @@ class Prediction:
         return float(np.hypot(*end))
 
     def moved_px(self, xi: Array) -> float:
-        """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the linearisation pose."""
+        """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
+        linearisation pose.
+        """
         return float(np.abs(self.jacobian[:, : len(xi)] @ xi).max(initial=0.0))
 
 
 def lay_out(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings
 ) -> EdgeLayout:
-    """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its length."""
+    """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its
+    length.
+    """
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
@@ -162,8 +166,8 @@ def lay_out(
     lengths = np.array([r[2] if r else 0.0 for r in ranges])
     counts = np.zeros(len(uv), dtype=int)
     if lengths.sum() > 0.0:
-        # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most one
-        # profile a pixel: closer ones see the same pixels again.
+        # Short edges across the fingers tell what long ones along them can't, so density falls with length.  At most
+        # one profile a pixel: closer ones see the same pixels again.
         share = np.sqrt(lengths)
         counts = np.minimum(np.round(settings.samples * share / share.sum()), lengths).astype(int)
     counts[counts < 4] = 0
@@ -184,7 +188,9 @@ def lay_out(
 def _sampled_range(
     coarse: Array, inside: NDArray[np.bool_], step_px: Array, margin_px: float
 ) -> tuple[float, float, float] | None:
-    """First and last fraction and length in px of the longest run of an edge inside the image, less the margin; None if nothing is left."""
+    """First and last fraction and length in px of the longest run of an edge inside the image, less the margin; None
+    if nothing is left.
+    """
     if not inside.any():
         return None
     change = np.flatnonzero(np.diff(np.concatenate([[0], inside.astype(np.int8), [0]])))
@@ -201,7 +207,7 @@ def _sampled_range(
 def _inside(camera: Camera, uv_px: Array, margin_px: float) -> NDArray[np.bool_]:
     limit = np.array([camera.width_px - 1.0, camera.height_px - 1.0]) - margin_px
     with np.errstate(invalid="ignore"):
-        return ((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1)
+        return np.asarray(((uv_px >= margin_px) & (uv_px <= limit)).all(axis=-1))
 
 
 def predict(
@@ -271,10 +277,11 @@ def predict(
 def _ideal_lines(
     points_cam_m: Array, normal: Array, d_uv: Array, layout: EdgeLayout, edge_count: int
 ) -> tuple[Array, Array, Array, Array]:
-    """The edges as straight lines in ideal coordinates, and how an offset in px along the image normal moves a point off its line.
+    """The edges as straight lines in ideal coordinates, and how an offset in px along the image normal moves a point
+    off its line.
 
-    ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal coordinates.  Lines of
-    edges that are not sampled are NaN.
+    ``d_uv`` (n, 2, 3) holds the lens: its first two columns times z are the derivative of pixels by ideal
+    coordinates.  Lines of edges that are not sampled are NaN.
     """
     if len(layout.edges) == 0:
         nowhere = np.full((edge_count, 2), np.nan)

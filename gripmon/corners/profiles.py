@@ -1,7 +1,7 @@
 """Step 3 of the corner measurement: sub-pixel edge candidates on the sampled profiles.
 
-The derivative of a Gaussian is applied to all profiles as one matrix product; every local extremum that stands out of the noise is a
-candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
+The derivative of a Gaussian is applied to all profiles as one matrix product; every local extremum that stands out of
+the noise is a candidate.  Which of them belong to the gripper is decided later, jointly (``consensus``).
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal, ``step`` (k,) signed
-    height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px`` (k,) standard deviation from image
-    noise.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of the image's type.
+    """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal,
+    ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px``
+    (k,) standard deviation from image noise.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest
+    grey level of the image's type.
     """
 
     sample: NDArray[np.intp]
@@ -68,7 +69,9 @@ def profile_offsets_px(reach_px: float) -> Array:
 
 
 def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Interpolate the image at the maps (n, s): float32 grey levels; colour is reduced to grey here, so that cost grows with edges."""
+    """Interpolate the image at the maps (n, s): float32 grey levels; colour is reduced to grey here, so that cost
+    grows with edges.
+    """
     if map_x.size == 0:
         return np.zeros(map_x.shape, dtype=np.float32)
     values = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
@@ -79,7 +82,7 @@ def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.fl
 
 def full_scale(image: Image) -> float:
     """Largest grey level of an image's type; 1 for float images."""
-    return float(np.iinfo(image.dtype).max) if np.issubdtype(image.dtype, np.integer) else 1.0
+    return 1.0 if np.issubdtype(image.dtype, np.floating) else float(np.iinfo(image.dtype.str).max)
 
 
 def quantum(image: Image) -> float:
@@ -100,12 +103,14 @@ def _kernel(samples: int, blur_px: float) -> _Kernel:
     matrix = np.zeros((samples, responses), dtype=np.float32)
     for k in range(responses):
         matrix[k : k + len(taps), k] = taps
-    # Pixels, not half-pixel samples, carry independent noise: bilinear interpolation spreads each over a triangle of one pixel.
+    # Pixels, not half-pixel samples, carry independent noise: bilinear interpolation spreads each over a triangle of
+    # one pixel.
     triangle = np.array([0.5, 1.0, 0.5])
     effective = np.convolve(taps, triangle)[::2]
     slope = np.gradient(np.convolve(taps, triangle), STEP_PX)[::2]
     response_noise = float(np.sqrt((effective**2).sum()))
-    # A step blurred by the lens (about 0.6 px) answers with a Gaussian of this width; its peak moves by noise' / curvature.
+    # A step blurred by the lens (about 0.6 px) answers with a Gaussian of this width; its peak moves by noise' /
+    # curvature.
     width_squared = blur_px**2 + 0.6**2
     return _Kernel(
         matrix, -(responses // 2) * STEP_PX, response_noise, float(np.sqrt((slope**2).sum())) * width_squared
@@ -122,7 +127,8 @@ def find_candidates(
 ) -> Candidates:
     """Local extrema of the edge response of profiles (n, s), refined by a parabola through three responses.
 
-    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`).  Nothing found is an empty result.
+    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`).  Nothing found is an empty
+    result.
     """
     kernel = _kernel(profiles.shape[1], settings.blur_px)
     response = profiles @ kernel.matrix
@@ -148,8 +154,9 @@ def find_candidates(
 def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:
     """Standard deviation of the image noise, grey levels, from the quiet parts of the profiles (n, s).
 
-    Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that the lower
-    quartile is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29 of it.
+    Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that
+    the lower quartile is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29
+    of it.
     """
     whole = profiles[::3, ::2]
     third = np.abs(whole[:, 3:] - whole[:, :-3] - 3.0 * (whole[:, 2:-1] - whole[:, 1:-2])).ravel()
@@ -157,6 +164,6 @@ def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float
     if not third.size:
         return floor
     quartile = float(np.partition(third, third.size // 4)[third.size // 4])
-    # Of a normal distribution a quarter lies within 0.3186 sigma; a third difference of white noise has variance 20, of which
-    # bilinear interpolation at a random phase leaves two thirds across each axis.
+    # Of a normal distribution a quarter lies within 0.3186 sigma; a third difference of white noise has variance 20,
+    # of which bilinear interpolation at a random phase leaves two thirds across each axis.
     return max(quartile / (0.3186 * math.sqrt(20.0 * 4.0 / 9.0)), floor)

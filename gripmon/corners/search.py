@@ -1,8 +1,8 @@
 """Finding the gripper again after a jump that is wider than the profiles reach.
 
-In an image reduced to some 160 columns, every predicted edge point asks for a gradient across its edge.  The answers, limited so that strong
-texture counts no more than a clear edge, are added up over shifts, turns about the optical axis and scales; the best places
-become starts for the joint fit on the full image.
+In an image reduced to some 160 columns, every predicted edge point asks for a gradient across its edge.  The answers,
+limited so that strong texture counts no more than a clear edge, are added up over shifts, turns about the optical
+axis and scales; the best places become starts for the joint fit on the full image.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 def search_starts(image: Image, prediction: Prediction, settings: SearchSettings) -> Array:
-    """Starts (s, m) for the joint fit, best first: perturbations of the prediction's pose.  Empty when nothing is predicted.
+    """Starts (s, m) for the joint fit, best first: perturbations of the prediction's pose.  Empty when nothing is
+    predicted.
 
     The pose's tilt isn't searched: within some degrees it shows as a shift, and the fit finds the rest.
     """
@@ -95,7 +96,9 @@ def _ticks(reach: float, step: float) -> list[float]:
 def _shift_of_tcp(
     prediction: Prediction, centre: Array, shift_px: tuple[float, float], turn: float, scale: float
 ) -> Array:
-    """Translation (2,) of the TCP, m, that moves the point seen at ``centre`` by ``shift_px`` when the gripper also turns and comes nearer."""
+    """Translation (2,) of the TCP, m, that moves the point seen at ``centre`` by ``shift_px`` when the gripper also
+    turns and comes nearer.
+    """
     tcp = prediction.cam_T_grip[:3, 3]
     lens = prediction.corners_d_uv_d_xy.mean(axis=0)
     tcp_uv = prediction.corners_uv_px.mean(axis=0) + lens @ (tcp[:2] / tcp[2] - prediction.corners_xy.mean(axis=0))
@@ -108,7 +111,9 @@ def _shift_of_tcp(
 
 
 def _edge_answers(image: Image, factor: float) -> NDArray[np.float32]:
-    """(o, h, w) for each orientation of the normal in [0, pi): squared cosine to the gradient, times a limited strength."""
+    """(o, h, w) for each orientation of the normal in [0, pi): squared cosine to the gradient, times a limited
+    strength.
+    """
     size = (max(16, round(image.shape[1] / factor)), max(16, round(image.shape[0] / factor)))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     if small.ndim == 3:

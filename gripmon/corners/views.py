@@ -36,9 +36,11 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
 
 
 def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array) -> Array:
-    """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that isn't sampled.
+    """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that
+    isn't sampled.
 
-    Edge points closer to that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach gets zeros.
+    Edge points closer to that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach
+    gets zeros.
     """
     prediction, candidates = measurement.prediction, measurement.candidates
     xi = perturbation_between(prediction.cam_T_grip, cam_T_grip)
