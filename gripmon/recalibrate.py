@@ -1,7 +1,7 @@
 """On-line recalibration: the full pose from measured corners, without the previous one.
 
-The start comes from OpenCV's closed forms (IPPE for coplanar corners, SQPNP else); the weighted refinement is ours, since it needs
-the corners' covariances and gives that of the pose.
+The start comes from OpenCV's closed forms (IPPE for coplanar corners, SQPNP else); the weighted refinement is ours,
+since it needs the corners' covariances and gives that of the pose.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ COPLANAR_RATIO = 1e-3
 """Corners whose thickness is below this part of their extent count as coplanar."""
 
 AMBIGUITY = 16.0
-"""Corners can't tell two poses apart whose weighted squared errors differ by less than this: the worse one is less likely by a
-factor of exp(8) at most.
+"""Corners can't tell two poses apart whose weighted squared errors differ by less than this: the worse one is less
+likely by a factor of exp(8) at most.
 """
 
 
@@ -29,7 +29,9 @@ class RecalibrationRefused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Recalibration:
-    """``cam_T_grip``, the covariance (6, 6) of its error, and the weighted rms of the residuals (1 if the corners' covariances hold)."""
+    """``cam_T_grip``, the covariance (6, 6) of its error, and the weighted rms of the residuals (1 if the corners'
+    covariances hold).
+    """
 
     cam_T_grip: Array
     covariance: Array
@@ -41,11 +43,14 @@ def recalibrate(
 ) -> Recalibration:
     """Pose from n >= 4 coplanar or n >= 6 general corners.
 
-    ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates with ``covariance_xy`` (n, 2, 2).  ``expected_cam_T_grip`` only decides between the two
-    poses of a plane that the residuals don't tell apart.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
+    ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates with ``covariance_xy`` (n, 2, 2).
+    ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals don't tell apart.  Raises
+    :class:`RecalibrationRefused` for too few or collinear corners.
     """
-    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False) if len(points_grip_m) else []
-    coplanar = len(spread) == 3 and spread[2] <= COPLANAR_RATIO * spread[0]
+    if len(points_grip_m) < 4:
+        raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least 4 coplanar ones or 6 are needed")
+    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False)
+    coplanar = bool(spread[2] <= COPLANAR_RATIO * spread[0])
     needed = 4 if coplanar else 6
     if len(points_grip_m) < needed:
         raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least {needed} are needed")
@@ -58,11 +63,14 @@ def recalibrate(
         )
     except cv2.error as error:
         raise RecalibrationRefused(f"the corners' images don't determine a pose ({error.err})") from None
-    starts = [make_transform(cv2.Rodrigues(r)[0], t.ravel()) for r, t in zip(rotations, translations, strict=True)]
+    starts = [
+        make_transform(np.asarray(cv2.Rodrigues(r)[0], float), np.asarray(t, float).ravel())
+        for r, t in zip(rotations, translations, strict=True)
+    ]
     starts = [start for start in starts if (points_grip_m @ start[2, :3] + start[2, 3] > 0.0).all()]
     if not found or not starts:
         raise RecalibrationRefused("no pose has all corners in front of the camera")
-    weight_xy = np.linalg.inv(covariance_xy)
+    weight_xy: Array = np.linalg.inv(covariance_xy)
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
     return _choose(refined, expected_cam_T_grip, len(points_grip_m))
 
