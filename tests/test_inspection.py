@@ -1,0 +1,114 @@
+"""Which frames are refused before anything is measured, why, and in which words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_models import cube_model
+from simulated import PAPER_LENS, sharp_gripper
+
+from gripmon.camera import make_camera
+from gripmon.gripper import gripper_from_dict
+from gripmon.inspection import inspect
+from gripmon.records import Frame, Refusal
+
+CAMERA, GRIPPER = make_camera(PAPER_LENS), sharp_gripper()
+HEIGHT, WIDTH = PAPER_LENS.height_px, PAPER_LENS.width_px
+RAMP = np.tile(np.linspace(0.1, 0.9, WIDTH), (HEIGHT, 1))
+
+
+def frame(image: object, jaw_opening_m: float | None = None, fault: str | None = None) -> Frame:
+    return Frame(0, 0, image, jaw_opening_m=jaw_opening_m, fault=fault)  # type: ignore[arg-type]
+
+
+def grey(level: float) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH), round(255 * level), np.uint8)
+
+
+def spoiled(value: float) -> np.ndarray:
+    image = RAMP.astype(np.float32)
+    image[HEIGHT // 2 :, : WIDTH // 2] = value
+    return image
+
+
+@pytest.mark.parametrize(
+    "image",
+    [
+        (RAMP * 255).astype(np.uint8),
+        (RAMP * 65535).astype(np.uint16),
+        RAMP.astype(np.float32),
+        np.repeat((RAMP * 255).astype(np.uint8)[..., None], 3, axis=2),
+        np.asfortranarray((RAMP * 255).astype(np.uint8)),
+        grey(0.5) + np.arange(WIDTH, dtype=np.uint8) % 5,  # hardly any contrast, but more than none
+        (RAMP * 0.05 * 255).astype(np.uint8),  # dark, but not black
+    ],
+    ids=["uint8", "uint16", "float32", "colour", "columns first", "faint", "dark"],
+)
+def test_frames_that_can_be_measured_pass(image: np.ndarray):
+    assert inspect(frame(image, 0.03), CAMERA, GRIPPER) is None
+
+
+@pytest.mark.parametrize(
+    ("image", "reason", "came", "right"),
+    [
+        (None, Refusal.NOT_AN_IMAGE, "there is no image", ""),
+        ([[1, 2], [3, 4]], Refusal.NOT_AN_IMAGE, "there is no image", ""),
+        (np.zeros(WIDTH, np.uint8), Refusal.WRONG_TYPE, "(768,)", "H x W"),
+        (np.zeros((HEIGHT, WIDTH, 4), np.uint8), Refusal.WRONG_TYPE, "(576, 768, 4)", "BGR"),
+        (np.zeros((2, HEIGHT, WIDTH, 3), np.uint8), Refusal.WRONG_TYPE, "(2, 576, 768, 3)", "H x W"),
+        (np.zeros((WIDTH, HEIGHT), np.uint8), Refusal.WRONG_SIZE, "576x768", "768x576"),
+        (np.zeros((HEIGHT // 2, WIDTH // 2), np.uint8), Refusal.WRONG_SIZE, "384x288", "768x576"),
+        (np.zeros((0, 0), np.uint8), Refusal.WRONG_SIZE, "0x0", "768x576"),
+        (RAMP, Refusal.WRONG_TYPE, "float64", "uint8, uint16 or float32"),
+        ((RAMP * 100).astype(np.int16), Refusal.WRONG_TYPE, "int16", "uint8, uint16 or float32"),
+        (RAMP > 0.5, Refusal.WRONG_TYPE, "bool", "uint8, uint16 or float32"),
+        ((RAMP * 255).astype(np.float32), Refusal.WRONG_TYPE, "to 227", "0 to 1"),
+        (RAMP.astype(np.float32) - 0.5, Refusal.WRONG_TYPE, "from -0.39", "0 to 1"),
+        (spoiled(np.nan), Refusal.NOT_FINITE, "NaN", "0 to 1"),
+        (spoiled(np.inf), Refusal.NOT_FINITE, "infinite", "0 to 1"),
+        (spoiled(-np.inf), Refusal.NOT_FINITE, "infinite", "0 to 1"),
+        (grey(0.0), Refusal.BLACK, "0 %", "full scale"),
+        ((RAMP * 0.019 * 65535).astype(np.uint16), Refusal.BLACK, "2 %", "full scale"),
+        (grey(1.0), Refusal.WHITE, "100 %", "full scale"),
+        (np.ones((HEIGHT, WIDTH), np.float32), Refusal.WHITE, "100 %", "full scale"),
+        (grey(0.5), Refusal.FLAT, "0.0 %", "full scale"),
+    ],
+)  # fmt: skip
+def test_frames_that_cannot_be_measured_are_refused_with_what_came_and_what_would_be_right(
+    image: object, reason: Refusal, came: str, right: str
+):
+    found = inspect(frame(image), CAMERA, GRIPPER)
+    assert found is not None
+    assert found[0] is reason
+    assert came in found[1], found[1]
+    assert right in found[1], found[1]
+
+
+def test_what_the_source_says_about_a_missing_image_is_passed_on():
+    assert inspect(frame(None, fault="file ends after 12 bytes"), CAMERA, GRIPPER) == (
+        Refusal.NOT_AN_IMAGE,
+        "file ends after 12 bytes",
+    )
+
+
+def test_an_image_that_is_half_black_passes():
+    """A truncated file often decodes to that; the measurement has to cope with it, not the inspection."""
+    image = (RAMP * 255).astype(np.uint8)
+    image[HEIGHT // 3 :] = 0
+    assert inspect(frame(image), CAMERA, GRIPPER) is None
+
+
+@pytest.mark.parametrize("opening_m", [None, 0.0, 0.034, 0.06])
+def test_openings_within_the_jaws_range_pass(opening_m: float | None):
+    assert inspect(frame((RAMP * 255).astype(np.uint8), opening_m), CAMERA, GRIPPER) is None
+
+
+@pytest.mark.parametrize("opening_m", [-0.01, 0.075, 34.0, float("nan"), float("inf")])
+def test_openings_far_beyond_the_jaws_range_are_refused(opening_m: float):
+    found = inspect(frame((RAMP * 255).astype(np.uint8), opening_m), CAMERA, GRIPPER)
+    assert found is not None and found[0] is Refusal.JAW_OPENING
+    assert "0 to 0.06 m" in found[1]
+
+
+def test_a_gripper_without_a_jaw_takes_any_opening():
+    assert inspect(frame((RAMP * 255).astype(np.uint8), 34.0), CAMERA, gripper_from_dict(cube_model())) is None
