@@ -1,0 +1,182 @@
+"""Sequences of an independent renderer, with exact truth: the estimates are held against it, frame by frame."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from functools import cache
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gripmon.cli import main
+
+ROOT = Path(__file__).resolve().parent.parent
+SEQUENCES = ROOT.parent / "shared" / "data" / "rendered"
+TOOL = ROOT / "tools" / "rendered_config"
+LIE_M = 2e-4  # no frame may be valid and further from the truth than this
+
+# 95 % of the frames: error of the TCP's position across and along the optical axis, m; a third above what was measured.
+BOUNDS_M = {
+    "static_background": (20e-6, 65e-6),
+    "bump_y": (12e-6, 70e-6),
+    "grasp_occlusion": (28e-6, 75e-6),
+    "jaw_cycle": (18e-6, 85e-6),
+    "series2": (20e-6, 85e-6),
+}
+
+pytestmark = pytest.mark.skipif(not SEQUENCES.is_dir(), reason="../shared/data/rendered is not there")
+
+Lines = list[dict[str, Any]]
+
+
+@cache
+def tool() -> Any:
+    loader = SourceFileLoader("rendered_config", str(TOOL))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    return module
+
+
+def truth(name: str) -> list[dict[str, Any]]:
+    return json.loads((SEQUENCES / name / "truth.json").read_text())["frames"]
+
+
+def replay(folder: Path) -> Lines:
+    out = folder.with_suffix(".jsonl")
+    assert main(["replay", str(folder), "--config", str(folder / "config.yaml"), "--out", str(out)]) == 0
+    return [json.loads(line) for line in out.read_bytes().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Lines]:
+    """The lines of every sequence; those of ``clean`` are one replay for each of its unrelated frames."""
+    folder = tmp_path_factory.mktemp("rendered")
+    lines = {}
+    for name in BOUNDS_M:
+        tool().convert(SEQUENCES / name, folder / name)
+        lines[name] = replay(folder / name)
+    lines["clean"] = []
+    for index in range(len(truth("clean"))):
+        tool().convert(SEQUENCES / "clean", folder / f"clean{index}", index)
+        lines["clean"] += replay(folder / f"clean{index}")
+    return lines
+
+
+def tcp_errors_m(lines: Lines, frames: list[dict[str, Any]]) -> np.ndarray:
+    """(n, 3) position error of the TCP in camera axes, m; NaN where no transform was given."""
+    assert [line["name"] for line in lines] == [frame["file"] for frame in frames]
+    nothing = [np.nan] * 3
+    given = [line["cam_T_grip"]["translation_m"] if line["cam_T_grip"] else nothing for line in lines]
+    return np.array(given) - np.array([frame["camera_T_gripper"] for frame in frames])[:, :3, 3]
+
+
+def test_every_sequence_is_tested():
+    assert {path.name for path in SEQUENCES.iterdir() if path.is_dir()} == {*BOUNDS_M, "clean"}
+
+
+@pytest.mark.parametrize("name", BOUNDS_M)
+def test_the_tcp_is_where_the_truth_says(replayed: dict[str, Lines], name: str):
+    errors_m = tcp_errors_m(replayed[name], truth(name))
+    assert all(line["source"] == "update" for line in replayed[name])
+    across_m, along_m = np.hypot(errors_m[:, 0], errors_m[:, 1]), np.abs(errors_m[:, 2])
+    assert np.percentile(across_m, 95.0) < BOUNDS_M[name][0]
+    assert np.percentile(along_m, 95.0) < BOUNDS_M[name][1]
+
+
+@pytest.mark.parametrize("name", [*BOUNDS_M, "clean"])
+def test_no_valid_transform_is_far_from_the_truth(replayed: dict[str, Lines], name: str):
+    """Neither a valid one, nor any other: these sequences hide little."""
+    distances_m = np.linalg.norm(tcp_errors_m(replayed[name], truth(name)), axis=1)
+    valid = np.array([line["verdict"] == "valid" for line in replayed[name]])
+    assert not (distances_m[valid] > LIE_M).any()
+    assert np.nanmax(distances_m) < LIE_M
+
+
+def test_ground_truth_and_conventions_agree(replayed: dict[str, Lines]):
+    """Neither noise nor texture: what is left would be a convention misread, such as half a pixel (60 µm)."""
+    errors_m = tcp_errors_m(replayed["clean"], truth("clean"))
+    assert np.abs(errors_m[:, :2]).max() < 8e-6
+    assert np.abs(errors_m[:, 2]).max() < 30e-6
+    misses_px = [
+        np.linalg.norm(np.subtract(corner["uv_px"], frame["corners"][corner["id"]]))
+        for line, frame in zip(replayed["clean"], truth("clean"), strict=True)
+        for corner in line["corners"]
+        if corner["used"]
+    ]
+    assert len(misses_px) > 30
+    assert np.median(misses_px) < 0.1
+
+
+def test_the_bump_is_found_when_it_happens(replayed: dict[str, Lines]):
+    """4.5 mm along camera y at frame 45: nothing before, a jump then, a drift of the true size soon after."""
+    lines, frames = replayed["bump_y"], truth("bump_y")
+    alerts = [(line["seq"], alert["kind"], alert["cause"]) for line in lines for alert in line["alerts"]]
+    assert alerts[0] == (45, "jump", "camera_mount_moved")
+    assert [kind for _, kind, _ in alerts].count("jump") == 1
+    drifts = [seq for seq, kind, _ in alerts if kind == "drift"]
+    assert len(drifts) == 1 and 45 <= drifts[0] <= 50
+    assert lines[45]["verdict"] == "suspect"
+    assert all(line["verdict"] == "valid" for line in lines[1:45] + lines[47:])
+    for line, frame in zip(lines, frames, strict=True):
+        if line["revision"] == lines[0]["revision"]:
+            true_shift_m = 1e-3 * np.array(frame["tcp_shift_mm"])
+            assert np.abs(line["drift"]["tcp_shift_m"] - true_shift_m).max() < 1e-4
+    assert np.linalg.norm(lines[-1]["drift"]["tcp_shift_m"]) > 4e-3
+
+
+@pytest.mark.parametrize("name", ["static_background", "grasp_occlusion", "jaw_cycle"])
+def test_an_unmoved_camera_stays_quiet(replayed: dict[str, Lines], name: str):
+    """Whatever the background, the jaws and what they hold do."""
+    assert not [alert for line in replayed[name] for alert in line["alerts"]]
+    assert {line["state"] for line in replayed[name][1:]} == {"tracking"}
+
+
+def test_hidden_corners_are_not_invented(replayed: dict[str, Lines]):
+    """From frame 25 on an object hides inner corners: they are left out, and the transform stays valid."""
+    lines, frames = replayed["grasp_occlusion"], truth("grasp_occlusion")
+    hidden_somewhere = 0
+    for line, frame in zip(lines, frames, strict=True):
+        for corner in line["corners"]:
+            if corner["id"] in frame["occluded"]:
+                hidden_somewhere += 1
+                assert (corner["used"], corner["uv_px"], corner["reason"]) == (False, None, "hidden")
+    assert hidden_somewhere > 20
+    assert all(line["verdict"] == "valid" for line in lines[1:])
+
+
+def test_pairs_before_and_after_a_turn_of_the_mount(replayed: dict[str, Lines]):
+    """The paper's second series: the TCP's way between the two images of a pair, estimated and true."""
+    lines, frames = replayed["series2"], truth("series2")
+    estimated_m, true_m = (
+        np.array([np.subtract(b, a) for a, b in zip(positions[::2], positions[1::2], strict=True)])
+        for positions in (
+            [line["cam_T_grip"]["translation_m"] for line in lines],
+            [np.array(frame["camera_T_gripper"])[:3, 3] for frame in frames],
+        )
+    )
+    assert np.abs(true_m[:, 1]).min() > 3e-3
+    mean_m = np.abs(estimated_m - true_m).mean(axis=0)
+    assert (mean_m < [6e-6, 12e-6, 60e-6]).all()
+
+
+def test_the_tool_makes_what_replay_takes_or_says_why_not(tmp_path: Path):
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, str(TOOL), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, env={"PYTHONPATH": str(ROOT)})
+
+    out = tmp_path / "bump"
+    assert run(str(SEQUENCES / "bump_y"), str(out)).returncode == 0
+    assert {path.name for path in out.iterdir()} >= {"config.yaml", "gripper.yaml", "timestamps.csv", "000059.png"}
+    assert main(["check", str(out / "config.yaml")]) == 0
+    for arguments in ([str(tmp_path / "none"), str(tmp_path / "a")], [str(SEQUENCES / "bump_y"), str(out)]):
+        done = run(*arguments)
+        assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "0 to 59" in run("--frame", "60", str(SEQUENCES / "bump_y"), str(tmp_path / "b")).stderr
