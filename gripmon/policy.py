@@ -114,10 +114,11 @@ class DriftTest:
         frames_a_day = 86400.0 * settings.frames_per_s
         self.threshold = math.log(2 * len(self.smallest) * frames_a_day / settings.false_alarms_per_day)
         self._sums = np.zeros((2, 6))
+        self._established = np.zeros((2, 6), dtype=bool)
 
     def add(self, shift: Array, sigma: Array) -> bool:
         """One frame's shift against the reference (6,) and its standard deviations; True while a drift is
-        established.
+        established: from the threshold on until all that spoke for it is taken back.
         """
         gain = self.smallest / sigma**2
         centred, half = gain * shift, 0.5 * gain * self.smallest
@@ -129,7 +130,9 @@ class DriftTest:
             sums += evidence
         np.maximum(self._sums, 0.0, out=self._sums)
         np.minimum(self._sums, self.threshold, out=self._sums)
-        return float(self._sums.max()) >= self.threshold
+        self._established &= self._sums > 0.0
+        self._established |= self._sums >= self.threshold
+        return bool(self._established.any())
 
     @property
     def suspicious(self) -> bool:
@@ -138,6 +141,7 @@ class DriftTest:
 
     def reset(self) -> None:
         self._sums[:] = 0.0
+        self._established[:] = False
 
 
 class Policy:
@@ -212,7 +216,7 @@ class Policy:
         held = has_transform and lasted_s <= settings.hold_s
         alerts = []
         before = self.state
-        if self.state is not State.ACQUIRING:
+        if has_transform or self.state is not State.ACQUIRING:
             # A bad image says nothing about the gripper: only time makes it lost.
             self.state = (
                 State.LOST if not held else (before if refusal and before is not State.LOST else State.OCCLUDED)
