@@ -33,6 +33,9 @@ exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used; 13
 was done until then is in FILE)"""
 
 
+_RECORDING_PATIENCE_S = 30.0  # replay outruns any camera: it waits for the recording rather than drop a frame
+
+
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = common.add_command(
@@ -219,10 +222,8 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
         yield NullRecorder()
         return
     path = Path(name)
-    # Replay outruns any camera: queues long enough that nothing is dropped, and one file whatever its length.
-    settings = msgspec.structs.replace(
-        config.settings.recording, enabled=True, queue_frames=100_000, queue_images=64, max_file_bytes=2**62
-    )
+    # One file, whatever its length.
+    settings = msgspec.structs.replace(config.settings.recording, enabled=True, max_file_bytes=2**62)
     common.make_directory(path.parent)
     with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as scratch:
         recorder = open_recorder(
@@ -234,6 +235,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             reference=config.reference,
             directory=Path(scratch),
             name=path.stem,
+            patience_s=_RECORDING_PATIENCE_S,
         )
         try:
             yield recorder

@@ -31,7 +31,7 @@ _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
 Truth = Callable[[int], Vector | None]
-_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None]
+_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, float | None]
 _T = TypeVar("_T")
 
 
@@ -99,7 +99,9 @@ def open_recorder(
     folder.mkdir(parents=True, exist_ok=True)
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
-    scene = make_scene(settings, str(folder.resolve()), name, robot, camera_name, camera, gripper, reference)
+    where = str(folder.resolve())
+    has_truth = truth_tcp_m is not None
+    scene = make_scene(settings, where, name, robot, camera_name, camera, gripper, reference, has_truth)
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
 
 
@@ -194,10 +196,10 @@ class ProcessRecorder:
         if due and self._images_offered - self._images_taken < self._queue_images:
             self._images_offered += 1
             self._image_stamp_ns = record.stamp_ns
-            self._frames.append((record, True, frame.image, trace))
+            self._frames.append((record, True, frame.image, trace, frame.jaw_opening_m))
         else:
             self._images_not_queued += bool(due)
-            self._frames.append((record, False, None, None))
+            self._frames.append((record, False, None, None, frame.jaw_opening_m))
 
     def alert(self, alert: AlertRecord) -> None:
         """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
@@ -281,12 +283,12 @@ class ProcessRecorder:
     def _next_batch(self, worker: WorkerProcess) -> Batch:
         frames: list[FrameNote] = []
         while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0][2]):
-            record, shown, image, trace = self._frames.popleft()
+            record, shown, image, trace, jaw_reported_m = self._frames.popleft()
             self._images_taken += shown
             note = None if image is None else self._share(worker, image)
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
-            frames.append(FrameNote(record, note, packed, truth_tcp_m))
+            frames.append(FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m))
         worker.frames_sent += len(frames)
         references = _drain(self._references)
         if references:

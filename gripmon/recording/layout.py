@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun.blueprint as rrb
 
+from gripmon.recording import palette
 from gripmon.recording.overlay import IMAGE
 from gripmon.recording.wire import Scene
 
@@ -25,7 +26,7 @@ def make_blueprint(scene: Scene) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(_image(scene), _events(), row_shares=[7, 2]),
-            rrb.Vertical(_rig(scene), shift, status, _details(axis), row_shares=[4.5, 4, 1.8, 2.2]),
+            rrb.Vertical(_rig(scene), shift, status, _details(scene, axis), row_shares=[4.5, 4, 1.8, 2.2]),
             column_shares=[5, 4],
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -57,14 +58,17 @@ def _rig(scene: Scene) -> rrb.Spatial3DView:
         name="Gripper as the camera sees it; white: reference",
         eye_controls=eye,
         line_grid=False,
+        background=palette.BACKGROUND,
     )
 
 
-def _details(axis: rrb.TimeAxis) -> rrb.Tabs:
+def _details(scene: Scene, axis: rrb.TimeAxis) -> rrb.Tabs:
     def plot(origin: str, contents: str | list[str], name: str) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(origin=origin, contents=contents, name=name, axis_x=axis)
 
+    error = [plot("drift", "drift/error_mm", "Error against truth (mm)")] if scene.has_truth else []
     return rrb.Tabs(
+        *error,
         plot("quality", "quality/rms_px", "Residual (px)"),
         plot("drift", ["drift/d_mm", "drift/delta_deg"], "d (mm), δ (°)"),
         plot("quality", ["quality/corners_used", "quality/edge_points"], "Points"),

@@ -56,7 +56,7 @@ class OverlayWriter:
         for kind, used in (("used", True), ("refused", False)):
             corners = [self._corners(row.record, row.trace, used) for row in rows]
             self._points(f"corners/{kind}", rows, [uv_px for uv_px, _ in corners])
-            places = [self._label_places(uv_px) for uv_px, _ in corners]
+            places = [self._label_places(row, uv_px) for row, (uv_px, _) in zip(rows, corners, strict=True)]
             self._points(f"labels/{kind}", rows, places, [labels for _, labels in corners])
 
     def _images(self, rows: Sequence[Row]) -> None:
@@ -85,11 +85,12 @@ class OverlayWriter:
         columns = rr.Points2D.columns(positions=positions, labels=flat).partition([len(p) for p in points])
         self._send.frames(f"{IMAGE}/{name}", rows, columns)
 
-    def _label_places(self, uv_px: _Pixels) -> _Pixels:
+    def _label_places(self, row: Row, uv_px: _Pixels) -> _Pixels:
         """Labels go up from the upper corners and down from the lower ones, off the edges that meet there."""
+        every = np.concatenate([self._corners(row.record, row.trace, used)[0] for used in (True, False)])
         places = uv_px.copy()
         if len(places):
-            lower = places[:, 1] > places[:, 1].mean()
+            lower = places[:, 1] > every[:, 1].mean()
             places[:, 1] += np.where(lower, 0.3 * self._label_px, -self._label_px).astype(np.float32)
         return places
 

@@ -16,11 +16,20 @@ from gripmon.records import Frame, FrameRecord
 from gripmon.sources.base import SourceError
 
 RECORD = "record"
+JAW_REPORTED = "jaw/reported_m"
 
 
 class _Shot(NamedTuple):
     stamp_ns: int
     blob: bytes
+
+
+class _Contents(NamedTuple):
+    """What a file holds, by ``seq``."""
+
+    shots: dict[int, _Shot]
+    records: dict[int, FrameRecord]
+    jaw_reported_m: dict[int, float]
 
 
 class RecordedFrames:
@@ -35,11 +44,11 @@ class RecordedFrames:
 
     def __init__(self, path: Path) -> None:
         self._name = path.name
-        self._shots, self._records = _read(path)
-        if not self._shots:
+        self._contents = contents = _read(path)
+        if not contents.shots:
             raise SourceError(f"path: {path} holds no images; a recording made with image_rate_hz above 0")
-        self.frames_without_image = len(self._records.keys() - self._shots.keys())
-        self._seqs = sorted(self._shots)
+        self.frames_without_image = len(contents.records.keys() - contents.shots.keys())
+        self._seqs = sorted(contents.shots)
         self._next = 0
 
     def __len__(self) -> int:
@@ -54,40 +63,44 @@ class RecordedFrames:
             return None
         seq = self._seqs[self._next]
         self._next += 1
-        shot, record = self._shots[seq], self._records.get(seq)
+        shot, record = self._contents.shots[seq], self._contents.records.get(seq)
         image = cv2.imdecode(np.frombuffer(shot.blob, np.uint8), cv2.IMREAD_UNCHANGED)
         fault = None if image is not None else "the recorded image is damaged"
-        jaw_opening_m = None if record is None else record.jaw_opening_m
         name = self._name if record is None or not record.name else record.name
-        return Frame(seq, shot.stamp_ns, image, jaw_opening_m, name, fault)
+        return Frame(seq, shot.stamp_ns, image, self._contents.jaw_reported_m.get(seq), name, fault)
 
     def close(self) -> None:
         """Nothing more is read."""
         self._next = len(self._seqs)
 
 
-def _read(path: Path) -> tuple[dict[int, _Shot], dict[int, FrameRecord]]:
-    """Encoded images and records by ``seq``."""
+def _read(path: Path) -> _Contents:
     from rerun.chunk import RrdReader
 
-    shots: dict[int, _Shot] = {}
-    records: dict[int, FrameRecord] = {}
+    contents = _Contents({}, {}, {})
     decode = msgspec.json.Decoder(FrameRecord).decode
+    wanted = [f"/{entity}" for entity in (IMAGE, RECORD, JAW_REPORTED)]
     try:
-        chunks = RrdReader(path).stream().filter(content=[f"/{IMAGE}", f"/{RECORD}"], has_timeline="frame").to_chunks()
+        chunks = RrdReader(path).stream().filter(content=wanted, has_timeline="frame").to_chunks()
     except Exception as error:  # whatever rerun's reader raises: the file is at fault
         reason = " ".join(str(error).split())
         remedy = "a complete .rrd file (`rerun rrd optimize` saves what is whole in one that was cut off)"
         raise SourceError(f"path: {path} can't be read ({reason}); {remedy}") from error
     for chunk in chunks:
         batch = chunk.to_record_batch()
+        entity = chunk.entity_path.removeprefix("/")
         seqs = batch.column("frame").to_pylist()
-        if chunk.entity_path == f"/{RECORD}":
-            for seq, texts in zip(seqs, batch.column("json").to_pylist(), strict=True):
-                records[seq] = decode(texts[0])
-            continue
-        stamps_ns = batch.column("capture_time").cast("int64").to_pylist()
-        blobs = batch.column("EncodedImage:blob")
-        for row, (seq, stamp_ns) in enumerate(zip(seqs, stamps_ns, strict=True)):
-            shots[seq] = _Shot(stamp_ns, blobs[row].values[0].values.to_numpy().tobytes())
-    return shots, records
+        if entity == RECORD:
+            texts = batch.column("json").to_pylist()
+            contents.records.update((seq, decode(text)) for seq, (text,) in zip(seqs, texts, strict=True))
+        elif entity == JAW_REPORTED:
+            openings = batch.column("Scalars:scalars").to_pylist()
+            contents.jaw_reported_m.update(
+                (seq, opening[0]) for seq, opening in zip(seqs, openings, strict=True) if opening
+            )
+        else:
+            stamps_ns = batch.column("capture_time").cast("int64").to_pylist()
+            blobs = batch.column("EncodedImage:blob")
+            for row, (seq, stamp_ns) in enumerate(zip(seqs, stamps_ns, strict=True)):
+                contents.shots[seq] = _Shot(stamp_ns, blobs[row].values[0].values.to_numpy().tobytes())
+    return contents

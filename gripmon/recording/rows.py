@@ -10,6 +10,7 @@ chunk an entity, which costs a tenth of logging frame by frame.
 ``rig/reference``               ``cam_T_grip`` of the reference
 ``drift/…``                     TCP shift (mm, camera axes) with its standard deviation, ``d`` (mm), ``delta`` (degrees)
 ``quality/…``, ``timing/…``     residual, counts of points and corners, latency
+``jaw/reported_m``              the opening that came with the frame (the record's is what the monitor believed)
 ``image/…``                     statistics of the recorded images
 ``status/state``, ``verdict``   as state changes;  ``events`` alerts and changes as text
 ``record``                      the frame's whole record, one JSON line as ``replay`` writes it, to the last digit
@@ -53,6 +54,7 @@ class Row:
     picture: Picture | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
+    jaw_reported_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,6 +151,7 @@ class RowWriter:
             rr.SeriesLines(names=["x-σ", "y-σ", "z-σ", "x+σ", "y+σ", "z+σ"], colors=bands * 2, widths=[0.7] * 6),
         )
         static("drift/truth_mm", rr.SeriesLines(names=[f"true {n}" for n in names], colors=truths, widths=[6.0] * 3))
+        static("drift/error_mm", rr.SeriesLines(names=names, colors=[x, y, z], widths=[1.0] * 3))
         static("drift/d_mm", rr.SeriesLines(names="d (mm)", colors=palette.BUSY, widths=2.0))
         static("drift/delta_deg", rr.SeriesLines(names="δ (°)", colors=palette.DOUBTFUL, widths=2.0))
         static("quality/rms_px", rr.SeriesLines(names="rms (px)", colors=palette.BUSY, widths=1.5))
@@ -166,9 +169,14 @@ class RowWriter:
         send.curve("drift/d_mm", rows, [None if d is None else 1e3 * d.translation_m for d in drifts])
         send.curve("drift/delta_deg", rows, [None if d is None else math.degrees(d.rotation_rad) for d in drifts])
         if any(r.truth_tcp_m is not None for r in rows):
-            send.scalars("drift/truth_mm", rows, [self._truth_mm(r) for r in rows])
+            truths_mm = [self._truth_mm(r) for r in rows]
+            shifts_mm = [_millimetres(d.tcp_shift_m if d is not None else None) for d in drifts]
+            send.scalars("drift/truth_mm", rows, truths_mm)
+            errors_mm = [[e - t for e, t in zip(*pair, strict=False)] for pair in zip(shifts_mm, truths_mm, strict=True)]
+            send.scalars("drift/error_mm", rows, errors_mm)
         send.curve("quality/rms_px", rows, [r.record.rms_px for r in rows])
         send.curve("quality/corners_used", rows, [float(sum(c.used for c in r.record.corners)) for r in rows])
+        send.curve("jaw/reported_m", rows, [r.jaw_reported_m for r in rows])
         send.curve("timing/latency_us", rows, [1e-3 * r.record.latency_ns for r in rows])
         traced = [r for r in rows if r.trace is not None]
         if traced:

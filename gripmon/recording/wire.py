@@ -47,6 +47,7 @@ class Scene(msgspec.Struct, frozen=True):
     jaw_openings_m: tuple[float, ...]
     points_m: list[list[tuple[float, float, float]]]
     reference: ReferenceRecord
+    has_truth: bool
     version: str
 
 
@@ -73,6 +74,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     image: ImageNote | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
+    jaw_reported_m: float | None
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):
@@ -103,6 +105,7 @@ def make_scene(
     camera: Camera,
     gripper: Gripper,
     reference: ReferenceRecord,
+    has_truth: bool = False,
 ) -> Scene:
     from gripmon import __version__
 
@@ -127,6 +130,7 @@ def make_scene(
         jaw_openings_m=tuple(openings_m.tolist()),
         points_m=[gripper.points_grip_m(opening_m).tolist() for opening_m in openings_m.tolist()],
         reference=reference,
+        has_truth=has_truth,
         version=__version__,
     )
 

@@ -85,7 +85,7 @@ class RecordingLoop:
         if note.image is not None:
             picture = encode_picture(self._ring.get(note.image), self._scene.settings)
             self._images_done += 1
-        return Row(note.record, picture, note.trace, note.truth_tcp_m)
+        return Row(note.record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m)
 
     def _report(self) -> None:
         files = self._files
