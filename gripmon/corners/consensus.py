@@ -183,7 +183,7 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
 
     Expressed as translations of the gripper across the axis, rotation about the optical axis, and translation along it.
     """
-    middle = prediction.corners_cam_m.mean(axis=0)
+    middle = prediction.corners.cam_m.mean(axis=0)
     span_px = float(np.abs(prediction.uv_px - prediction.uv_px.mean(axis=0)).max())
     ticks = np.arange(-round(reach_px / step_px), round(reach_px / step_px) + 1) * step_px
     turns = np.array([-1.0, 0.0, 1.0]) * 0.6 * reach_px / span_px

@@ -86,7 +86,7 @@ class CornerGeometry:
         slots[layout.edges] = np.arange(len(layout.edges))
         slot = slots[edges]
         direction = prediction.line_direction[edges]
-        from_origin = prediction.corners_xy[:, None, :] - prediction.line_origin[edges]
+        from_origin = prediction.corners.xy[:, None, :] - prediction.line_origin[edges]
         bounds = np.append(layout.first, len(layout.edge))
         first, last = bounds[slot], bounds[slot + 1]
         at_start = gripper.edge_points[edges, 0] == gripper.corner_points[:, None]
@@ -108,8 +108,8 @@ class CornerGeometry:
                 if sampled < 2
                 else None
                 for inside, visible, sampled in zip(
-                    prediction.corner_inside.tolist(),
-                    prediction.corner_visible.tolist(),
+                    prediction.corners.inside.tolist(),
+                    prediction.corners.visible.tolist(),
                     (slot >= 0).sum(axis=1).tolist(),
                     strict=True,
                 )
@@ -146,11 +146,11 @@ def intersect_edges(
     covariance_xy = np.full((len(good), 2, 2), np.nan)
     covariance_xy[good] = np.linalg.inv(information[good])
     shift = (covariance_xy @ (weighted * wanted[..., None]).sum(axis=1)[..., None])[..., 0]
-    sigma_px = _largest_sigma(prediction.corners_d_uv_d_xy, covariance_xy)
+    sigma_px = _largest_sigma(prediction.corners.d_uv_d_xy, covariance_xy)
     return Corners(
-        prediction.corners_xy + shift,
+        prediction.corners.xy + shift,
         covariance_xy,
-        prediction.corners_uv_px + (prediction.corners_d_uv_d_xy @ shift[..., None])[..., 0],
+        prediction.corners.uv_px + (prediction.corners.d_uv_d_xy @ shift[..., None])[..., 0],
         sigma_px,
         tuple(
             CornerFault.UNCERTAIN if f is None and not s <= settings.largest_sigma_px else f

@@ -73,7 +73,7 @@ class MeasurementSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     search: SearchSettings = SearchSettings()
     relinearise_px: Annotated[
         float, Meta(ge=0.05, le=5.0, description="motion from the prediction after which it is computed anew (px)")
-    ] = 0.5
+    ] = 1.0
 
 
 class Effort(enum.IntEnum):
@@ -124,7 +124,7 @@ class Measurement:
         """Corners (c, 3) in the camera frame at the prediction's pose, but with the jaw opening that was measured."""
         prediction = self.prediction
         opened_m = self.jaw_opening_m - prediction.jaw_opening_m
-        return prediction.corners_cam_m + opened_m * prediction.corners_jaw_rate
+        return prediction.corners.cam_m + opened_m * prediction.corners.jaw_rate
 
     def corner_rms_px(self, cam_T_grip: Array) -> float | None:
         """Root mean square distance between the usable corners and where ``cam_T_grip`` puts them, px; None without
@@ -137,7 +137,7 @@ class Measurement:
         turn = cam_T_grip[:3, :3] @ prediction.cam_T_grip[:3, :3].T
         points = (self.corners_cam_m[usable] - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
         miss_xy = self.corners.xy[usable] - points[:, :2] / points[:, 2:]
-        miss_px = np.einsum("cij,cj->ci", prediction.corners_d_uv_d_xy[usable], miss_xy)
+        miss_px = np.einsum("cij,cj->ci", prediction.corners.d_uv_d_xy[usable], miss_xy)
         return float(np.sqrt((miss_px * miss_px).sum() / len(miss_px)))
 
 

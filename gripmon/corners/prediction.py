@@ -73,6 +73,28 @@ class EdgeLayout:
         return np.arange(len(self.edge)) // STRETCH + np.cumsum(starts)
 
 
+@dataclass(frozen=True, slots=True)
+class PredictedCorners:
+    """The predicted corners, arrays over all corners of the gripper.
+
+    ``cam_m`` (c, 3) in the camera frame, ``jaw_rate`` (c, 3) their motion by the jaw opening, m/m; ``xy`` (c, 2) ideal and
+    ``uv_px`` (c, 2) distorted image coordinates, ``d_uv_d_xy`` (c, 2, 2) px between the two; ``facing`` (c,) a face of the
+    corner looks at the camera, ``inside`` (c,) it lies in the image.
+    """
+
+    cam_m: Array
+    jaw_rate: Array
+    xy: Array
+    uv_px: Array
+    d_uv_d_xy: Array
+    facing: NDArray[np.bool_]
+    inside: NDArray[np.bool_]
+
+    @property
+    def visible(self) -> NDArray[np.bool_]:
+        return self.facing & self.inside
+
+
 @dataclass(frozen=True)
 class Prediction:
     """The predicted edges at one pose; n samples, v visible edges, c corners.
@@ -82,7 +104,7 @@ class Prediction:
     and, where the jaw opening is an unknown too, by the opening (px/m). ``along`` (n,) and ``gain`` (n,): ideal
     coordinate along the edge's line, and ideal distance from the line for each px of offset along the normal.
     ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
-    in the image. ``corners_jaw_rate`` (c, 3): motion of the corners in the camera frame by the jaw opening, m/m.
+    in the image.
     """
 
     cam_T_grip: Array
@@ -95,16 +117,10 @@ class Prediction:
     gain: Array
     line_origin: Array
     line_direction: Array
-    corners_cam_m: Array
-    corners_jaw_rate: Array
-    corners_xy: Array
-    corners_uv_px: Array
-    corners_d_uv_d_xy: Array
-    corner_visible: NDArray[np.bool_]
-    corner_inside: NDArray[np.bool_]
     ok: NDArray[np.bool_]
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
+    corners: PredictedCorners
 
     @cached_property
     def pixels_per_m(self) -> float:
@@ -224,7 +240,8 @@ def predict(
     Points behind the camera or outside the lens model are marked in ``ok`` and never measured.
     """
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
-    levers = gripper.points_grip_m(jaw_opening_m) @ rotation.T
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    levers = points_grip_m @ rotation.T
     ends = levers[gripper.edge_points]
     spans = ends[:, 1] - ends[:, 0]
     edge = layout.edge
@@ -237,17 +254,15 @@ def predict(
     gradient = np.einsum("ni,nij->nj", normal, d_uv)
     jacobian = np.empty((len(edge), 7 if jaw_unknown else 6))
     jacobian[:, :3] = gradient
-    jacobian[:, 3:6] = np.cross(lever, gradient)
+    for i, j, k in ((3, 1, 2), (4, 2, 0), (5, 0, 1)):  # lever x gradient, without np.cross's overhead
+        jacobian[:, i] = lever[:, j] * gradient[:, k] - lever[:, k] * gradient[:, j]
     rate = np.zeros_like(levers)
     if jaw_unknown:
         rate = gripper.point_motion(jaw_opening_m) @ rotation.T
         jacobian[:, 6] = np.einsum("ni,ni->n", gradient, rate[gripper.edge_points[edge, 0]])
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
     along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
-    corners_cam_m = levers[gripper.corner_points] + translation
-    corners_uv, corners_d_uv = camera.project_with_jacobian(corners_cam_m)
-    corner_visible = gripper.corners_visible(gripper.points_grip_m(jaw_opening_m), -rotation.T @ translation)
-    corner_inside = _inside(camera, corners_uv, CORNER_MARGIN_PX)
+    corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
     offsets = offsets_px.astype(np.float32)
     uv32, normal32 = uv.astype(np.float32), normal.astype(np.float32)
     return Prediction(
@@ -261,16 +276,29 @@ def predict(
         gain=gain,
         line_origin=origin,
         line_direction=direction,
-        corners_cam_m=corners_cam_m,
-        corners_jaw_rate=rate[gripper.corner_points],
-        corners_xy=corners_cam_m[:, :2] / corners_cam_m[:, 2:],
-        corners_uv_px=corners_uv,
-        corners_d_uv_d_xy=corners_d_uv[:, :, :2] * corners_cam_m[:, 2][:, None, None],
-        corner_visible=corner_visible & corner_inside,
-        corner_inside=corner_inside,
         ok=ok,
         map_x=uv32[:, 0:1] + normal32[:, 0:1] * offsets,
         map_y=uv32[:, 1:2] + normal32[:, 1:2] * offsets,
+        corners=corners,
+    )
+
+
+def _predict_corners(
+    camera: Camera, gripper: Gripper, cam_T_grip: Array, points_grip_m: Array, rate: Array
+) -> PredictedCorners:
+    """``rate`` (p, 3): motion of all points in the camera frame by the jaw opening, m/m."""
+    rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
+    cam_m = points_grip_m[gripper.corner_points] @ rotation.T + translation
+    uv_px, d_uv = camera.project_with_jacobian(cam_m)
+    inside = _inside(camera, uv_px, CORNER_MARGIN_PX)
+    return PredictedCorners(
+        cam_m=cam_m,
+        jaw_rate=rate[gripper.corner_points],
+        xy=cam_m[:, :2] / cam_m[:, 2:],
+        uv_px=uv_px,
+        d_uv_d_xy=d_uv[:, :, :2] * cam_m[:, 2][:, None, None],
+        facing=gripper.corners_visible(points_grip_m, -rotation.T @ translation),
+        inside=inside,
     )
 
 

@@ -66,7 +66,7 @@ def search_starts(image: Image, prediction: Prediction, settings: SearchSettings
         return np.zeros((0, unknowns))
     points = usable[:: max(1, len(usable) // POINTS)]
     factor = max(1.0, image.shape[1] / settings.coarse_columns)
-    depth = float(prediction.corners_cam_m[:, 2].mean())
+    depth = float(prediction.corners.cam_m[:, 2].mean())
     reach = math.ceil(settings.reach_m * prediction.pixels_per_m / factor)
     padded = np.pad(_edge_answers(image, factor), ((0, 0), (reach, reach), (reach, reach)))
     centre = prediction.uv_px[points].mean(axis=0)
@@ -100,8 +100,8 @@ def _shift_of_tcp(
     turns and comes nearer.
     """
     tcp = prediction.cam_T_grip[:3, 3]
-    lens = prediction.corners_d_uv_d_xy.mean(axis=0)
-    tcp_uv = prediction.corners_uv_px.mean(axis=0) + lens @ (tcp[:2] / tcp[2] - prediction.corners_xy.mean(axis=0))
+    lens = prediction.corners.d_uv_d_xy.mean(axis=0)
+    tcp_uv = prediction.corners.uv_px.mean(axis=0) + lens @ (tcp[:2] / tcp[2] - prediction.corners.xy.mean(axis=0))
     arm = tcp_uv - centre
     turned = (1.0 + scale) * np.array(
         [math.cos(turn) * arm[0] - math.sin(turn) * arm[1], math.sin(turn) * arm[0] + math.cos(turn) * arm[1]]

@@ -25,7 +25,7 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
         line = camera.project(start + along * (end - start))
         lines.append(line[np.isfinite(line).all(axis=1)])
     corners_uv_px = camera.project(points_cam_m[gripper.corner_points])
-    corners_uv_px[~prediction.corner_visible] = np.nan
+    corners_uv_px[~prediction.corners.visible] = np.nan
     return MeasurementTrace(
         edge_uv_px=prediction.uv_px[sample] + candidates.offset_px[:, None] * prediction.normal[sample],
         edge_used=consensus.weight > 0.0,
