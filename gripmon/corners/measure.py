@@ -260,6 +260,8 @@ class FingertipMeter:
         for start in search_starts(image, prediction, settings.search):
             there = self._moved(prediction, here + start, expected)
             seen = self._predict(prediction.layout, there)
+            if not seen.ok.any():
+                continue
             candidates, weights = self._look(image, seen)
             starts = grid_of_starts(seen, settings.sampling.reach_px, settings.consensus.start_width_px)
             prior_mean = self._prior_mean(seen, there)

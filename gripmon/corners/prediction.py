@@ -77,9 +77,9 @@ class EdgeLayout:
 class PredictedCorners:
     """The predicted corners, arrays over all corners of the gripper.
 
-    ``cam_m`` (c, 3) in the camera frame, ``jaw_rate`` (c, 3) their motion by the jaw opening, m/m; ``xy`` (c, 2) ideal and
-    ``uv_px`` (c, 2) distorted image coordinates, ``d_uv_d_xy`` (c, 2, 2) px between the two; ``facing`` (c,) a face of the
-    corner looks at the camera, ``inside`` (c,) it lies in the image.
+    ``cam_m`` (c, 3) in the camera frame, ``jaw_rate`` (c, 3) their motion by the jaw opening, m/m; ``xy`` (c, 2)
+    ideal and ``uv_px`` (c, 2) distorted image coordinates, ``d_uv_d_xy`` (c, 2, 2) px between the two; ``facing``
+    (c,) a face of the corner looks at the camera, ``inside`` (c,) it lies in the image.
     """
 
     cam_m: Array
@@ -124,7 +124,9 @@ class Prediction:
 
     @cached_property
     def pixels_per_m(self) -> float:
-        """Scale of the image at the gripper: median over the edge points, across their edges (px/m)."""
+        """Scale of the image at the gripper: median over the edge points, across their edges (px/m); 0 without any."""
+        if not len(self.uv_px):
+            return 0.0
         return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
 
     @cached_property
