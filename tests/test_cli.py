@@ -238,9 +238,8 @@ def test_a_signal_stops_the_daemon_with_everything_written(
     assert "Traceback" not in err
     assert took_s < 5.0, "2 s are promised; a loaded test machine gets more"
     lines = (out / "estimates.jsonl").read_bytes().splitlines()
-    assert [msgspec.json.decode(line, type=FrameRecord).seq for line in lines] == sorted(
-        json.loads(x)["seq"] for x in lines
-    )
+    seqs = [msgspec.json.decode(line, type=FrameRecord).seq for line in lines]
+    assert seqs == sorted(set(seqs)), "whole lines, in order"
     assert list(out.glob("*.rrd"))
 
 
@@ -278,9 +277,7 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
     assert comparison["after_correction"]["along_mm"]["p95"] < 0.06
     assert comparison["after_correction"]["frames"] > 0.6 * len(records)
     assert {"creep", "bump", "occlusion"} <= {event["event"] for event in comparison["events"]}
-    assert all(
-        e["noticed_after_s"] is not None for e in comparison["events"] if e["event"] in ("creep", "bump", "occlusion")
-    )
+    assert all((event["noticed_after_s"] is None) == event["harmless"] for event in comparison["events"])
     assert "after correction" in done.stdout and "rerun " in done.stdout
 
 
@@ -352,7 +349,9 @@ def truth(seq: int) -> FrameTruth:
 
 def test_the_comparison_counts_by_hand():
     jump = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "it moved")
-    records = [record(i, (3e-6, 4e-6, -2e-6)) for i in range(5)]
+    recalibrated = Alert(AlertKind.RECALIBRATED, Cause.UNKNOWN, Severity.INFO, "a new reference")
+    records = [record(i, (3e-6, 4e-6, -2e-6)) for i in range(4)]
+    records += [record(4, (3e-6, 4e-6, -2e-6), alerts=(recalibrated,))]
     records += [record(5, (0.0, 0.0, 1e-5), alerts=(jump,)), record(6, (1.0, 1.0, 1.0), verdict=Verdict.SUSPECT)]
     records += [
         record(7, (1.0, 0.0, 0.0), source=Origin.HELD),
@@ -367,6 +366,7 @@ def test_the_comparison_counts_by_hand():
     assert result.smoothed.frames == 0 and result.smoothed.across_mm.mean is None
     bump, occlusion = result.events
     assert (bump.event, bump.frames, occlusion.event, occlusion.frames) == ("bump", 3, "occlusion", 2)
-    assert bump.noticed_after_s == pytest.approx(0.1) and "camera_mount_moved" in str(bump.noticed_as)
-    assert occlusion.noticed_as == "state occluded"
+    assert bump.noticed_after_s == pytest.approx(0.1)
+    assert bump.alerts == ("recalibrated (unknown)", "jump (camera_mount_moved)"), "in order; the first is no alarm"
+    assert occlusion.noticed_after_s is None and occlusion.alerts == ()
     assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]

@@ -97,6 +97,18 @@ def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callabl
     return _TqdmSteps(total, unit)
 
 
+def messages_above_bar(logger: str) -> AbstractContextManager[object]:
+    """While it lasts, what this logger writes to a terminal appears above the progress bar."""
+    if not sys.stderr.isatty():
+        return nullcontext()
+    import logging
+
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    redirected: AbstractContextManager[object] = logging_redirect_tqdm([logging.getLogger(logger)])
+    return redirected
+
+
 class _TqdmSteps(AbstractContextManager[Callable[[], None]]):
     def __init__(self, total: int | None, unit: str):
         from tqdm import tqdm

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon.records import Array, FrameRecord, Origin, State, Verdict
+from gripmon.records import AlertKind, Array, FrameRecord, Origin, Verdict
 from gripmon.simulator import FrameTruth
 
 EVENT_NAMES = {
@@ -23,6 +23,8 @@ EVENT_NAMES = {
     "sheet": "occlusion",
     "object_between": "grasp",
 }
+NO_ALARMS = frozenset({AlertKind.RECALIBRATED, AlertKind.RECOVERED})
+HARMLESS = frozenset({"shadow", "light step"})
 
 
 class Distribution(msgspec.Struct, frozen=True):
@@ -42,17 +44,21 @@ class TcpErrors(msgspec.Struct, frozen=True):
 
 
 class EventReport(msgspec.Struct, frozen=True):
-    """One event of the scenario and what the monitor made of it; times from the first frame."""
+    """One event of the scenario and what the monitor made of it; times from the first frame.
+
+    ``noticed_after_s`` is the time to the first alert that isn't good news; ``alerts`` are all until the next event
+    begins.  A ``harmless`` event should not be noticed.
+    """
 
     event: str
     start_s: float
     end_s: float
     frames: int
     valid: int
+    harmless: bool
     largest_tcp_shift_mm: float
     after_correction: TcpErrors
     noticed_after_s: float | None
-    noticed_as: str | None
     alerts: tuple[str, ...]
 
 
@@ -117,45 +123,35 @@ def _errors(errors_m: Sequence[Array]) -> TcpErrors:
 
 
 def _events(pairs: list[_Pair]) -> tuple[EventReport, ...]:
-    """One report for each uninterrupted time of a label; a bump lasts until the next event, as its shift stays."""
-    spans: list[tuple[str, int, int]] = []
-    for label in EVENT_NAMES:
+    """One report for each uninterrupted time of a label, cut where the next event begins: each frame counts once."""
+    spans: list[tuple[int, int, str]] = []
+    for label, name in EVENT_NAMES.items():
         active = [label in pair.truth.events for pair in pairs]
         starts = [i for i, on in enumerate(active) if on and (i == 0 or not active[i - 1])]
-        for start in starts:
-            end = next((i for i in range(start, len(pairs)) if not active[i]), len(pairs))
-            spans.append((label, start, end))
-    spans.sort(key=lambda span: span[1])
-    onsets = [start for _, start, _ in spans]
-    reports = []
-    for label, start, end in spans:
-        if label == "bumped":
-            end = min((onset for onset in onsets if onset > start), default=end)
-        following = min((onset for onset in onsets if onset > start), default=len(pairs))
-        reports.append(
-            _event_report(
-                EVENT_NAMES[label], pairs[start:end], pairs[start : max(end, following)], pairs[0].truth.time_s
-            )
-        )
-    return tuple(reports)
+        spans += [(i, next((k for k in range(i, len(pairs)) if not active[k]), len(pairs)), name) for i in starts]
+    spans.sort()
+    following = [start for start, _, _ in spans[1:]] + [len(pairs)]
+    origin_s = pairs[0].truth.time_s if pairs else 0.0
+    return tuple(
+        _event_report(name, pairs[start : min(end, limit)], pairs[start:limit], origin_s)
+        for (start, end, name), limit in zip(spans, following, strict=True)
+        if start < limit
+    )
 
 
-def _event_report(name: str, during: list[_Pair], until_next: list[_Pair], start_s: float) -> EventReport:
+def _event_report(name: str, during: list[_Pair], until_next: list[_Pair], origin_s: float) -> EventReport:
     valid = [pair for pair in during if pair.record.verdict is Verdict.VALID]
-    noticed = next((p for p in until_next if p.record.alerts or p.record.state is not State.TRACKING), None)
-    how = None
-    if noticed is not None:
-        alert = noticed.record.alerts[0] if noticed.record.alerts else None
-        how = f"state {noticed.record.state}" if alert is None else f"alert {alert.kind} ({alert.cause})"
+    alarms = (pair for pair in until_next if any(a.kind not in NO_ALARMS for a in pair.record.alerts))
+    noticed = next(alarms, None)
     return EventReport(
         event=name,
-        start_s=during[0].truth.time_s - start_s,
-        end_s=during[-1].truth.time_s - start_s,
+        start_s=during[0].truth.time_s - origin_s,
+        end_s=during[-1].truth.time_s - origin_s,
         frames=len(during),
         valid=len(valid),
+        harmless=name in HARMLESS,
         largest_tcp_shift_mm=1e3 * max(float(np.linalg.norm(p.truth.tcp_shift_m)) for p in during),
         after_correction=_errors([error for p in valid if (error := _error(p)) is not None]),
         noticed_after_s=None if noticed is None else noticed.truth.time_s - during[0].truth.time_s,
-        noticed_as=how,
         alerts=tuple(f"{alert.kind} ({alert.cause})" for p in until_next for alert in p.record.alerts),
     )

@@ -7,7 +7,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
     from gripmon.client import Client
     from gripmon.config import Config
-    from gripmon.records import FrameRecord
+    from gripmon.records import Array, FrameRecord
     from gripmon.simulator import Simulator
 
 _DESCRIPTION = """\
@@ -38,6 +38,7 @@ exit codes: 0 done; 2 wrong usage; 3 no usable frame; 130 interrupted"""
 
 _PREFERRED_PORT = 7447
 _CONNECT_S = 5.0
+_TRACKING = ("tracking", "drifting")
 _SHORTEST_S = 4.0
 
 
@@ -77,13 +78,18 @@ def run(arguments: argparse.Namespace) -> int:
         f"{arguments.seconds:g} s of a simulated wrist camera; transforms on {_endpoint(config)}; results in {out}",
         file=sys.stderr,
     )
-    with common.progress_bar(simulator.frame_count, "frame") as step, _Receiver(config, step) as receiver:
+    bar = common.progress_bar(simulator.frame_count, "frame")
+    with bar as step, _Receiver(config, step) as receiver, ExitStack() as messages:
 
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:
             x, y, z = simulator.truth(seq).cam_T_grip[:3, 3].tolist()
             return x, y, z
 
-        code = run_daemon(config, out=out, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=receiver.connect)
+        def on_network() -> None:
+            receiver.connect()
+            messages.enter_context(common.messages_above_bar("gripmon"))
+
+        code = run_daemon(config, out=out, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=on_network)
     _summarise(out, simulator, receiver.count)
     return code
 
@@ -175,7 +181,8 @@ def _summarise(out: Path, simulator: Simulator, received: int) -> None:
         "frames_dropped": records[-1].seq + 1 - len(records),
         "frames_per_s": (len(records) - 1) / span_s if span_s > 0.0 else None,
         "transforms_received": received,
-        "latency_ms": {"median": float(np.median(latencies_ms)), "p99": float(np.percentile(latencies_ms, 99.0))},
+        "latency_ms": _latency(latencies_ms),
+        "latency_while_tracking_ms": _latency(latencies_ms[[r.state in _TRACKING for r in records]]),
         "recordings": sorted(path.name for path in out.glob("*.rrd")),
         "comparison": msgspec.to_builtins(comparison),
     }
@@ -187,7 +194,6 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
     from gripmon.config import builtin_config
 
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in comparison.verdicts.items() if count)
-    latency = summary["latency_ms"]
     live = builtin_config("live_camera.yaml")
     recordings = [str(out / name) for name in summary["recordings"]]
     return "\n".join(
@@ -204,13 +210,28 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
             "",
             f"frames     {summary['frames']} ({verdicts}), {summary['frames_dropped']} dropped",
             f"Zenoh      {summary['transforms_received']} transforms received",
-            f"latency    {latency['median']:.2f} ms median, {latency['p99']:.2f} ms 99 %, frame to published transform",
+            f"latency    {_latency_line(summary['latency_ms'])}, from frame to published transform",
+            f"           {_latency_line(summary['latency_while_tracking_ms'])} while tracking (else it searches)",
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
             *(f"look at it rerun {recording}" for recording in recordings),
             f"next       your own camera: copy {live}, edit it, gripmon check COPY, gripmon run COPY",
         ]
     )
+
+
+def _latency(latencies_ms: Array) -> dict[str, float | None]:
+    import numpy as np
+
+    if not latencies_ms.size:
+        return {"median": None, "p99": None}
+    return {"median": float(np.median(latencies_ms)), "p99": float(np.percentile(latencies_ms, 99.0))}
+
+
+def _latency_line(latency_ms: dict[str, float | None]) -> str:
+    if latency_ms["median"] is None:
+        return "—"
+    return f"{latency_ms['median']:.2f} ms median, {latency_ms['p99']:.2f} ms 99 %"
 
 
 def _span(event: EventReport) -> str:
@@ -226,10 +247,11 @@ def _cells(values: Distribution) -> str:
 
 
 def _event_line(event: EventReport) -> str:
-    moved = f"TCP moved up to {event.largest_tcp_shift_mm:.2f} mm"
+    moved = f"TCP up to {event.largest_tcp_shift_mm:.2f} mm off"
     if event.noticed_after_s is None:
-        noticed = "nothing noticed"
+        noticed = "rightly no alarm" if event.harmless else "NOT NOTICED"
     else:
-        noticed = f"noticed after {event.noticed_after_s:.2f} s as {event.noticed_as}"
-    alerts = f"; alerts: {', '.join(dict.fromkeys(event.alerts))}" if event.alerts else "; no alert"
-    return f"{event.event:<10} {moved}; {noticed}{alerts}; {event.valid} of {event.frames} frames valid"
+        noticed = f"{'FALSE ALARM' if event.harmless else 'noticed'} after {event.noticed_after_s:.2f} s"
+    if event.alerts:
+        noticed += f": {', '.join(dict.fromkeys(event.alerts))}"
+    return f"{event.event:<10} {moved}; {event.valid} of {event.frames} frames valid; {noticed}"
