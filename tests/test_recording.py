@@ -175,6 +175,12 @@ def test_truth_is_drawn_against_the_reference(told: Recorded) -> None:
     for i, values in told.by_seq("drift/truth_mm", "scalars").items():
         expected = 1e3 * (np.array(truth(i)) - REFERENCE.cam_T_grip.translation_m)
         np.testing.assert_allclose(values, expected, rtol=1e-12)
+    for i, values in told.by_seq("drift/error_mm", "scalars").items():
+        drift = story(i).drift
+        assert (values == []) == (drift is None)
+        if drift is not None:
+            estimated_tcp_m = np.array(REFERENCE.cam_T_grip.translation_m) + drift.tcp_shift_m
+            np.testing.assert_allclose(values, 1e3 * (estimated_tcp_m - truth(i)), atol=1e-9)
 
 
 def test_images_are_the_frames_images(told: Recorded) -> None:

@@ -26,7 +26,7 @@ def make_blueprint(scene: Scene) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(_image(scene), _events(), row_shares=[7, 2]),
-            rrb.Vertical(_rig(scene), shift, status, _details(scene, axis), row_shares=[4.5, 4, 1.8, 2.2]),
+            rrb.Vertical(_rig(scene), shift, status, _details(scene, axis), row_shares=[4.3, 4, 1.8, 2.6]),
             column_shares=[5, 4],
         ),
         rrb.BlueprintPanel(state="collapsed"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -20,9 +20,16 @@ IMAGE = "rig/camera/image"
 _POINT_PX = 1.6
 _CORNER_PX = 3.5
 _LINE_PX = 0.6
-_LABEL_SHARE = 0.06  # of the image's height
+_LABEL_SHARE = 0.05  # of the image's height
 _Pixels = NDArray[np.float32]
 _NO_PIXELS: _Pixels = np.empty((0, 2), np.float32)
+
+
+class _Corner(NamedTuple):
+    uv_px: tuple[float, float]
+    label_px: tuple[float, float]
+    label: str
+    used: bool
 
 
 class OverlayWriter:
@@ -53,11 +60,12 @@ class OverlayWriter:
         self._points("edges/used", rows, [_edge_points(trace, used=True) for trace in traces])
         self._points("edges/refused", rows, [_edge_points(trace, used=False) for trace in traces])
         self._points("corners/predicted", rows, [_predicted_corners(trace) for trace in traces])
+        corners = [self._corners(row.record, row.trace) for row in rows]
         for kind, used in (("used", True), ("refused", False)):
-            corners = [self._corners(row.record, row.trace, used) for row in rows]
-            self._points(f"corners/{kind}", rows, [uv_px for uv_px, _ in corners])
-            places = [self._label_places(row, uv_px) for row, (uv_px, _) in zip(rows, corners, strict=True)]
-            self._points(f"labels/{kind}", rows, places, [labels for _, labels in corners])
+            shown = [[corner for corner in some if corner.used == used] for some in corners]
+            self._points(f"corners/{kind}", rows, [_pixels([c.uv_px for c in some]) for some in shown])
+            places = [_pixels([c.label_px for c in some]) for some in shown]
+            self._points(f"labels/{kind}", rows, places, [[c.label for c in some] for some in shown])
 
     def _images(self, rows: Sequence[Row]) -> None:
         pictures = [row.picture for row in rows if row.picture is not None]
@@ -85,26 +93,38 @@ class OverlayWriter:
         columns = rr.Points2D.columns(positions=positions, labels=flat).partition([len(p) for p in points])
         self._send.frames(f"{IMAGE}/{name}", rows, columns)
 
-    def _label_places(self, row: Row, uv_px: _Pixels) -> _Pixels:
-        """Labels go up from the upper corners and down from the lower ones, off the edges that meet there."""
-        every = np.concatenate([self._corners(row.record, row.trace, used)[0] for used in (True, False)])
-        places = uv_px.copy()
-        if len(places):
-            lower = places[:, 1] > every[:, 1].mean()
-            places[:, 1] += np.where(lower, 0.3 * self._label_px, -self._label_px).astype(np.float32)
-        return places
-
-    def _corners(self, record: FrameRecord, trace: TraceNote | None, used: bool) -> tuple[_Pixels, list[str]]:
+    def _corners(self, record: FrameRecord, trace: TraceNote | None) -> list[_Corner]:
         """Corners with their labels; one that was not measured is shown where it was predicted, with the reason."""
         predicted = _NO_PIXELS if trace is None else pairs(trace.predicted_corners_uv_px)
-        where = dict(zip(self._corner_ids, predicted, strict=False))
-        uv_px, labels = [], []
-        for corner in record.corners:
-            position = corner.uv_px if corner.uv_px is not None else where.get(corner.id)
-            if corner.used == used and position is not None and np.isfinite(position).all():
-                uv_px.append(position)
-                labels.append(corner.id if corner.reason is None else f"{corner.id}: {corner.reason}")
-        return np.array(uv_px, np.float32).reshape(-1, 2), labels
+        where = {name: (float(u), float(v)) for name, (u, v) in zip(self._corner_ids, predicted, strict=False)}
+        found = [(corner, corner.uv_px or where.get(corner.id)) for corner in record.corners]
+        known = [(corner, uv_px) for corner, uv_px in found if uv_px is not None and np.isfinite(uv_px).all()]
+        labels_px = _label_places([uv_px for _, uv_px in known], self._label_px)
+        return [
+            _Corner(
+                uv_px, label_px, corner.id if corner.reason is None else f"{corner.id}: {corner.reason}", corner.used
+            )
+            for (corner, uv_px), label_px in zip(known, labels_px, strict=True)
+        ]
+
+
+def _label_places(corners_px: Sequence[tuple[float, float]], step_px: float) -> list[tuple[float, float]]:
+    """Above the upper corners and below the lower ones, off the edges that meet there; neighbours on two levels."""
+    middle_px = float(np.mean([v for _, v in corners_px])) if corners_px else 0.0
+    places = list(corners_px)
+    for below in (False, True):
+        row = sorted(
+            (i for i, (_, v) in enumerate(corners_px) if (v > middle_px) == below), key=lambda i: corners_px[i]
+        )
+        for rank, i in enumerate(row):
+            u, v = corners_px[i]
+            level = rank % 2
+            places[i] = (u, v + (0.3 + level) * step_px if below else v - (1.0 + level) * step_px)
+    return places
+
+
+def _pixels(points: Sequence[tuple[float, float]]) -> _Pixels:
+    return np.array(points, np.float32).reshape(-1, 2)
 
 
 def _edge_points(trace: TraceNote | None, used: bool) -> _Pixels:

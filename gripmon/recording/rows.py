@@ -162,18 +162,15 @@ class RowWriter:
     def _curves(self, rows: Sequence[Row]) -> None:
         send = self._send
         drifts = [r.record.drift for r in rows]
-        send.scalars(
-            "drift/tcp_shift_mm", rows, [_millimetres(d.tcp_shift_m if d is not None else None) for d in drifts]
-        )
+        shifts_mm = [_millimetres(None if d is None else d.tcp_shift_m) for d in drifts]
+        send.scalars("drift/tcp_shift_mm", rows, shifts_mm)
         send.scalars("drift/tcp_shift_sigma_mm", rows, [_band_mm(r.record) for r in rows])
         send.curve("drift/d_mm", rows, [None if d is None else 1e3 * d.translation_m for d in drifts])
         send.curve("drift/delta_deg", rows, [None if d is None else math.degrees(d.rotation_rad) for d in drifts])
         if any(r.truth_tcp_m is not None for r in rows):
             truths_mm = [self._truth_mm(r) for r in rows]
-            shifts_mm = [_millimetres(d.tcp_shift_m if d is not None else None) for d in drifts]
             send.scalars("drift/truth_mm", rows, truths_mm)
-            errors_mm = [[e - t for e, t in zip(*pair, strict=False)] for pair in zip(shifts_mm, truths_mm, strict=True)]
-            send.scalars("drift/error_mm", rows, errors_mm)
+            send.scalars("drift/error_mm", rows, list(map(_difference, shifts_mm, truths_mm)))
         send.curve("quality/rms_px", rows, [r.record.rms_px for r in rows])
         send.curve("quality/corners_used", rows, [float(sum(c.used for c in r.record.corners)) for r in rows])
         send.curve("jaw/reported_m", rows, [r.jaw_reported_m for r in rows])
@@ -229,6 +226,11 @@ def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
 
 def _millimetres(metres: Sequence[float] | None) -> list[float]:
     return [1e3 * v for v in metres or ()]
+
+
+def _difference(values: Sequence[float], others: Sequence[float]) -> list[float]:
+    """Empty where either is unknown."""
+    return [a - b for a, b in zip(values, others, strict=True)] if values and others else []
 
 
 def _band_mm(record: FrameRecord) -> list[float]:
