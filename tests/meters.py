@@ -8,12 +8,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
-from gripmon.camera import Camera, LensSettings, make_camera
+from gripmon.camera import Camera, FisheyeLens, LensSettings, make_camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.gripper import Gripper, load_gripper
 from gripmon.records import Image
 from gripmon.simulator import Scenario, Simulator
 
+FISHEYE_LENS = FisheyeLens(
+    width_px=768,
+    height_px=576,
+    fx_px=640.0,
+    fy_px=640.0,
+    cx_px=380.0,
+    cy_px=290.0,
+    coefficients=(0.03, -0.02, 0.004, 0.0),
+)
 NARROW = Patience(when_doubtful=False, when_lost=False)
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 USUAL_SHARE = 0.9

@@ -1,0 +1,198 @@
+"""Predicted edges: Jacobians by central differences for every lens, normals, lines, and which parts are sampled."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from box_models import cube_model
+from meters import FISHEYE_LENS, box_gripper, moved
+from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+
+from gripmon.camera import Camera, LensSettings, make_camera
+from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.corners.profiles import profile_offsets_px
+from gripmon.gripper import Gripper, gripper_from_dict
+
+LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
+LENS_NAMES = ["paper", "brown_conrady", "fisheye"]
+OPENING_M = 0.031
+OFFSETS_PX = profile_offsets_px(7.0)
+
+
+def predicted(
+    lens: LensSettings = PAPER_LENS,
+    gripper: Gripper | None = None,
+    cam_T_grip: np.ndarray | None = None,
+    settings: SamplingSettings | None = None,
+    jaw_unknown: bool = True,
+) -> Prediction:
+    camera, gripper = make_camera(lens), gripper or box_gripper()
+    pose = nominal_cam_T_grip() if cam_T_grip is None else cam_T_grip
+    layout = lay_out(camera, gripper, pose, OPENING_M, settings or SamplingSettings())
+    return predict(camera, gripper, layout, pose, OPENING_M, OFFSETS_PX, jaw_unknown)
+
+
+def ends_cam_m(gripper: Gripper, edge: int, cam_T_grip: np.ndarray, opening_m: float) -> np.ndarray:
+    ends = gripper.points_grip_m(opening_m)[gripper.edge_points[edge]]
+    return ends @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+
+
+def crossing_px(camera: Camera, ends_m: np.ndarray, fraction: float, uv_px: np.ndarray, normal: np.ndarray) -> float:
+    """Where along a normal the projected edge crosses it: what a profile there would measure."""
+    near = np.array([fraction - 2e-3, fraction, fraction + 2e-3])
+    curve = camera.project(ends_m[0] + near[:, None] * (ends_m[1] - ends_m[0])) - uv_px
+    tangential = curve @ np.array([normal[1], -normal[0]])
+    # The parabola through three points of the curve, taken where it meets the normal.
+    fit = np.polyfit(near - fraction, np.column_stack([tangential, curve @ normal]), 2)
+    roots = np.roots(fit[:, 0])
+    at = float(roots[np.argmin(np.abs(roots))].real)
+    return float(np.polyval(fit[:, 1], at))
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
+def test_jacobian_is_the_motion_of_the_edge_along_its_normal(lens: LensSettings):
+    """All seven columns: the moved edge, projected through the lens, is intersected with the profile."""
+    camera, gripper, pose = make_camera(lens), box_gripper(), nominal_cam_T_grip()
+    prediction = predicted(lens)
+    steps = np.array([2e-6] * 3 + [2e-5] * 3 + [2e-6])
+    for i in range(0, len(prediction.uv_px), 7):
+        edge, fraction = prediction.layout.edge[i], prediction.layout.fraction[i]
+        numeric = np.empty(7)
+        for k, step in enumerate(steps):
+            sides = []
+            for sign in (1.0, -1.0):
+                xi = np.zeros(7)
+                xi[k] = sign * step
+                ends = ends_cam_m(gripper, edge, moved(pose, xi[:6]), OPENING_M + xi[6])
+                sides.append(crossing_px(camera, ends, fraction, prediction.uv_px[i], prediction.normal[i]))
+            numeric[k] = (sides[0] - sides[1]) / (2.0 * step)
+        # Relative to how far each unknown moves any edge at all.
+        scale = np.abs(prediction.jacobian).max(axis=0)
+        np.testing.assert_allclose(prediction.jacobian[i] / scale, numeric / scale, atol=2e-5)
+
+
+def test_without_an_unknown_jaw_there_are_six_columns_and_the_same_ones():
+    six, seven = predicted(jaw_unknown=False), predicted()
+    assert six.jacobian.shape[1] == 6
+    np.testing.assert_array_equal(six.jacobian, seven.jacobian[:, :6])
+    assert np.abs(seven.jacobian[:, 6]).max() > 100.0, "px/m: half of an opening moves each finger"
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
+def test_normals_point_to_the_right_of_somebody_walking_along_the_edge(lens: LensSettings):
+    camera, gripper, prediction = make_camera(lens), box_gripper(), predicted(lens)
+    for i in range(0, len(prediction.uv_px), 5):
+        ends = ends_cam_m(gripper, prediction.layout.edge[i], nominal_cam_T_grip(), OPENING_M)
+        fraction = prediction.layout.fraction[i]
+        behind, here, ahead = camera.project(
+            ends[0] + np.array([[-1e-4], [0.0], [1e-4]]) * (ends[1] - ends[0]) + fraction * (ends[1] - ends[0])
+        )
+        np.testing.assert_allclose(prediction.uv_px[i], here, atol=1e-9)
+        walk = (ahead - behind) / np.linalg.norm(ahead - behind)
+        # The image's v axis points down: to the right of u is v.
+        np.testing.assert_allclose(prediction.normal[i], [-walk[1], walk[0]], atol=1e-6)
+
+
+@pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
+def test_lines_and_gains_agree_with_undistorted_pixels(lens: LensSettings):
+    camera, prediction = make_camera(lens), predicted(lens)
+    edge = prediction.layout.edge
+    origin, direction = prediction.line_origin[edge], prediction.line_direction[edge]
+    right = np.column_stack([-direction[:, 1], direction[:, 0]])
+    on = camera.undistort(prediction.uv_px) - origin
+    np.testing.assert_allclose(np.einsum("ni,ni->n", on, right), 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.einsum("ni,ni->n", on, direction), prediction.along, atol=1e-9)
+    off = camera.undistort(prediction.uv_px + 0.01 * prediction.normal) - camera.undistort(
+        prediction.uv_px - 0.01 * prediction.normal
+    )
+    np.testing.assert_allclose(np.einsum("ni,ni->n", off, right) / 0.02, prediction.gain, rtol=1e-5)
+    # An edge that isn't seen has no line.
+    hidden = np.setdiff1d(np.arange(len(prediction.line_origin)), edge)
+    assert len(hidden) and np.isnan(prediction.line_origin[hidden]).all()
+
+
+def test_maps_sample_along_the_normals():
+    prediction = predicted()
+    u = prediction.uv_px[:, :1] + prediction.normal[:, :1] * OFFSETS_PX
+    v = prediction.uv_px[:, 1:] + prediction.normal[:, 1:] * OFFSETS_PX
+    np.testing.assert_allclose(prediction.map_x, u, atol=1e-4)
+    np.testing.assert_allclose(prediction.map_y, v, atol=1e-4)
+    np.testing.assert_allclose(OFFSETS_PX, np.arange(-7.0, 7.25, 0.5))
+
+
+@pytest.mark.parametrize("shift_m", [0.0, 0.01, 0.03], ids=["inside", "partly outside", "half outside"])
+def test_samples_lie_in_the_image_on_visible_outlines_away_from_their_ends(shift_m: float):
+    camera, gripper = make_camera(PAPER_LENS), box_gripper()
+    pose = moved(nominal_cam_T_grip(), np.array([shift_m, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    settings = SamplingSettings()
+    prediction = predicted(cam_T_grip=pose)
+    view = gripper.edge_view(gripper.points_grip_m(OPENING_M), np.linalg.inv(pose)[:3, 3])
+    sampled = np.unique(prediction.layout.edge)
+    assert (view.visible & ~view.crease)[sampled].all(), "creases are left out unless asked for"
+    inside = (prediction.uv_px >= settings.reach_px - 1.0) & (
+        prediction.uv_px <= np.array([767.0, 575.0]) - settings.reach_px + 1.0
+    )
+    assert inside.all(axis=1).sum() >= 0.97 * len(inside)
+    assert not (prediction.ok & ~((prediction.uv_px >= 7.0) & (prediction.uv_px <= [760.0, 568.0])).all(axis=1)).any()
+    for edge in sampled:
+        ends_px = camera.project(ends_cam_m(gripper, edge, pose, OPENING_M))
+        mine = prediction.uv_px[prediction.layout.edge == edge]
+        gap = np.linalg.norm(mine[:, None] - ends_px, axis=2).min()
+        assert gap > settings.end_margin_px - 0.5
+        step_px = np.linalg.norm(np.diff(mine, axis=0), axis=1)
+        assert step_px.min() > 0.9, "no pixel is read twice"
+    assert abs(len(prediction.uv_px) - settings.samples) <= 0.1 * settings.samples
+
+
+def test_creases_are_sampled_when_asked_for():
+    plain, with_creases = predicted(), predicted(settings=SamplingSettings(creases=True))
+    more = set(with_creases.layout.edge.tolist()) - set(plain.layout.edge.tolist())
+    assert more and all(with_creases.layout.crease[e] for e in more)
+
+
+def test_short_edges_are_sampled_more_densely_than_long_ones():
+    prediction, gripper, camera = predicted(), box_gripper(), make_camera(PAPER_LENS)
+    edges, counts = np.unique(prediction.layout.edge, return_counts=True)
+    lengths = np.array(
+        [
+            np.linalg.norm(np.diff(camera.project(ends_cam_m(gripper, e, nominal_cam_T_grip(), OPENING_M)), axis=0))
+            for e in edges
+        ]
+    )
+    order = np.argsort(lengths)
+    assert counts[order[0]] / lengths[order[0]] > 1.3 * counts[order[-1]] / lengths[order[-1]]
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        moved(nominal_cam_T_grip(), np.array([0.0, 0.0, -0.3, 0.0, 0.0, 0.0])),
+        moved(nominal_cam_T_grip(), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])),
+        moved(nominal_cam_T_grip(), np.array([0.0, 0.0, -0.115, 0.0, 0.0, 0.0])),
+    ],
+    ids=["behind", "beside", "around the camera"],
+)
+def test_a_gripper_out_of_view_gives_an_empty_or_a_sound_prediction(pose: np.ndarray):
+    prediction = predicted(cam_T_grip=pose)
+    assert np.isfinite(prediction.jacobian[prediction.ok]).all()
+    assert np.isfinite(prediction.uv_px[prediction.ok]).all()
+    if not len(prediction.uv_px):
+        assert prediction.map_x.size == 0 and prediction.moved_px(np.full(7, 1e-3)) == 0.0
+
+
+def test_moved_px_is_the_largest_motion_of_any_edge_point():
+    prediction = predicted()
+    shift = np.array([1e-4, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    later = predicted(cam_T_grip=moved(nominal_cam_T_grip(), shift[:6]))
+    way = np.einsum("ni,ni->n", later.uv_px - prediction.uv_px, prediction.normal)
+    assert prediction.moved_px(shift) == pytest.approx(np.abs(way).max(), rel=0.02)
+    # 962 px focal length at about 115 mm
+    assert prediction.pixels_per_m == pytest.approx(962.0 / 0.115, rel=0.3)
+
+
+def test_a_gripper_without_faces_samples_all_its_edges():
+    model = cube_model()
+    model.pop("faces")
+    pose = moved(nominal_cam_T_grip(), np.array([0.0, 0.0, 0.1, 0.3, 0.2, 0.1]))
+    prediction = predicted(gripper=gripper_from_dict(model), cam_T_grip=pose, jaw_unknown=False)
+    assert len(np.unique(prediction.layout.edge)) == 12
