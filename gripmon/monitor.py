@@ -83,7 +83,8 @@ class Monitor:
     def __init__(self, camera: Camera, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
         self._camera, self._gripper, self._settings = camera, gripper, settings
         self._meter = FingertipMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
-        self._policy = Policy(settings.policy)
+        reference_sigma = np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal())
+        self._policy = Policy(settings.policy, reference_sigma)
         self._average = PoseAverage(settings.smoothing)
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
         self._reference = reference

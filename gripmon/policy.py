@@ -144,15 +144,45 @@ class DriftTest:
         self._established[:] = False
 
 
+class Baseline:
+    """The part of the shift that an inexact reference explains.
+
+    A calibration is off by some tenths of a millimetre from the start, which is no drift.  The mean shift of the
+    first frames is taken for that error if the reference's own uncertainty allows it (four standard deviations on
+    every axis), else nothing is.
+    """
+
+    def __init__(self, reference_sigma: Array | None, frames: int):
+        self._allowed = None if reference_sigma is None else 4.0 * reference_sigma
+        self._frames = frames
+        self._first: list[Array] = []
+        self._error: Array = np.zeros(6)
+
+    def subtract(self, shift: Array) -> Array | None:
+        """The shift (6,) less the reference's error; None while that isn't known yet."""
+        if self._allowed is not None:
+            self._first.append(shift)
+            if len(self._first) < self._frames:
+                return None
+            mean = np.mean(self._first, axis=0)
+            self._error = mean if (np.abs(mean) <= self._allowed).all() else np.zeros(6)
+            self._allowed = None
+        return shift - self._error
+
+
 class Policy:
     """The states ``acquiring -> tracking <-> drifting -> recalibrating -> tracking``, ``occluded`` and ``lost``.
 
     A function of the frames so far: time is the frames' own.
     """
 
-    def __init__(self, settings: PolicySettings):
+    def __init__(self, settings: PolicySettings, reference_sigma: Array | None = None):
+        """``reference_sigma`` (6,): standard deviations of the reference's error, m and rad; None if it counts as
+        exact.
+        """
         self._settings = settings
         self.test = DriftTest(settings)
+        self._baseline = Baseline(reference_sigma, settings.settle_frames)
         self.state = State.ACQUIRING
         self._since_jump = 0
         self._still = 0
@@ -170,7 +200,8 @@ class Policy:
         if evidence.jumped and self.state not in (State.ACQUIRING, State.LOST):
             alerts.append(_jump_alert(evidence))
         confirmed = self._since_jump >= settings.confirm_frames
-        drifting = self.test.add(evidence.shift, evidence.sigma)
+        since_start = self._baseline.subtract(evidence.shift)
+        drifting = since_start is not None and self.test.add(since_start, evidence.sigma)
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
         recalibrate = False
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
@@ -196,6 +227,7 @@ class Policy:
     def recalibrated(self, text: str) -> Alert:
         """The reference was replaced: drift is reckoned from zero."""
         self.test.reset()
+        self._baseline = Baseline(None, 0)
         self._drift_alerted = False
         return Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.WARNING, text)
 
