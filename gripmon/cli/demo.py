@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+import shutil
 import socket
 import sys
 import time
@@ -194,7 +196,7 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
     from gripmon.config import builtin_config
 
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in comparison.verdicts.items() if count)
-    live = builtin_config("live_camera.yaml")
+    configs = shlex.quote(str(builtin_config("live_camera.yaml").parent))
     recordings = [str(out / name) for name in summary["recordings"]]
     return "\n".join(
         [
@@ -214,10 +216,17 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
             f"           {_latency_line(summary['latency_while_tracking_ms'])} while tracking (else it searches)",
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
-            *(f"look at it rerun {recording}" for recording in recordings),
-            f"next       your own camera: copy {live}, edit it, gripmon check COPY, gripmon run COPY",
+            *(f"look at it {_viewer()} {shlex.quote(recording)}" for recording in recordings),
+            f"next       your own camera: cp -r {configs} mine; edit mine/live_camera.yaml;",
+            "           gripmon check mine/live_camera.yaml; gripmon run mine/live_camera.yaml",
         ]
     )
+
+
+def _viewer() -> str:
+    """How to start rerun's viewer, which is installed with us but perhaps not on the path."""
+    beside_us = Path(sys.executable).parent / "rerun"
+    return "rerun" if shutil.which("rerun") or not beside_us.exists() else shlex.quote(str(beside_us))
 
 
 def _latency(latencies_ms: Array) -> dict[str, float | None]:
