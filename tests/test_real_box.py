@@ -130,7 +130,7 @@ def texture_miss_px(first: int, cam_T_box: np.ndarray, later_cam_T_box: np.ndarr
 
 
 def outline_misses_px(index: int, cam_T_box: np.ndarray) -> tuple[list[float], int]:
-    """Distance to the line segment detected along each side of the silhouette that has one; how many sides there are."""
+    """Distance to the line segment detected along each side of the silhouette that has one, and the number of sides."""
     segments = cv2.createLineSegmentDetector(0).detect(image(index))[0].reshape(-1, 2, 2)
     outline = outline_px(cam_T_box)
     misses = []

@@ -1,0 +1,95 @@
+"""``tools/bench latency`` in small: it runs, counts every message, and measures what it says.  No speed is asserted."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+SIZE = (384, 288)
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch):
+    """Also in the processes that the benchmark starts."""
+    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+
+
+def test_the_whole_run_in_small(capsys: pytest.CaptureFixture[str]):
+    from benchmarks import latency, report, stages
+
+    plan = latency.Plan(
+        sizes=(SIZE,),
+        ring=8,
+        warm_up=20,
+        frames=60,
+        block=20,
+        tags_per_block=2,
+        staged=40,
+        paced_block=40,
+        paced_blocks=2,
+        memory_marks=(50, 100),
+    )
+    results = latency.measure(plan)
+    name = f"{SIZE[0]}x{SIZE[1]}"
+    measured = results["latency"][name]
+    assert measured["published_us"]["count"] == 60
+    assert 0.0 < measured["published_us"]["median"] <= measured["published_us"]["p99"]
+    assert measured["received"] == [80, 80]
+    assert results["memory"][name]["received"] == [101, 101]
+    assert measured["tags_us"]["count"] == 6
+    assert set(results["stages"][name]) == set(stages.STAGES)
+    assert all(us > 0.0 for us in results["stages"][name].values())
+    assert results["recording"][name]["written_bytes"] > 10_000
+    assert all(rss > 20e6 for rss in results["memory"][name]["rss_bytes"].values())
+    text = report.as_text(results)
+    assert "384 x 288" in text and "times faster than tags" in text
+    assert text.count("  met") + text.count("NOT MET") == 5
+
+
+def test_the_ring_moves_on_steadily_and_its_tags_are_found():
+    from benchmarks import scene, tags
+
+    ring = scene.render((768, 576), 3)
+    assert [ring.place(seq) for seq in range(9)] == [0, 1, 2, 1, 0, 1, 2, 1, 0]
+    stamps_ns = [ring.frame(seq).stamp_ns for seq in range(3)]
+    assert np.diff(stamps_ns).tolist() == pytest.approx([1e9 / 60] * 2, abs=1.0)
+    tracker = tags.TagTracker(scene.config_for((768, 576)).camera)
+    for place in range(3):
+        tcp_m = tracker.tcp_m(ring.tagged[place], float(ring.jaw_openings_m[place]))
+        assert tcp_m is not None
+        assert np.linalg.norm(tcp_m - ring.true_tcp_m[place]) < 3e-4
+        assert tracker.tcp_m(ring.images[place], float(ring.jaw_openings_m[place])) is None
+
+
+def test_stop_watches_count_every_nanosecond_once(monkeypatch: pytest.MonkeyPatch):
+    """By a clock that advances by 1 ns whenever it is read."""
+    from benchmarks import stages
+
+    monkeypatch.setattr(stages.time, "perf_counter_ns", itertools.count().__next__)
+    watches = stages.StopWatches()
+    inner = watches.wrapped(lambda: None, "corners")
+    outer = watches.wrapped(lambda: (inner(), inner()), "joint fit")
+    outer()
+    assert watches.total_ns["corners"] == 2
+    assert watches.total_ns["joint fit"] == 3
+    assert sum(watches.total_ns.values()) == 5
+    watches.reset()
+    assert not any(watches.total_ns.values())
+
+
+def test_stop_watches_leave_the_product_as_it_was():
+    from benchmarks import stages
+
+    before = {(owner, name): getattr(owner, name) for places in stages.STAGES.values() for owner, name in places}
+    with stages.stop_watches():
+        assert all(getattr(owner, name) is not function for (owner, name), function in before.items())
+    assert all(getattr(owner, name) is function for (owner, name), function in before.items())

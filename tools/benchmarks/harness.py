@@ -1,0 +1,162 @@
+"""The product's own loop with a stop watch at both ends: where frames are handed over, and where transforms leave."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.scene import FPS, Ring
+from gripmon import daemon
+from gripmon.config import Config
+from gripmon.monitor import Monitor
+from gripmon.publish import Publisher, PublishSettings, ZenohPublisher
+from gripmon.recording import NullRecorder, Recorder
+from gripmon.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
+
+_SUBSCRIBER = Path(__file__).parent / "subscriber.py"
+_CORES = os.sched_getaffinity(0)
+_MATCH_S = 0.5  # until the publisher knows of its subscriber
+
+
+class RingSource:
+    """Hands frames over and notes when, and when the loop came back; ``paced``: at the camera's rate, else at once.
+
+    ``between`` is called before each frame, outside of what is timed.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(
+        self, ring: Ring, count: int, *, paced: bool = False, between: Callable[[int], None] = lambda seq: None
+    ) -> None:
+        self.handed_ns = np.zeros(count, np.int64)
+        self.published_ns = np.zeros(count, np.int64)
+        self.back_ns = np.zeros(count, np.int64)
+        self._ring, self._count, self._paced, self._between = ring, count, paced, between
+        self._seq = 0
+        self._due_s = time.monotonic()
+
+    def read(self) -> Frame | None:
+        seq = self._seq
+        if seq > 0:
+            self.back_ns[seq - 1] = time.monotonic_ns()
+        if seq >= self._count:
+            return None
+        self._between(seq)
+        frame = self._ring.frame(seq)
+        self._seq = seq + 1
+        if self._paced:
+            self._due_s = max(self._due_s + 1.0 / FPS, time.monotonic())
+            time.sleep(max(self._due_s - time.monotonic(), 0.0))
+        self.handed_ns[seq] = time.monotonic_ns()
+        return frame
+
+    def close(self) -> None:
+        self._count = self._seq
+
+    def latency_us(self) -> NDArray[np.float64]:
+        """From handed over to published, per frame."""
+        return 1e-3 * (self.published_ns - self.handed_ns)
+
+    def loop_us(self) -> NDArray[np.float64]:
+        """From handed over until the loop wants the next frame."""
+        return 1e-3 * (self.back_ns - self.handed_ns)
+
+
+class _TimedPublisher:
+    """Notes when a transform has left.  Its session outlives the loop, until the subscriber has been asked."""
+
+    def __init__(self, inner: Publisher, source: RingSource) -> None:
+        self._inner, self._source = inner, source
+
+    def transform(self, record: FrameRecord) -> None:
+        self._inner.transform(record)
+        self._source.published_ns[record.seq] = time.monotonic_ns()
+
+    def state(self, record: StateRecord) -> None:
+        self._inner.state(record)
+
+    def alert(self, record: AlertRecord) -> None:
+        self._inner.alert(record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self._inner.reference(record)
+
+    def close(self) -> None: ...
+
+
+class Subscriber:
+    """The process that receives; ``received`` after the context: frame numbers and arrival times, ns."""
+
+    def __init__(self, endpoint: str, key: str) -> None:
+        self.seqs = np.zeros(0, np.int64)
+        self.arrivals_ns = np.zeros(0, np.int64)
+        pinned_to = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, (_CORES - pinned_to) or _CORES)  # for the new process, which takes it over
+        self._process = subprocess.Popen(
+            [sys.executable, str(_SUBSCRIBER), endpoint, key], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+        os.sched_setaffinity(0, pinned_to)
+        assert self._process.stdout is not None
+        if self._process.stdout.readline() != "ready\n":
+            raise RuntimeError("the subscriber did not start")
+        time.sleep(_MATCH_S)
+
+    def finish(self) -> None:
+        answer, _ = self._process.communicate(timeout=60)
+        received: dict[str, Any] = json.loads(answer)
+        self.seqs, self.arrivals_ns = (np.array(received[k], np.int64) for k in ("seqs", "arrivals_ns"))
+
+
+@contextmanager
+def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
+    """A publisher on a free loopback port with a subscriber in another process."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), config.settings.robot, config.settings.camera_name)
+    try:
+        subscriber = Subscriber(endpoint, publisher.keys["transform"])
+        try:
+            yield publisher, subscriber
+        finally:
+            subscriber.finish()
+    finally:
+        publisher.close()
+
+
+def run_loop(config: Config, source: RingSource, publisher: Publisher, recorder: Recorder | None = None) -> None:
+    """The daemon's loop, as ``gripmon run`` runs it, until the source ends.  Closes the recorder, not the publisher."""
+    settings = config.settings
+    daemon.run(
+        Monitor(config.camera, config.gripper, settings.monitor, config.reference),
+        source,
+        _TimedPublisher(publisher, source),
+        NullRecorder() if recorder is None else recorder,
+        settings.daemon,
+        robot=settings.robot,
+        camera=settings.camera_name,
+    )
+
+
+@contextmanager
+def on_one_core() -> Iterator[None]:
+    """This thread, and all threads that it starts meanwhile (Zenoh's), on one core; the subscriber goes elsewhere."""
+    os.sched_setaffinity(0, {max(_CORES)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, _CORES)

@@ -1,0 +1,109 @@
+"""What the benchmarks look at: cluttered simulator frames with motion, rendered beforehand and handed over in a ring.
+
+The ring is played forwards and backwards, so that creep and background move on steadily however long it runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import tags
+from benchmarks.machine import ROOT
+from gripmon.camera import PaperLens, make_camera
+from gripmon.config import Config, load_config
+from gripmon.geometry import from_record
+from gripmon.records import Frame
+from gripmon.simulator import Scenario, Simulator
+from gripmon.simulator.scenario import Background, Creep
+
+FPS = 60.0
+WARM_UP_PACED = 30
+"""Frames at the camera's rate after which everything is as it stays."""
+_START_NS = 1_700_000_000_000_000_000
+_DEMO_HEIGHT_PX = 576
+_CREEP_M = 3e-4
+
+Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Ring:
+    """Rendered frames: ``images`` and ``tagged``, the same with a tag on each finger, (n, height, width) each."""
+
+    images: NDArray[np.uint8]
+    tagged: NDArray[np.uint8]
+    jaw_openings_m: NDArray[np.float64]
+    true_tcp_m: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    def place(self, seq: int) -> int:
+        """Which of the images is frame ``seq``: 0, 1, …, n - 1, n - 2, …, 1, 0, 1, …"""
+        period = 2 * (len(self) - 1)
+        return min(seq % period, period - seq % period)
+
+    def frame(self, seq: int) -> Frame:
+        place = self.place(seq)
+        stamp_ns = _START_NS + round(seq * 1e9 / FPS)
+        return Frame(seq, stamp_ns, self.images[place], float(self.jaw_openings_m[place]))
+
+    def save(self, path: Path) -> None:
+        np.savez(path, **{field.name: getattr(self, field.name) for field in dataclasses.fields(self)})
+
+    @classmethod
+    def load(cls, path: Path) -> Ring:
+        with np.load(path) as arrays:
+            return cls(**{name: arrays[name] for name in arrays.files})
+
+
+def config_for(size: Size) -> Config:
+    """The demo's configuration with a camera of another resolution that sees the same."""
+    config = load_config(ROOT / "configs" / "demo.yaml", check_source=False)
+    width_px, height_px = size
+    scale = height_px / _DEMO_HEIGHT_PX
+    lens = config.settings.camera
+    assert isinstance(lens, PaperLens)
+    lens = PaperLens(
+        width_px=width_px,
+        height_px=height_px,
+        fx_px=lens.fx_px * scale,
+        fy_px=lens.fy_px * scale,
+        cx_px=0.5 * (width_px - 1),
+        cy_px=0.5 * (height_px - 1),
+        kappa_per_px2=lens.kappa_per_px2 / scale**2,
+    )
+    settings = msgspec.structs.replace(config.settings, camera=lens)
+    return dataclasses.replace(config, settings=settings, camera=make_camera(lens))
+
+
+def render(size: Size, count: int, step: Callable[[], object] = lambda: None) -> Ring:
+    """A ring of ``count`` frames; ``step`` is called after each (for a progress bar)."""
+    config = config_for(size)
+    scenario = Scenario(
+        name="benchmark",
+        duration_s=count / FPS,
+        fps=FPS,
+        mount=(Creep(law="linear", time_s=count / FPS, tcp_shift_m=(_CREEP_M, 0.5 * _CREEP_M)),),
+        background=Background(kind="printed", boxes=45, cables=14, contrast=0.9, speed_m_per_s=0.12),
+    )
+    simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)
+    shape = (count, config.camera.height_px, config.camera.width_px)
+    ring = Ring(np.zeros(shape, np.uint8), np.zeros(shape, np.uint8), np.zeros(count), np.zeros((count, 3)))
+    rng = np.random.default_rng(1)
+    for i in range(count):
+        frame, truth = simulator.frame(i), simulator.truth(i)
+        assert isinstance(frame.image, np.ndarray) and frame.jaw_opening_m is not None
+        ring.images[i] = frame.image
+        ring.tagged[i] = tags.with_tags(ring.images[i], config.camera, truth.cam_T_grip, truth.jaw_opening_m, rng)
+        ring.jaw_openings_m[i] = frame.jaw_opening_m
+        ring.true_tcp_m[i] = truth.cam_T_grip[:3, 3]
+        step()
+    return ring
