@@ -304,7 +304,7 @@ def test_typed_settings_keep_what_is_right():
     assert value == _Outer(rows=((1.0, 2.5),), inner={"a": _Inner(mode="slow")}, either="x")
 
 
-@pytest.mark.parametrize("name", ["demo.yaml", "folder.yaml", "live_camera.yaml"])
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
 def test_shipped_configurations_are_sound_and_every_key_says_its_unit(name: str):
     path = builtin_config(name)
     load_config(path, check_source=False)
