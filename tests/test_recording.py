@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections import Counter
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from recorded import (
     CAMERA,
     GRIPPER,
@@ -32,8 +29,6 @@ from recorded import (
 
 from gripmon.geometry import rotation_from_xyzw
 from gripmon.recording import NullRecorder, RecordingSettings, open_recorder
-from gripmon.recording.wire import ImageRing, Unframer, framed
-from gripmon.recording.worker import to_8_bit
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -404,39 +399,3 @@ def test_an_old_file_is_never_overwritten(tmp_path: Path) -> None:
     assert writer.path == tmp_path / "run-0002.rrd"
     writer.close(10.0)
     assert (tmp_path / "run-0001.rrd").read_bytes() == b"precious"
-
-
-@given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))
-def test_messages_survive_any_cutting(payloads: list[bytes], cut: int) -> None:
-    stream = b"".join(framed(payload) for payload in payloads)
-    unframer = Unframer()
-    found = [p for i in range(0, len(stream), cut) for p in unframer.feed(stream[i : i + cut])]
-    assert found == payloads
-
-
-def test_shared_images_keep_apart() -> None:
-    ring = ImageRing.for_camera(WIDTH_PX, HEIGHT_PX, 3)
-    rng = np.random.default_rng(5)
-    pictures = [
-        rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8),
-        rng.integers(0, 65535, (HEIGHT_PX, WIDTH_PX), np.uint16)[::2, ::3],
-        rng.random((HEIGHT_PX, WIDTH_PX, 3), np.float32),
-    ]
-    notes = [ring.put(slot, picture) for slot, picture in enumerate(pictures)]
-    for note, picture in zip(notes, pictures, strict=True):
-        assert ring.takes(picture)
-        np.testing.assert_array_equal(ring.get(note), picture)
-    ring.close()
-
-
-def test_deep_pixels_become_8_bit() -> None:
-    np.testing.assert_array_equal(to_8_bit(np.array([[0, 255, 256, 65535]], np.uint16)), [[0, 0, 1, 255]])
-    floats = np.array([[0.0, 0.5, 1.0, 7.0, -1.0, np.nan]], np.float32)
-    np.testing.assert_array_equal(to_8_bit(floats), [[0, 128, 255, 255, 0, 0]])
-
-
-def test_every_state_and_verdict_has_its_own_colour() -> None:
-    from gripmon.recording import palette
-
-    assert set(palette.STATES) == set(State) and set(palette.VERDICTS) == set(Verdict)
-    assert max(Counter(palette.STATES.values()).values()) == 1

@@ -17,7 +17,7 @@ from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.process import WorkerProcess
 from gripmon.recording.settings import RecordingSettings
-from gripmon.recording.wire import Batch, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
+from gripmon.recording.wire import EncodedBatch, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
 from gripmon.records import AlertRecord, Frame, FrameRecord, Image, MeasurementTrace, ReferenceRecord, State, Verdict
 
 _log = logging.getLogger(__name__)
@@ -27,6 +27,7 @@ BATCH_FRAMES = 16
 LONGEST_RESTART_PAUSE_S = 30.0
 _ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
+_FRAMES_A_TURN = 4
 _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
@@ -280,20 +281,22 @@ class ProcessRecorder:
         _log.error("recording failed: %s; next try in %.0f s", failure, self._restart_pause_s)
         self._restart_pause_s = min(2.0 * self._restart_pause_s, LONGEST_RESTART_PAUSE_S)
 
-    def _next_batch(self, worker: WorkerProcess) -> Batch:
-        frames: list[FrameNote] = []
+    def _next_batch(self, worker: WorkerProcess) -> EncodedBatch:
+        frames: list[msgspec.Raw] = []
         while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0][2]):
             record, shown, image, trace, jaw_reported_m = self._frames.popleft()
             self._images_taken += shown
             note = None if image is None else self._share(worker, image)
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
-            frames.append(FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m))
+            frames.append(msgspec.Raw(self._encode(FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m))))
+            if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
+                time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
         references = _drain(self._references)
         if references:
             self._newest_reference = references[-1]
-        return Batch(frames, _drain(self._alerts), references)
+        return EncodedBatch(frames, _drain(self._alerts), references)
 
     def _wait_for_slot(self, worker: WorkerProcess, image: Image | None) -> bool:
         """Whether the next frame stays in the queue because its image has no room yet and patience is left."""

@@ -78,7 +78,17 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Batch(msgspec.Struct, frozen=True, array_like=True):
+    """What goes over the pipe at once, as it is read."""
+
     frames: list[FrameNote]
+    alerts: list[AlertRecord]
+    references: list[ReferenceRecord]
+
+
+class EncodedBatch(msgspec.Struct, frozen=True, array_like=True):
+    """The same as it is written: every :class:`FrameNote` is encoded on its own."""
+
+    frames: list[msgspec.Raw]
     alerts: list[AlertRecord]
     references: list[ReferenceRecord]
 

@@ -1,0 +1,59 @@
+"""Parts of the recording by themselves: messages, shared images, pixels, colours, labels."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from recorded import HEIGHT_PX, WIDTH_PX
+
+from gripmon.recording import palette
+from gripmon.recording.overlay import _label_places
+from gripmon.recording.wire import ImageRing, Unframer, framed
+from gripmon.recording.worker import to_8_bit
+from gripmon.records import State, Verdict
+
+
+@given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))
+def test_messages_survive_any_cutting(payloads: list[bytes], cut: int) -> None:
+    stream = b"".join(framed(payload) for payload in payloads)
+    unframer = Unframer()
+    found = [p for i in range(0, len(stream), cut) for p in unframer.feed(stream[i : i + cut])]
+    assert found == payloads
+
+
+def test_shared_images_keep_apart() -> None:
+    ring = ImageRing.for_camera(WIDTH_PX, HEIGHT_PX, 3)
+    rng = np.random.default_rng(5)
+    pictures = [
+        rng.integers(0, 255, (HEIGHT_PX, WIDTH_PX, 3), np.uint8),
+        rng.integers(0, 65535, (HEIGHT_PX, WIDTH_PX), np.uint16)[::2, ::3],
+        rng.random((HEIGHT_PX, WIDTH_PX, 3), np.float32),
+    ]
+    notes = [ring.put(slot, picture) for slot, picture in enumerate(pictures)]
+    for note, picture in zip(notes, pictures, strict=True):
+        assert ring.takes(picture)
+        np.testing.assert_array_equal(ring.get(note), picture)
+    ring.close()
+
+
+def test_deep_pixels_become_8_bit() -> None:
+    np.testing.assert_array_equal(to_8_bit(np.array([[0, 255, 256, 65535]], np.uint16)), [[0, 0, 1, 255]])
+    floats = np.array([[0.0, 0.5, 1.0, 7.0, -1.0, np.nan]], np.float32)
+    np.testing.assert_array_equal(to_8_bit(floats), [[0, 128, 255, 255, 0, 0]])
+
+
+def test_every_state_and_verdict_has_its_own_colour() -> None:
+    assert set(palette.STATES) == set(State) and set(palette.VERDICTS) == set(Verdict)
+    assert max(Counter(palette.STATES.values()).values()) == 1
+
+
+def test_labels_keep_off_the_edges_and_each_other() -> None:
+    corners = [(100.0, 50.0), (140.0, 52.0), (110.0, 150.0), (300.0, 49.0)]
+    places = _label_places(corners, step_px=10.0)
+    assert [u for u, _ in places] == [u for u, _ in corners]
+    assert places[0][1] < 50.0 and places[1][1] < 52.0 and places[3][1] < 49.0 and places[2][1] > 150.0
+    assert abs(places[0][1] - places[1][1]) > 5.0  # neighbours stand on two levels
+    assert _label_places([], 10.0) == []
