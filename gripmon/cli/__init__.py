@@ -12,6 +12,17 @@ from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailed
 
 _COMMANDS = (demo, run, replay, simulate, check)
 
+# To be set before NumPy and OpenCV are imported; what the user has set stays.
+_ENVIRONMENT = {
+    # One thread: the matrices are tiny, and the same input then gives the same bytes.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+    # A camera that is absent, or a file that is no video, we report in our own words.
+    "OPENCV_LOG_LEVEL": "ERROR",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+}
+
 _DESCRIPTION = """\
 gripmon watches a robot's wrist camera that sees its own fingertips: in every frame it measures the
 fingertips' corners, corrects the hand/eye calibration cam_T_grip, says whether it can still be
@@ -46,9 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
     if not hasattr(chosen, "handler"):
         parser.print_help()
         return 0
-    # One thread: the matrices are tiny, and the same input then gives the same bytes.  Has to come before NumPy.
-    for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+    for variable, value in _ENVIRONMENT.items():
+        os.environ.setdefault(variable, value)
     try:
         code: int = chosen.handler(chosen)
         sys.stdout.flush()
