@@ -118,6 +118,9 @@ def _edge_answers(image: Image, factor: float) -> NDArray[np.float32]:
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     if small.ndim == 3:
         small = small @ GREY_BGR
+    if not np.isfinite(small).all():
+        # Dead pixels of a float camera: the usual level makes no edge that would outshine all others.
+        small[~np.isfinite(small)] = np.nanmedian(small)
     gx = cv2.Scharr(small, cv2.CV_32F, 1, 0)
     gy = cv2.Scharr(small, cv2.CV_32F, 0, 1)
     energy = gx * gx + gy * gy

@@ -1,0 +1,146 @@
+"""Finding the gripper again after jumps far beyond the profiles' reach: random jumps in simulated scenes, no lies."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from meters import EVERYWHERE, NARROW, box_gripper, difference, measure, meter, moved, picture, simulated
+from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from test_prediction import predicted
+
+from gripmon.camera import make_camera
+from gripmon.corners import Effort, Measurement
+from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.simulator import make_scenario
+
+SETTINGS = SearchSettings()
+
+
+def jumps(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Shifts of the TCP by up to 10 mm along every axis, turns by up to 4 degrees about the optical axis."""
+    xi = np.zeros((count, 6))
+    xi[:, :3] = rng.uniform(-0.01, 0.01, (count, 3))
+    xi[:, 5] = np.deg2rad(rng.uniform(-4.0, 4.0, count))
+    return xi
+
+
+def is_true(found: Measurement, cam_T_grip: np.ndarray) -> bool:
+    error = difference(found.cam_T_grip, cam_T_grip)
+    return bool(np.abs(error[:2]).max() < 1.5e-4 and abs(error[2]) < 6e-4)
+
+
+@pytest.mark.parametrize(("scene", "least"), [("static", 28), ("bump", 28), ("clutter", 17)])
+def test_random_jumps_are_found_and_never_a_wrong_place_is_trusted(scene: str, least: int):
+    """Of 30 jumps; the third scene, full of straight edges in motion, may need several frames."""
+    rng, true = np.random.default_rng(11), nominal_cam_T_grip()
+    found = 0
+    for seed in (3, 4, 5):
+        image = picture(make_scenario(scene), 0, seed)
+        for xi in jumps(rng, 10):
+            got = measure(image, moved(true, xi), patience=EVERYWHERE)
+            assert not got.trusted or is_true(got, true), xi
+            found += got.trusted
+    assert found >= least
+
+
+def test_without_patience_a_jump_is_not_found_and_not_trusted():
+    rng, true = np.random.default_rng(12), nominal_cam_T_grip()
+    image = picture(make_scenario("static"), 0, 3)
+    for xi in jumps(rng, 10):
+        got = measure(image, moved(true, xi), patience=NARROW)
+        assert not got.trusted and got.effort is Effort.NARROW and not got.looked_far
+
+
+def test_the_grid_suffices_for_a_jump_of_a_few_pixels_and_the_search_is_spared():
+    true = nominal_cam_T_grip()
+    for xi in ([5e-4, -4e-4, 0.0, 0.0, 0.0, 0.0], [-5e-4, 0.0, 0.0, 0.0, 0.0, 0.008]):
+        got = measure(picture(make_scenario("static"), 0, 3), moved(true, np.array(xi)), patience=EVERYWHERE)
+        assert got.trusted and is_true(got, true) and got.effort is not Effort.SEARCH
+
+
+def test_a_gripper_that_is_where_it_was_expected_is_not_looked_for():
+    got = measure(picture(make_scenario("static"), 0, 3), patience=EVERYWHERE)
+    assert got.trusted and got.effort is Effort.NARROW and not got.looked_far
+
+
+def test_nothing_is_found_where_no_gripper_is():
+    rng = np.random.default_rng(13)
+    for seed in range(6):
+        texture = cv2.GaussianBlur(rng.normal(size=(576, 768)), (0, 0), 0.7 + seed)
+        boxes = np.zeros((576, 768), np.uint8)
+        for _ in range(60):
+            corner = rng.integers(0, [768, 576])
+            size = rng.integers(20, 160, 2)
+            level = int(rng.integers(30, 220))
+            cv2.rectangle(boxes, corner.tolist(), (corner + size).tolist(), level, -1)
+        image = np.clip(boxes + 20.0 * texture / texture.std() + 20.0, 0, 255).astype(np.uint8)
+        assert not measure(image, patience=EVERYWHERE).trusted
+
+
+def test_a_start_puts_the_gripper_where_it_is():
+    """On even ground one of the starts must lie within what the fit can bridge: a few pixels of the reduced image."""
+    image, true, camera = picture(plain_scenario()), nominal_cam_T_grip(), make_camera(PAPER_LENS)
+    points = box_gripper().points_grip_m(0.034)[box_gripper().corner_points]
+    rng = np.random.default_rng(14)
+    for xi in jumps(rng, 12):
+        expected = moved(true, xi)
+        starts = search_starts(image, predicted(cam_T_grip=expected), SETTINGS)
+        assert 0 < len(starts) <= SETTINGS.starts
+        misses = []
+        for start in starts:
+            pose = moved(expected, start[:6])
+            uv, goal = (camera.project(points @ p[:3, :3].T + p[:3, 3]) for p in (pose, true))
+            misses.append(np.abs(uv - goal).max())
+        assert min(misses) < 4.0 * image.shape[1] / SETTINGS.coarse_columns
+
+
+def test_no_start_lies_beyond_the_reach():
+    image = picture(make_scenario("clutter"), 0, 3)
+    starts = search_starts(image, predicted(), SearchSettings(reach_m=0.004, turn_rad=0.03, starts=8))
+    assert len(starts) == 8
+    assert np.abs(starts[:, 5]).max() <= 0.03 + 1e-9
+    assert np.abs(starts[:, 2]).max() <= 0.004 * 1.15
+    # A shift of the image by the reach, a turn and a scale about the middle of the fingers.
+    assert np.abs(starts[:, :2]).max() <= 0.004 + 0.03 * 0.03 + 0.035 * 0.03 + 0.001
+    assert not starts[:, 3:5].any() and not starts[:, 6:].any()
+
+
+def test_nothing_is_searched_for_when_nothing_can_be_seen():
+    pose = moved(nominal_cam_T_grip(), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    image = picture(plain_scenario())
+    assert search_starts(image, predicted(cam_T_grip=pose), SETTINGS).shape == (0, 7)
+    assert not measure(image, pose, patience=EVERYWHERE).trusted
+
+
+def test_a_search_in_a_meter_leaves_nothing_behind():
+    image, true, used = picture(make_scenario("static"), 0, 3), nominal_cam_T_grip(), meter()
+    first = measure(image, using=used)
+    measure(image, moved(true, np.array([0.008, -0.006, 0.0, 0.0, 0.0, 0.05])), using=used, patience=EVERYWHERE)
+    again = difference(first.cam_T_grip, measure(image, using=used).cam_T_grip)
+    assert (np.abs(again) < 0.3 * np.sqrt(np.diag(first.covariance)[:6])).all()
+
+
+@pytest.mark.parametrize("kind", ["colour", "uint16", "float32"])
+def test_other_kinds_of_images_are_searched_as_well(kind: str):
+    image = picture(make_scenario("static"), 0, 3)
+    other = {
+        "colour": np.repeat(image[..., None], 3, axis=2),
+        "uint16": image.astype(np.uint16) * 257,
+        "float32": image.astype(np.float32) / 255.0,
+    }[kind]
+    xi = np.array([0.007, -0.005, 0.003, 0.0, 0.0, 0.04])
+    got = measure(other, moved(nominal_cam_T_grip(), xi), patience=EVERYWHERE)
+    assert got.trusted and is_true(got, nominal_cam_T_grip())
+
+
+def test_pixels_that_are_not_finite_do_not_stop_a_search():
+    image = picture(make_scenario("static"), 0, 3).astype(np.float32) / 255.0
+    image[40:60, 300:330] = np.nan
+    xi = np.array([0.007, -0.005, 0.003, 0.0, 0.0, 0.04])
+    got = measure(image, moved(nominal_cam_T_grip(), xi), patience=EVERYWHERE)
+    assert got.trusted and is_true(got, nominal_cam_T_grip())
+
+
+def test_simulated_truth_is_what_the_tests_take_it_for():
+    np.testing.assert_allclose(simulated(make_scenario("bump"), 3).truth(0).cam_T_grip, nominal_cam_T_grip())
