@@ -14,6 +14,8 @@ import numpy as np
 from gripmon.records import Array, Transform
 
 _SMALL_RAD = 1e-8
+_IDENTITY = np.eye(4)
+_THREE_HALVES = 1.5 * np.eye(3)
 
 
 def skew(v: Array) -> Array:
@@ -93,7 +95,7 @@ def rotation_from_xyzw(quaternion: tuple[float, float, float, float]) -> Array:
 
 def make_transform(rotation: Array, translation_m: Array) -> Array:
     """(3, 3) and (3,) -> ``a_T_b`` (4, 4)."""
-    out = np.eye(4)
+    out = _IDENTITY.copy()
     out[:3, :3] = rotation
     out[:3, 3] = translation_m
     return out
@@ -109,7 +111,7 @@ def perturb(a_T_b: Array, xi: Array) -> Array:
     """Apply ``xi = (rho, omega)`` (6,): translation plus rho, rotation exp(omega) from the left, re-orthonormalised."""
     rotation = exp_rotation(xi[3:]) @ a_T_b[:3, :3]
     # One Newton step towards the nearest rotation: rounding does not pile up over millions of frames.
-    rotation = rotation @ (1.5 * np.eye(3) - 0.5 * (rotation.T @ rotation))
+    rotation = rotation @ (_THREE_HALVES - 0.5 * (rotation.T @ rotation))
     return make_transform(rotation, a_T_b[:3, 3] + xi[:3])
 
 

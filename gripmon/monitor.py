@@ -117,7 +117,8 @@ class Monitor:
         before_T = self._cam_T_grip
         self._cam_T_grip, self._covariance = self._update(measurement)
         self._jaw_opening_m, self._measured_s = measurement.jaw_opening_m, self._now_s
-        evidence = self._evidence(measurement, before_T)
+        drift = self._drift()
+        evidence = self._evidence(measurement, before_T, drift)
         if evidence.jumped:
             self._average.forget()
         self._average.add(self._cam_T_grip, self._covariance)
@@ -126,8 +127,8 @@ class Monitor:
         if judgement.recalibrate:
             recalibrated = self._recalibrate(measurement, frame.stamp_ns)
             if recalibrated is not None:
-                origin, alerts = Origin.RECALIBRATION, (*alerts, recalibrated)
-        return self._record(frame, judgement, origin, alerts, measurement)
+                origin, alerts, drift = Origin.RECALIBRATION, (*alerts, recalibrated), self._drift()
+        return self._record(frame, judgement, origin, alerts, measurement, drift)
 
     def trace(self) -> MeasurementTrace | None:
         """The pixels behind the newest record; None if its frame was refused."""
@@ -195,10 +196,9 @@ class Monitor:
                 pass  # The corners that are left lie on a line: the edges still determine the motion.
         return cam_T_grip, covariance + self._floor
 
-    def _evidence(self, measurement: Measurement, before_T: Array) -> Evidence:
+    def _evidence(self, measurement: Measurement, before_T: Array, drift: Drift) -> Evidence:
         assert self._covariance is not None
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
-        drift = self._drift()
         # Motion that the profiles can follow from frame to frame is no jump.
         looked_far = measurement.effort is not Effort.NARROW
         jumped = looked_far and self._meter.moved_px(measurement, before_T) > self._settings.corners.sampling.reach_px
@@ -297,7 +297,13 @@ class Monitor:
         )
 
     def _record(
-        self, frame: Frame, judgement: Judgement, origin: Origin, alerts: tuple[Alert, ...], measurement: Measurement
+        self,
+        frame: Frame,
+        judgement: Judgement,
+        origin: Origin,
+        alerts: tuple[Alert, ...],
+        measurement: Measurement,
+        drift: Drift,
     ) -> FrameRecord:
         assert self._covariance is not None
         return FrameRecord(
@@ -309,7 +315,7 @@ class Monitor:
             cam_T_grip=to_record(self._cam_T_grip),
             covariance=_flat(self._covariance),
             smoothed=self._smoothed(),
-            drift=self._drift(),
+            drift=drift,
             reference_id=self._reference.reference_id,
             revision=self._reference.revision,
             rms_px=measurement.corner_rms_px(self._cam_T_grip),

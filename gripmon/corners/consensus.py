@@ -69,7 +69,7 @@ GATE_PX = 0.5
 _TUKEY = 4.685
 _LARGEST_SCALE_PX = 0.5
 _ROUNDS = 6
-_CONVERGED = 1e-3  # squared step over its covariance: three hundredths of a standard deviation
+_CONVERGED = 1e-2  # squared step over its covariance: a tenth of a standard deviation, and the next is smaller still
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +150,7 @@ def agree(
         step, information, weight = _step(jacobian, residual, weights, width, prior_mean - xi, prior)
         xi = xi + step
         residual = offset - xi @ jacobian
-        if round_ >= 2 and step @ information @ step < _CONVERGED:
+        if round_ >= 2 and float(step @ information @ step) < _CONVERGED:
             break
     return _judge(candidates, prediction, active, xi, weight, residual, information, scale, settings)
 

@@ -40,8 +40,8 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 @dataclass(frozen=True, slots=True)
 class Corners:
     """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy``
-    (c, 2, 2), ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each; NaN where there
-    is a fault.
+    (c, 2, 2), ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each, ``usable``
+    (c,) where there is none; NaN where a corner was not measured.
     """
 
     xy: Array
@@ -49,10 +49,7 @@ class Corners:
     uv_px: Array
     sigma_px: Array
     fault: tuple[CornerFault | None, ...]
-
-    @property
-    def usable(self) -> NDArray[np.bool_]:
-        return np.array([f is None for f in self.fault], dtype=bool)
+    usable: NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,15 +144,14 @@ def intersect_edges(
     covariance_xy[good] = np.linalg.inv(information[good])
     shift = (covariance_xy @ (weighted * wanted[..., None]).sum(axis=1)[..., None])[..., 0]
     sigma_px = _largest_sigma(prediction.corners.d_uv_d_xy, covariance_xy)
+    uncertain = good & ~(sigma_px <= settings.largest_sigma_px)
     return Corners(
         prediction.corners.xy + shift,
         covariance_xy,
         prediction.corners.uv_px + (prediction.corners.d_uv_d_xy @ shift[..., None])[..., 0],
         sigma_px,
-        tuple(
-            CornerFault.UNCERTAIN if f is None and not s <= settings.largest_sigma_px else f
-            for f, s in zip(fault, sigma_px.tolist(), strict=True)
-        ),
+        tuple(CornerFault.UNCERTAIN if unsure else why for why, unsure in zip(fault, uncertain.tolist(), strict=True)),
+        good & ~uncertain,
     )
 
 

@@ -7,6 +7,7 @@ are other starts tried, and only when those fail, too, is the gripper searched f
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -94,7 +95,7 @@ class Patience:
     when_lost: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
@@ -131,14 +132,15 @@ class Measurement:
         corners.
         """
         usable = self.corners.usable
-        if not usable.any():
+        count = int(np.count_nonzero(usable))
+        if not count:
             return None
         prediction = self.prediction
         turn = cam_T_grip[:3, :3] @ prediction.cam_T_grip[:3, :3].T
-        points = (self.corners_cam_m[usable] - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
-        miss_xy = self.corners.xy[usable] - points[:, :2] / points[:, 2:]
-        miss_px = np.einsum("cij,cj->ci", prediction.corners.d_uv_d_xy[usable], miss_xy)
-        return float(np.sqrt((miss_px * miss_px).sum() / len(miss_px)))
+        points = (self.corners_cam_m - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
+        miss_xy = self.corners.xy - points[:, :2] / points[:, 2:]
+        miss_px = (prediction.corners.d_uv_d_xy @ miss_xy[..., None])[usable]
+        return math.sqrt(float(np.vdot(miss_px, miss_px)) / count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,10 +186,11 @@ class FingertipMeter:
         best = self._settle(image, expected)
         satisfied = SATISFIED * usual_share
         if best.consensus.share >= satisfied:
-            return replace(best, trusted=best.consensus.share >= self._settings.consensus.trusted_share)
-        trusted = self._trusted(best, usual_share)
+            best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
+            return best
+        best.trusted = trusted = self._trusted(best, usual_share)
         if not (patience.when_doubtful if trusted else patience.when_lost):
-            return replace(best, trusted=trusted)
+            return best
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true.
         beat = CLEARLY_BETTER * best.consensus.share if trusted else best.consensus.share
@@ -197,7 +200,8 @@ class FingertipMeter:
                 best = other
             if best.consensus.share >= satisfied:
                 break
-        return replace(best, trusted=self._trusted(best, usual_share), looked_far=True)
+        best.trusted, best.looked_far = self._trusted(best, usual_share), True
+        return best
 
     def _trusted(self, measurement: Measurement, usual_share: float) -> bool:
         consensus = self._settings.consensus
