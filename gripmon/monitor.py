@@ -214,12 +214,12 @@ class Monitor:
 
     def _cause(self, measurement: Measurement) -> Cause:
         """A finger that left the reference alone is bent; when all have left it, the camera has moved."""
-        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
-            return Cause.JAW_OPENING
         shares = finger_shares(measurement, self._gripper, self._ref_cam_T_grip)
         known = shares[np.isfinite(shares)]
         if len(known) >= 2 and known.max() > 0.6 and known.min() < 0.3:
             return Cause.FINGER_BENT
+        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+            return Cause.JAW_OPENING
         return Cause.CAMERA_MOUNT if len(known) and known.max() < 0.6 else Cause.UNKNOWN
 
     def _recalibrate(self, measurement: Measurement, stamp_ns: int) -> Alert | None:

@@ -100,8 +100,8 @@ class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
     ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening), already multiplied by ``inflation``, the factor by
-    which the residuals exceed the image noise; ``jaw_surprise``: the seen jaw opening against the reported one, in
-    standard deviations of the latter.
+    which the residuals exceed the image noise; ``jaw_surprise``: the seen jaw opening against the reported one
+    (``jaw_reported_m``), in standard deviations of the latter.
 
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
@@ -115,6 +115,7 @@ class Measurement:
     jaw_opening_m: float
     covariance: Array
     inflation: float
+    jaw_reported_m: float
     jaw_surprise: float
     effort: Effort
     trusted: bool = False
@@ -236,6 +237,7 @@ class FingertipMeter:
             expected.jaw_opening_m,
             inflation * np.linalg.inv(consensus.information + np.diag(self._prior)),
             inflation,
+            expected.jaw_reported_m,
             self._jaw_surprise(prediction, consensus.xi, prior_mean),
             Effort.NARROW,
         )

@@ -39,14 +39,14 @@ def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array)
     """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that
     isn't sampled.
 
-    Edge points closer to that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach
-    gets zeros.
+    The jaw opening is the reported one: the seen one takes part of a bent finger upon itself.  Edge points closer to
+    that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach gets zeros.
     """
     prediction, candidates = measurement.prediction, measurement.candidates
     xi = perturbation_between(prediction.cam_T_grip, cam_T_grip)
     offset_px = prediction.jacobian[:, :6] @ xi
     if prediction.jacobian.shape[1] == 7:
-        offset_px = offset_px + prediction.jacobian[:, 6] * (measurement.jaw_opening_m - prediction.jaw_opening_m)
+        offset_px = offset_px + prediction.jacobian[:, 6] * (measurement.jaw_reported_m - prediction.jaw_opening_m)
     gate_px = min(3.0 * measurement.consensus.scale_px, GATE_PX)
     close = np.abs(candidates.offset_px - offset_px[candidates.sample]) < gate_px
     agrees = np.zeros(len(prediction.uv_px), dtype=bool)
