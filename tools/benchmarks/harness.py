@@ -42,9 +42,8 @@ class RingSource:
     def __init__(
         self, ring: Ring, count: int, *, paced: bool = False, between: Callable[[int], None] = lambda seq: None
     ) -> None:
-        self.handed_ns = np.zeros(count, np.int64)
-        self.published_ns = np.zeros(count, np.int64)
-        self.back_ns = np.zeros(count, np.int64)
+        # Filled, not just reserved: memory that is first touched later would look like a leak of the product's.
+        self.handed_ns, self.published_ns, self.back_ns = (np.full(count, -1, np.int64) for _ in range(3))
         self._ring, self._count, self._paced, self._between = ring, count, paced, between
         self._seq = 0
         self._due_s = time.monotonic()

@@ -1,0 +1,79 @@
+"""What the README promises exists: commands, files, message fields, and words on the wire."""
+
+from __future__ import annotations
+
+import enum
+import re
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gripmon import records
+from gripmon.cli import build_parser
+from gripmon.config.settings import Settings
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+CODE = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+
+
+def section(title: str) -> str:
+    match = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", TEXT, re.DOTALL | re.MULTILINE)
+    assert match is not None
+    return match[1]
+
+
+@pytest.mark.parametrize(
+    "record", [records.FrameRecord, records.StateRecord, records.ReferenceRecord, records.AlertRecord]
+)
+def test_every_field_of_every_message_is_explained(record: type[msgspec.Struct]):
+    named = set(re.findall(r"`(\w+)", section("Keys and messages")))
+    assert set(record.__struct_fields__) <= named
+
+
+@pytest.mark.parametrize(
+    "words", [records.State, records.Verdict, records.Origin, records.AlertKind, records.Cause, records.Severity]
+)
+def test_every_word_on_the_wire_is_named(words: type[enum.StrEnum]):
+    named = set(re.findall(r"`(\w+)`", section("Keys and messages")))
+    assert {word.value for word in words} <= named
+
+
+def test_commands_and_their_options_exist():
+    parser = build_parser()
+    subcommands = parser._subparsers._group_actions[0].choices  # type: ignore[union-attr]
+    shell = "\n".join(re.findall(r"```sh\n.*?```|`gripmon.*?`", TEXT, re.DOTALL))
+    used = re.findall(r"gripmon ([a-z]+)((?: [^`\n|]*)?)", shell)
+    assert {command for command, _ in used} == set(subcommands)
+    for command, rest in used:
+        known = {option for action in subcommands[command]._actions for option in action.option_strings}
+        assert set(re.findall(r"--[a-z]+", rest.split("#")[0])) <= known, command
+
+
+def test_files_that_are_named_exist():
+    paths = set(re.findall(r"(?<![\w/.])((?:configs|tools|tests|docs)/[\w./]*\w)", TEXT))
+    assert len(paths) > 6
+    assert not [path for path in paths if not (ROOT / path).exists()]
+
+
+def test_settings_that_are_named_exist():
+    named = set(re.findall(r"`((?:monitor|publish|jaw|reference)(?:\.\w+)+)`", TEXT)) - {"jaw.nominal_m"}
+    assert len(named) >= 4
+    for dotted in named:
+        kind: type = Settings
+        for key in dotted.split("."):
+            fields = {field.name: field.type for field in msgspec.structs.fields(kind)}
+            assert key in fields, dotted
+            kind = fields[key]
+
+
+def test_python_examples_compile():
+    assert len(CODE) == 3
+    for code in CODE:
+        compile(code, "README.md", "exec")
+
+
+def test_the_picture_is_small():
+    (picture,) = re.findall(r"!\[[^]]*\]\(([^)]+)\)", TEXT)
+    assert (ROOT / picture).stat().st_size < 400_000
