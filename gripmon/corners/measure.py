@@ -14,6 +14,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
+from scipy.linalg.lapack import dposv
 
 from gripmon.camera import Camera
 from gripmon.corners.consensus import (
@@ -183,6 +184,8 @@ class FingertipMeter:
         gripper is looked for elsewhere, and the place with the largest share is returned.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
+        # Encoders report a little beyond the end at which a jaw stands.
+        jaw_opening_m = min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
         satisfied = SATISFIED * usual_share
@@ -235,7 +238,7 @@ class FingertipMeter:
             corners,
             expected.cam_T_grip,
             expected.jaw_opening_m,
-            inflation * np.linalg.inv(consensus.information + np.diag(self._prior)),
+            inflation * self._covariance(consensus.information),
             inflation,
             expected.jaw_reported_m,
             self._jaw_surprise(prediction, consensus.xi, prior_mean),
@@ -324,6 +327,15 @@ class FingertipMeter:
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges)
         polarity, bevel_m = self._gripper.edge_polarity, self._gripper.edge_bevel_m
         return candidates, base_weights(candidates, prediction, polarity, bevel_m, settings.consensus)
+
+    def _covariance(self, information: Array) -> Array:
+        """Inverse of the edge points' information and the prior's together."""
+        normal = information.copy()
+        normal.flat[:: len(normal) + 1] += self._prior
+        _, inverse, failed = dposv(normal, np.eye(len(normal)))
+        if failed:
+            raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
+        return 0.5 * (inverse + inverse.T)
 
     def _jaw_surprise(self, prediction: Prediction, xi: Array, prior_mean: Array) -> float:
         """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a
