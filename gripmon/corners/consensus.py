@@ -69,7 +69,7 @@ GATE_PX = 0.5
 _TUKEY = 4.685
 _LARGEST_SCALE_PX = 0.5
 _ROUNDS = 6
-_CONVERGED = 1e-2  # squared step over its covariance: a tenth of a standard deviation, and the next is smaller still
+_CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard deviation; what is still to come is less
 
 
 @dataclass(frozen=True, slots=True)
