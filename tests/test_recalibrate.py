@@ -157,8 +157,8 @@ def test_where_residuals_can_tell_the_expected_pose_does_not_matter():
 @pytest.mark.parametrize(
     ("points_grip_m", "said"),
     [
-        (np.zeros((0, 3)), "0 corners; at least 6"),
-        (PLANE_GRIP_M[:1], "1 corners; at least 6"),
+        (np.zeros((0, 3)), "0 corners; at least 4 coplanar ones or 6"),
+        (PLANE_GRIP_M[:1], "1 corners; at least 4 coplanar ones or 6"),
         (PLANE_GRIP_M[:3], "3 corners; at least 4"),
         (GENERAL_GRIP_M[:5], "5 corners; at least 6"),
         (np.linspace(-0.02, 0.02, 5)[:, None] * [1.0, 0.5, 0.2], "on a line"),

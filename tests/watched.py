@@ -29,6 +29,8 @@ SCENES = {
         background=Background(kind="speckle"),
     ),
     "bump": make_scenario("bump", duration_s=3.0, fps=FPS),
+    "lighting": make_scenario("lighting", duration_s=4.0, fps=FPS),
+    "bent_finger": make_scenario("bent_finger", duration_s=3.0, fps=FPS),
     "hand": Scenario(name="hand", duration_s=4.0, fps=15.0, covers=(Cover(start_s=0.7, end_s=3.2, move_s=0.3),)),
 }
 
