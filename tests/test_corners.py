@@ -5,10 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+import yaml
 from box_models import cube_model
 from meters import FISHEYE_LENS, NARROW, box_gripper, corners_px, difference, measure, meter, moved, picture, simulated
 from scipy.spatial.transform import Rotation
-from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
+from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.camera import LensSettings, make_camera
 from gripmon.corners import Measurement, MeasurementSettings, finger_shares, trace_of
@@ -222,6 +223,40 @@ def test_a_coloured_edge_is_measured_in_its_luma():
     bgr = cv2.merge([255 - image, image, image])  # blue runs against the others and is worth 0.114
     found, reference = measure(bgr), measure(image)
     np.testing.assert_allclose(found.corners.uv_px, reference.corners.uv_px, atol=0.02)
+
+
+def brighter_sides(image: np.ndarray) -> dict[str, str]:
+    """For every sampled edge the side that is brighter for somebody who walks it in the image, read off the image."""
+    gripper, camera, pose = box_gripper(), make_camera(PAPER_LENS), nominal_cam_T_grip()
+    points = gripper.points_grip_m(0.034) @ pose[:3, :3].T + pose[:3, 3]
+    sides = {}
+    for edge in np.unique(measure(image).prediction.layout.edge):
+        start, end = camera.project(points[gripper.edge_points[edge]])
+        middle, walk = 0.5 * (start + end), (end - start) / np.linalg.norm(end - start)
+        # Rows count downwards: who walks along a row to the right has larger rows to his right.
+        right = np.array([-walk[1], walk[0]])
+        values = [float(image[tuple(np.rint(middle + 5.0 * s * right)[::-1].astype(int))]) for s in (1.0, -1.0)]
+        sides[gripper.edge_ids[edge]] = "right" if values[0] > values[1] else "left"
+    return sides
+
+
+def test_the_taught_polarity_admits_its_own_contrast_and_no_other():
+    image = picture(PLAIN)
+    sides = brighter_sides(image)
+    assert set(sides.values()) == {"left", "right"}
+    model = yaml.safe_load(BOX_FINGERS.read_text())
+    for name, side in sides.items():
+        model["edges"][name]["brighter"] = side
+    taught = measure(image, using=meter(gripper_from_dict(model)))
+    assert taught.consensus.share > 0.95
+    turned = "L_tip_near"
+    model["edges"][turned]["brighter"] = {"left": "right", "right": "left"}[sides[turned]]
+    other = measure(image, using=meter(gripper_from_dict(model)))
+    index = box_gripper().edge_ids.index(turned)
+    assert taught.consensus.edge_seen[index] and not other.consensus.edge_seen[index]
+    assert measure(255 - image, using=meter(gripper_from_dict(model))).consensus.share < 0.3, (
+        "a negative shows no gripper"
+    )
 
 
 # --- purity, jaw, fingers, trace ---
