@@ -120,7 +120,7 @@ class DriftTest:
         """One frame's shift against the reference (6,) and its standard deviations; True while a drift is
         established: from the threshold on until all that spoke for it is taken back.
         """
-        gain = self.smallest / sigma**2
+        gain = self.smallest / (sigma * sigma)
         centred, half = gain * shift, 0.5 * gain * self.smallest
         # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
         limit = 0.2 * self.threshold

@@ -62,7 +62,7 @@ class PoseAverage:
             return
         innovation = perturbation_between(self.cam_T_grip, cam_T_grip)
         # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
-        sides = np.empty((6, 7))
+        sides = np.empty((6, 7), order="F")  # as LAPACK wants it: no copy
         sides[:, :6], sides[:, 6] = self.covariance, innovation
         _, both, failed = dposv(self.covariance + covariance, sides)
         if failed:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 
 from loopback import frame_record, reference_record
 
+from gripmon.recording import Trace
 from gripmon.records import (
     AlertRecord,
     CornerFault,
@@ -108,7 +109,7 @@ class Listener:
     def reference(self, record: ReferenceRecord) -> None:
         self.references.append(record)
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
         if self._fails == "offer":
             raise RuntimeError("the recorder is broken")
         self.offered.append((frame, record))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -74,7 +75,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     directory = tmp_path_factory.mktemp("story")
     writer = recorder(directory, truth, image_rate_hz=1000.0, image_format="png", queue_images=32)
     for i in range(COUNT):
-        writer.offer(frame(i), story(i), trace(i))
+        writer.offer(frame(i), story(i), partial(trace, i))
     writer.alert(
         AlertRecord(
             robot="arm",
@@ -258,7 +259,7 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64)
     for i in range(60):
         state = State.DRIFTING if i in (31, 32) else State.TRACKING
-        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), trace(i))
+        writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), partial(trace, i))
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
     told = Recorded(path)
@@ -272,7 +273,7 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
 def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
     writer = recorder(tmp_path, patience_s=20.0, queue_frames=16, queue_images=2, image_rate_hz=1000.0)
     for i in range(150):
-        writer.offer(frame(i), record(i), trace(i))
+        writer.offer(frame(i), record(i), partial(trace, i))
     writer.close(10.0)
     assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
     (path,) = tmp_path.iterdir()
@@ -283,7 +284,7 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
     moved = msgspec.structs.replace(REFERENCE, reference_id="second", revision=2)
     writer = recorder(tmp_path)
     for i in range(12):
-        writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), None)
+        writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
     writer.reference(moved)
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
@@ -295,7 +296,7 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
 def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     for i in range(3):
-        writer.offer(frame(i), record(i), None)
+        writer.offer(frame(i), record(i), lambda: None)
     wait_until(lambda: writer.frames_written == 3)
     writer.alert(
         AlertRecord(
@@ -320,7 +321,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
 
 def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), None)
+    writer.offer(frame(0), record(0), lambda: None)
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
     told = Recorded(path)
@@ -343,8 +344,8 @@ def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
 def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.ndarray) -> None:
     refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image")
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), trace(0))
-    writer.offer(frame(1, picture), refused, None)
+    writer.offer(frame(0), record(0), partial(trace, 0))
+    writer.offer(frame(1, picture), refused, lambda: None)
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
     told = Recorded(path)
@@ -357,7 +358,7 @@ def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
     none = np.empty((0, 2))
     empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), (), np.full((8, 2), np.nan))
     writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0, corners=()), empty)
+    writer.offer(frame(0), record(0, corners=()), lambda: empty)
     writer.close(10.0)
     (path,) = tmp_path.iterdir()
     assert Recorded(path).by_seq("quality/edge_points", "scalars") == {0: [0.0, 0.0]}
@@ -366,7 +367,7 @@ def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
 def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; from recorded import *; w = recorder(Path(sys.argv[1]));"
-        "w.offer(frame(0), record(0), trace(0)); w.close(10.0);"
+        "w.offer(frame(0), record(0), lambda: trace(0)); w.close(10.0);"
         "assert w.frames_written == 1, w.failure; assert 'rerun' not in sys.modules"
     )
     here = Path(__file__).parent
@@ -387,7 +388,7 @@ def test_disabled_recording_touches_nothing(tmp_path: Path) -> None:
         directory=tmp_path / "none",
     )
     assert isinstance(writer, NullRecorder)
-    writer.offer(frame(0), record(0), None)
+    writer.offer(frame(0), record(0), lambda: None)
     writer.close()
     assert not (tmp_path / "none").exists()
 

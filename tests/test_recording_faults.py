@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -50,7 +51,7 @@ def no_child_left() -> Iterator[None]:
 
 def offer(writer: ProcessRecorder, first: int, count: int) -> None:
     for i in range(first, first + count):
-        writer.offer(frame(i), record(i), trace(i))
+        writer.offer(frame(i), record(i), partial(trace, i))
 
 
 def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
@@ -74,8 +75,8 @@ def test_a_killed_daemon_leaves_a_complete_file(tmp_path: Path) -> None:
     script = (
         "import os, signal, sys, time; from pathlib import Path; from recorded import *;"
         "w = recorder(Path(sys.argv[1]), flush_period_s=0.5); wait_until(lambda: w.path is not None);"
-        "[w.offer(frame(i), record(i), trace(i)) for i in range(50)];"
-        "print(w.process_id, flush=True); time.sleep(1.0); w.offer(frame(50), record(50), None);"
+        "[w.offer(frame(i), record(i), lambda i=i: trace(i)) for i in range(50)];"
+        "print(w.process_id, flush=True); time.sleep(1.0); w.offer(frame(50), record(50), lambda: None);"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
     paths = f"import sys; sys.path[:0] = [{str(HERE)!r}, {str(HERE.parent)!r}]; "
@@ -285,11 +286,11 @@ def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> No
     new = ReferenceRecord("second", 2, START_NS + 5 * INTERVAL_NS, "recalibration", moved, (0.0,) * 36)
     writer.reference(new)
     for i in range(5, 8):
-        writer.offer(frame(i), record(i, reference_id="second", revision=2), trace(i))
+        writer.offer(frame(i), record(i, reference_id="second", revision=2), partial(trace, i))
     wait_until(lambda: writer.frames_written == 8)
     os.kill(worker, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
-    writer.offer(frame(8), record(8, reference_id="second", revision=2), trace(8))
+    writer.offer(frame(8), record(8, reference_id="second", revision=2), partial(trace, 8))
     wait_until(lambda: writer.frames_written == 9)
     writer.close(10.0)
     told = Recorded(tmp_path / "run-0002.rrd")

@@ -274,18 +274,17 @@ def _judge(
     close = sample[np.abs(residual if active is None else residual[active]) < GATE_PX]
     supported = np.zeros(len(edge_of), dtype=bool)
     supported[close] = True
-    profiles = prediction.profiles
-    agreeing = np.bincount(edge_of[supported], minlength=edges)
+    profiles, some = prediction.profiles, prediction.some_profiles
+    agreeing = np.bincount(edge_of, supported, edges)
     others = np.bincount(edge_of[sample], minlength=edges) - np.bincount(edge_of[close], minlength=edges)
-    some = np.maximum(profiles, 1)
     chance = 1.0 - np.exp(others * (-2.0 * GATE_PX / max(2.0 * (prediction.reach_px - GATE_PX), 1.0)) / some)
     needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     share = agreeing / some
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
     # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
     pair = prediction.pair
-    pairs = int(np.count_nonzero(pair))
     believed = 0.0
-    if pairs and np.count_nonzero(seen) >= 3:
-        believed = int(np.count_nonzero(pair & supported[1:] & supported[:-1] & seen[edge_of[1:]])) / pairs
+    if prediction.pairs and np.count_nonzero(seen) >= 3:
+        agreeing_pairs = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
+        believed = int(np.count_nonzero(agreeing_pairs)) / prediction.pairs
     return Consensus(xi, weight, residual, information, scale_px, supported, share, seen, believed)

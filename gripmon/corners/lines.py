@@ -7,8 +7,9 @@ line is fitted by ``e = a + b * along``.  Corners come with a 2x2 covariance eac
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
@@ -52,66 +53,64 @@ class Corners:
     usable: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True)
-class CornerGeometry:
-    """What of the intersections doesn't depend on the image, for one prediction; c corners with at most three edges
-    each.
-
-    ``edges`` (c, 3) indices, -1 where there are fewer; ``slot`` (c, 3) their places among the sampled edges, -1 for
-    none; ``along`` (c, 3) the predicted corner on each line; ``direction`` and ``right`` (c, 3, 2) of the lines;
-    ``beside`` (c, 3, 2) first and last + 1 of the profiles next to the corner; ``fault`` the reason why a corner
-    can't be measured in this view, whatever the image.
+class _Spoke(NamedTuple):
+    """One edge at one corner, for a prediction: ``slot`` among the sampled edges, ``edge`` of the gripper, ``along``
+    the predicted corner on the edge's line, ``direction`` of the line, first and last + 1 of the profiles beside the
+    corner.
     """
 
-    edges: NDArray[np.intp]
-    slot: NDArray[np.intp]
-    along: Array
-    direction: Array
-    right: Array
-    beside: NDArray[np.intp]
+    slot: int
+    edge: int
+    along: float
+    direction_x: float
+    direction_y: float
+    begin: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True)
+class CornerGeometry:
+    """What of the intersections doesn't depend on the image, for one prediction: for each corner its sampled edges, the
+    reason why it can't be measured in this view whatever the image (or None), and the lens there, px by ideal units.
+
+    Plain numbers, since a handful of corners is less work than the calls that arrays would take.
+    """
+
+    spokes: tuple[tuple[_Spoke, ...], ...]
     fault: tuple[CornerFault | None, ...]
+    lens: tuple[tuple[float, float, float, float], ...]
 
     @classmethod
     def of(cls, gripper: Gripper, prediction: Prediction, settings: CornerSettings) -> CornerGeometry:
-        layout = prediction.layout
-        corners = len(gripper.corner_ids)
-        edges = np.full((corners, 3), -1, dtype=np.intp)
-        for i in range(corners):
-            at = gripper.edges_at_corner(i)[:3]
-            edges[i, : len(at)] = at
-        slots = np.full(len(gripper.edge_ids) + 1, -1, dtype=np.intp)
-        slots[layout.edges] = np.arange(len(layout.edges))
-        slot = slots[edges]
-        direction = prediction.line_direction[edges]
-        from_origin = prediction.corners.xy[:, None, :] - prediction.line_origin[edges]
-        bounds = np.append(layout.first, len(layout.edge))
-        first, last = bounds[slot], bounds[slot + 1]
-        at_start = gripper.edge_points[edges, 0] == gripper.corner_points[:, None]
-        begin = np.where(at_start, first, np.maximum(last - settings.neighbourhood, first))
-        end = np.where(at_start, np.minimum(first + settings.neighbourhood, last), last)
-        return cls(
-            edges,
-            slot,
-            np.einsum("cki,cki->ck", from_origin, direction),
-            direction,
-            np.stack([-direction[..., 1], direction[..., 0]], axis=-1),
-            np.stack([begin, end], axis=-1),
-            tuple(
-                CornerFault.OUTSIDE
-                if not inside
-                else CornerFault.SELF_HIDDEN
-                if not visible
-                else CornerFault.FEW_POINTS
-                if sampled < 2
-                else None
-                for inside, visible, sampled in zip(
-                    prediction.corners.inside.tolist(),
-                    prediction.corners.visible.tolist(),
-                    (slot >= 0).sum(axis=1).tolist(),
-                    strict=True,
-                )
-            ),
-        )
+        layout, corners = prediction.layout, prediction.corners
+        bounds = [*layout.first.tolist(), len(layout.edge)]
+        slots = {edge: slot for slot, edge in enumerate(layout.edges.tolist())}
+        spokes, faults = [], []
+        for i in range(len(gripper.corner_ids)):
+            at_corner = []
+            for edge in gripper.edges_at_corner(i).tolist():
+                if edge not in slots:
+                    continue
+                first, last = bounds[slots[edge]], bounds[slots[edge] + 1]
+                direction = prediction.line_direction[edge]
+                along = float((corners.xy[i] - prediction.line_origin[edge]) @ direction)
+                x, y = direction.tolist()
+                near = min(settings.neighbourhood, last - first)
+                at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
+                beside = (first, first + near) if at_start else (last - near, last)
+                at_corner.append(_Spoke(slots[edge], edge, along, x, y, *beside))
+            spokes.append(tuple(at_corner))
+            faults.append(_fault_of_view(bool(corners.inside[i]), bool(corners.facing[i]), len(at_corner)))
+        lens = tuple((a, b, c, d) for a, b, c, d in corners.d_uv_d_xy.reshape(-1, 4).tolist())
+        return cls(tuple(spokes), tuple(faults), lens)
+
+
+def _fault_of_view(inside: bool, facing: bool, edges: int) -> CornerFault | None:
+    if not inside:
+        return CornerFault.OUTSIDE
+    if not facing:
+        return CornerFault.SELF_HIDDEN
+    return CornerFault.FEW_POINTS if edges < 2 else None
 
 
 def intersect_edges(
@@ -127,40 +126,99 @@ def intersect_edges(
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
     of the corner with ``(right - slope * direction) . shift = offset + slope * along``.
     """
-    lines = _fit_lines(candidates, prediction, consensus)[:, geometry.slot]
-    offset, slope, var_offset, covariance, var_slope = lines
-    seen = (geometry.slot >= 0) & consensus.edge_seen[geometry.edges] & np.isfinite(offset)
-    along = geometry.along
-    row = geometry.right - slope[..., None] * geometry.direction
-    row[~seen] = 0.0
-    weight = np.zeros(seen.shape)
-    np.divide(1.0, var_offset + along * (2.0 * covariance + along * var_slope), out=weight, where=seen)
-    wanted = np.where(seen, offset + slope * along, 0.0)
-    weighted = weight[..., None] * row
-    information = weighted.transpose(0, 2, 1) @ row
-    fault = _faults(consensus, geometry, seen, row, settings)
-    good = np.array([f is None for f in fault], dtype=bool)
-    covariance_xy = np.full((len(good), 2, 2), np.nan)
-    covariance_xy[good] = np.linalg.inv(information[good])
-    shift = (covariance_xy @ (weighted * wanted[..., None]).sum(axis=1)[..., None])[..., 0]
-    sigma_px = _largest_sigma(prediction.corners.d_uv_d_xy, covariance_xy)
-    uncertain = good & ~(sigma_px <= settings.largest_sigma_px)
+    lines = _fit_lines(candidates, prediction, consensus)
+    seen = consensus.edge_seen.tolist()
+    agreed = [0, *np.cumsum(consensus.supported).tolist()]
+    measured = [
+        fault or _intersect(lines, seen, agreed, spokes, lens, settings)
+        for fault, spokes, lens in zip(geometry.fault, geometry.spokes, geometry.lens, strict=True)
+    ]
+    faults = tuple(m if isinstance(m, CornerFault) else None for m in measured)
+    numbers = np.array([_NOTHING if isinstance(m, CornerFault) else m for m in measured]).reshape(-1, 6)
+    shift, sigma_px = numbers[:, :2], numbers[:, 2]
     return Corners(
         prediction.corners.xy + shift,
-        covariance_xy,
+        numbers[:, [3, 4, 4, 5]].reshape(-1, 2, 2),
         prediction.corners.uv_px + (prediction.corners.d_uv_d_xy @ shift[..., None])[..., 0],
         sigma_px,
-        tuple(CornerFault.UNCERTAIN if unsure else why for why, unsure in zip(fault, uncertain.tolist(), strict=True)),
-        good & ~uncertain,
+        faults,
+        np.array([fault is None for fault in faults], dtype=bool),
     )
 
 
-def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> Array:
-    """Weighted straight lines ``e = offset + slope * along`` through the agreed points of every sampled edge at once.
+_NOTHING = (math.nan,) * 6
 
-    (5, v + 1): offset, slope, variance of the offset, covariance, variance of the slope; NaN for edges with fewer than
-    four points and in the last column, which stands for "no edge" (slot -1).
+
+def _intersect(
+    lines: list[_Line | None],
+    seen: list[bool],
+    agreed: list[int],
+    spokes: tuple[_Spoke, ...],
+    lens: tuple[float, float, float, float],
+    settings: CornerSettings,
+) -> tuple[float, float, float, float, float, float] | CornerFault:
+    """One corner: shift x and y from the prediction (ideal coordinates), sigma (px), variance x, covariance, variance
+    y.
+
+    ``agreed`` are running counts of the profiles that agree.  Hidden if fewer than two edges are seen right beside it.
     """
+    beside, rows = 0, []
+    ixx = ixy = iyy = bx = by = 0.0
+    for spoke in spokes:
+        line = lines[spoke.slot]
+        if line is None or not seen[spoke.edge]:
+            continue
+        beside += 2 * (agreed[spoke.end] - agreed[spoke.begin]) >= spoke.end - spoke.begin
+        x = -spoke.direction_y - line.slope * spoke.direction_x
+        y = spoke.direction_x - line.slope * spoke.direction_y
+        along = spoke.along
+        weight = 1.0 / (line.var_offset + along * (2.0 * line.covariance + along * line.var_slope))
+        wanted = weight * (line.offset + line.slope * along)
+        ixx, ixy, iyy = ixx + weight * x * x, ixy + weight * x * y, iyy + weight * y * y
+        bx, by = bx + wanted * x, by + wanted * y
+        rows.append((x, y))
+    if beside < 2:
+        return CornerFault.HIDDEN
+    if _largest_sine(rows) < math.sin(settings.smallest_angle_rad):
+        return CornerFault.PARALLEL
+    determinant = ixx * iyy - ixy * ixy
+    cxx, cxy, cyy = iyy / determinant, -ixy / determinant, ixx / determinant
+    sigma_px = _larger_sigma(lens, cxx, cxy, cyy)
+    if sigma_px > settings.largest_sigma_px:
+        return CornerFault.UNCERTAIN
+    return cxx * bx + cxy * by, cxy * bx + cyy * by, sigma_px, cxx, cxy, cyy
+
+
+def _largest_sine(rows: list[tuple[float, float]]) -> float:
+    """Sine of the largest angle between any two lines with these normals."""
+    return max(
+        abs(ax * by - ay * bx) / (math.hypot(ax, ay) * math.hypot(bx, by))
+        for i, (ax, ay) in enumerate(rows)
+        for bx, by in rows[i + 1 :]
+    )
+
+
+def _larger_sigma(lens: tuple[float, float, float, float], cxx: float, cxy: float, cyy: float) -> float:
+    """Standard deviation along the larger axis of a covariance in ideal coordinates, px."""
+    a, b, c, d = lens
+    uu = a * a * cxx + 2.0 * a * b * cxy + b * b * cyy
+    uv = a * c * cxx + (a * d + b * c) * cxy + b * d * cyy
+    vv = c * c * cxx + 2.0 * c * d * cxy + d * d * cyy
+    return math.sqrt(0.5 * (uu + vv + math.hypot(uu - vv, 2.0 * uv)))
+
+
+class _Line(NamedTuple):
+    """``e = offset + slope * along`` with the variance of both and their covariance."""
+
+    offset: float
+    slope: float
+    var_offset: float
+    covariance: float
+    var_slope: float
+
+
+def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> list[_Line | None]:
+    """Weighted straight lines through the agreed points of every sampled edge; None for fewer than four points."""
     first = prediction.layout.first
     inlier = np.flatnonzero(consensus.weight)
     sample = candidates.sample[inlier]
@@ -176,41 +234,12 @@ def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consen
     # Points come sorted by edge: sums over edges are differences of running sums.
     bounds = np.append(np.searchsorted(sample, first), len(inlier))
     sums = np.cumsum(terms, axis=1)[:, bounds]
-    s0, s1, s2, t0, t1 = sums[:, 1:] - sums[:, :-1]
-    out = np.full((5, len(first) + 1), np.nan)
-    determinant = s0 * s2 - s1 * s1
-    fit = (np.diff(bounds) >= 4) & (determinant > 0.0)
-    np.divide(np.stack([s2 * t0 - s1 * t1, s0 * t1 - s1 * t0, s2, -s1, s0]), determinant, out=out[:, :-1], where=fit)
-    return out
-
-
-def _largest_sigma(lens: Array, covariance_xy: Array) -> Array:
-    """(c,) standard deviation along the larger axis of each corner's covariance, px."""
-    covariance_px = lens @ covariance_xy @ lens.transpose(0, 2, 1)
-    a, b, c = covariance_px[:, 0, 0], covariance_px[:, 0, 1], covariance_px[:, 1, 1]
-    sigma_px: Array = np.sqrt(0.5 * (a + c + np.sqrt((a - c) ** 2 + 4.0 * b * b)))
-    return sigma_px
-
-
-def _faults(
-    consensus: Consensus,
-    geometry: CornerGeometry,
-    seen: NDArray[np.bool_],
-    row: Array,
-    settings: CornerSettings,
-) -> list[CornerFault | None]:
-    """One reason or None for every corner: hidden if fewer than two of its edges are seen right beside it."""
-    count = np.concatenate([[0], np.cumsum(consensus.supported)])[geometry.beside]
-    width = geometry.beside[..., 1] - geometry.beside[..., 0]
-    beside = seen & (2 * (count[..., 1] - count[..., 0]) >= width)
-    seen_beside = beside.sum(axis=1).tolist()
-    # Sine of the angle between any two of the (up to three) lines; rows have nearly unit length relative to each other.
-    x, y = row[..., 0], row[..., 1]
-    length = np.sqrt(x * x + y * y)
-    following = [1, 2, 0]
-    cross = np.abs(x * y[:, following] - y * x[:, following])
-    angle_ok = (cross > np.sin(settings.smallest_angle_rad) * length * length[:, following]).any(axis=1).tolist()
-    return [
-        fault or (CornerFault.HIDDEN if near < 2 else None if wide else CornerFault.PARALLEL)
-        for fault, near, wide in zip(geometry.fault, seen_beside, angle_ok, strict=True)
-    ]
+    lines: list[_Line | None] = []
+    for count, s0, s1, s2, t0, t1 in zip(np.diff(bounds).tolist(), *np.diff(sums, axis=1).tolist(), strict=True):
+        determinant = s0 * s2 - s1 * s1
+        if count < 4 or not determinant > 0.0:
+            lines.append(None)
+            continue
+        k = 1.0 / determinant
+        lines.append(_Line((s2 * t0 - s1 * t1) * k, (s0 * t1 - s1 * t0) * k, s2 * k, -s1 * k, s0 * k))
+    return lines

@@ -146,6 +146,16 @@ class Prediction:
         return (edge[1:] == edge[:-1]) & self.ok[1:] & self.ok[:-1]
 
     @cached_property
+    def pairs(self) -> int:
+        """How many such neighbours there are."""
+        return int(np.count_nonzero(self.pair))
+
+    @cached_property
+    def some_profiles(self) -> NDArray[np.intp]:
+        """(e,) the profiles of each edge, or one where there is none: a divisor."""
+        return np.maximum(self.profiles, 1)
+
+    @cached_property
     def reach_px(self) -> float:
         """How far the profiles reach to both sides, px."""
         if not len(self.uv_px):

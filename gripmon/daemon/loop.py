@@ -178,7 +178,7 @@ class Daemon:
             self._alert(alert, record.state, recorded=True)
         for alert in self._watch.frame(record, time.monotonic()):
             self._alert(alert, record.state)
-        self._recorder.offer(frame, record, self._monitor.trace())
+        self._recorder.offer(frame, record, self._monitor.trace)
         if (record.reference_id, record.revision) != (self._reference.reference_id, self._reference.revision):
             self._reference = self._monitor.reference
             self._publisher.reference(self._reference)

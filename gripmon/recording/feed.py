@@ -33,6 +33,7 @@ _EVENTS_KEPT = 256
 Vector = tuple[float, float, float]
 Truth = Callable[[int], Vector | None]
 _Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, float | None]
+Trace = Callable[[], MeasurementTrace | None]
 _T = TypeVar("_T")
 
 
@@ -48,7 +49,9 @@ class Recorder(Protocol):
     @property
     def failure(self) -> str | None: ...
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None: ...
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
+        """``trace`` is called before this returns, and only where the picture is recorded."""
+
     def alert(self, alert: AlertRecord) -> None: ...
     def reference(self, reference: ReferenceRecord) -> None: ...
     def close(self, timeout_s: float = 2.0) -> None: ...
@@ -60,7 +63,7 @@ class NullRecorder:
     dropped = 0
     failure: str | None = None
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
         pass
 
     def alert(self, alert: AlertRecord) -> None:
@@ -183,7 +186,7 @@ class ProcessRecorder:
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
         """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
         if self._patience_s > 0.0:
             self._wait_for_room()
@@ -197,7 +200,7 @@ class ProcessRecorder:
         if due and self._images_offered - self._images_taken < self._queue_images:
             self._images_offered += 1
             self._image_stamp_ns = record.stamp_ns
-            self._frames.append((record, True, frame.image, trace, frame.jaw_opening_m))
+            self._frames.append((record, True, frame.image, trace(), frame.jaw_opening_m))
         else:
             self._images_not_queued += bool(due)
             self._frames.append((record, False, None, None, frame.jaw_opening_m))

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 
 from gripmon.config import Config
-from gripmon.recording import open_recorder
-from gripmon.records import AlertRecord, Frame, FrameRecord, MeasurementTrace, ReferenceRecord
+from gripmon.recording import Trace, open_recorder
+from gripmon.records import AlertRecord, Frame, FrameRecord, ReferenceRecord
 
 
 class SwitchedRecorder:
@@ -34,7 +34,7 @@ class SwitchedRecorder:
     def failure(self) -> str | None:
         return self._inner.failure
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: MeasurementTrace | None) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
         if self.on:
             self._inner.offer(frame, record, trace)
 
