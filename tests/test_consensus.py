@@ -25,7 +25,7 @@ CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()
 SETTINGS = ConsensusSettings()
 NO_FLOORS = ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0)
 PRIOR = prior_information(JAW_SIGMA_M)
-REACH_PX = 4.0  # candidates are found this far along the profiles
+REACH_PX = 4.25  # candidates are found this far along the profiles
 EDGES = len(GRIPPER.edge_ids)
 ANY = np.zeros(EDGES, dtype=np.int8)
 SHARP = np.zeros(EDGES)
@@ -164,6 +164,28 @@ def test_an_edge_of_the_background_instead_of_one_of_the_gripper_is_noticed(name
     error = consensus.xi - XI
     nees = float(error @ information @ error) / noise_inflation(found, PREDICTION, consensus)
     assert miss_px(consensus) < 0.35 or nees < 25.0 or consensus.share < SETTINGS.trusted_share
+
+
+def test_an_edge_that_chance_alone_supports_does_not_count_as_seen():
+    """In dense texture a third of the profiles has a candidate near any line at all."""
+    rng = np.random.default_rng(10)
+    seen = 0
+    for trial in range(40):
+        edge = SAMPLED[trial % len(SAMPLED)]
+        mine = np.flatnonzero(PREDICTION.layout.edge == edge)
+        offset_px = PREDICTION.jacobian @ XI + rng.normal(scale=0.1, size=SAMPLES)
+        kept = np.setdiff1d(np.arange(SAMPLES), mine)
+        texture = np.repeat(mine, 6)
+        random_px = rng.uniform(-REACH_PX, REACH_PX, len(texture))
+        consensus = fit(candidates(np.concatenate([kept, texture]), np.concatenate([offset_px[kept], random_px])))
+        assert consensus.edge_share[edge] > SETTINGS.support_share
+        assert consensus.edge_seen[kept_edges(edge)].all()
+        seen += consensus.edge_seen[edge]
+    assert seen <= 2
+
+
+def kept_edges(edge: int) -> np.ndarray:
+    return np.setdiff1d(SAMPLED, edge)
 
 
 def test_clutter_alone_is_never_trusted():

@@ -55,6 +55,17 @@ def test_a_motion_within_the_profiles_reach_is_measured_as_well_as_none(directio
     assert np.abs(away[:2]).max() < 1.5e-6 and abs(away[2]) < 1e-5 and np.abs(away[3:]).max() < 2e-4
 
 
+def test_corners_off_the_prediction_are_measured_as_well_as_on_it():
+    """Less than what calls for linearising anew: the lines' offsets and slopes carry the corner all the way."""
+    truth, on_it = simulated(PLAIN).truth(0), measure(picture(PLAIN)).corners.uv_px
+    for xi in ([5e-5, 0, 0, 0, 0, 0], [0, -5e-5, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1.2e-3], [3e-5, 3e-5, 0, 0, 0, -6e-4]):
+        expected = moved(nominal_cam_T_grip(), np.array(xi))
+        found = measure(picture(PLAIN), expected)
+        assert np.nanmax(np.abs(found.corners.uv_px - on_it)) < 0.03
+        predicted_px = corners_px(make_camera(PAPER_LENS), box_gripper(), found.prediction.cam_T_grip)
+        assert np.abs(predicted_px - truth.corner_uv_px)[truth.visible].max() > 0.2, "it was off"
+
+
 def test_covariances_are_the_spread_over_many_noisy_images():
     """With the floors for systematic errors out of the way; the noise is estimated, so it is known to a third only."""
     settings = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))
@@ -301,9 +312,9 @@ def test_a_bent_finger_is_the_one_that_leaves_the_reference(tip_shift_m: tuple[f
 def test_fingers_share_the_reference_while_nothing_moves_and_leave_it_together_with_the_camera():
     found, gripper = measure(picture(PLAIN)), box_gripper()
     assert finger_shares(found, gripper, nominal_cam_T_grip()).min() > 0.95
-    for shift_m in (3e-4, 5e-3):
+    for shift_m in (4e-5, 3e-4, 5e-3):  # a third of a pixel, and more
         away = moved(nominal_cam_T_grip(), np.array([shift_m, shift_m, 0, 0, 0, 0]))
-        assert finger_shares(found, gripper, away).max() < 0.1
+        assert finger_shares(found, gripper, away).max() < 0.2
 
 
 def test_a_finger_out_of_view_has_no_share():

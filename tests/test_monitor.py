@@ -150,6 +150,14 @@ def test_a_bump_is_a_jump_then_a_recalibration_near_the_truth(measurement: str):
     assert np.abs(error[:2]).max() < 2e-5 and abs(error[2]) < 1e-4
 
 
+def test_a_jump_starts_the_average_anew_at_once():
+    seen = watched("bump")
+    bumped = next(t.index for t in seen.truths if "bumped" in t.events)
+    before, first = seen.records[bumped - 1], seen.records[bumped]
+    assert before.smoothed.translation_m != before.cam_T_grip.translation_m
+    assert first.smoothed.translation_m == first.cam_T_grip.translation_m
+
+
 def test_the_reference_in_force_is_the_one_that_records_name():
     seen = watched("bump")
     for record, reference in zip(seen.records, seen.references, strict=True):

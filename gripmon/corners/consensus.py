@@ -277,7 +277,9 @@ def _judge(
     profiles, some = prediction.profiles, prediction.some_profiles
     agreeing = np.bincount(edge_of, supported, edges)
     others = np.bincount(edge_of[sample], minlength=edges) - np.bincount(edge_of[close], minlength=edges)
-    chance = 1.0 - np.exp(others * (-2.0 * GATE_PX / max(2.0 * (prediction.reach_px - GATE_PX), 1.0)) / some)
+    # Edge responses end before the profiles do: what was found tells how far candidates reach.
+    reach_px = max(float(np.abs(candidates.offset_px).max(initial=0.0)), settings.start_width_px)
+    chance = 1.0 - np.exp(others * (-GATE_PX / max(reach_px - GATE_PX, 0.5)) / some)
     needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     share = agreeing / some
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)

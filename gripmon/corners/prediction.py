@@ -155,14 +155,6 @@ class Prediction:
         """(e,) the profiles of each edge, or one where there is none: a divisor."""
         return np.maximum(self.profiles, 1)
 
-    @cached_property
-    def reach_px(self) -> float:
-        """How far the profiles reach to both sides, px."""
-        if not len(self.uv_px):
-            return 0.0
-        end = self.map_x[0, -1] - self.uv_px[0, 0], self.map_y[0, -1] - self.uv_px[0, 1]
-        return float(np.hypot(*end))
-
     def moved_px(self, xi: Array) -> float:
         """Largest motion of an edge point along its normal, px, for a perturbation ``xi`` (6 or 7,) of the
         linearisation pose.
