@@ -148,6 +148,9 @@ def test_a_bump_is_a_jump_then_a_recalibration_near_the_truth(measurement: str):
     new = seen.references[recalibrated]
     error = difference(pose_of(new.cam_T_grip), seen.truths[recalibrated].cam_T_grip)
     assert np.abs(error[:2]).max() < 2e-5 and abs(error[2]) < 1e-4
+    # It is the average since the camera came to rest, and as certain as that.
+    assert new.cam_T_grip.translation_m == record.smoothed.translation_m
+    assert new.covariance == record.smoothed.covariance
 
 
 def test_a_jump_starts_the_average_anew_at_once():
