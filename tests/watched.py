@@ -1,4 +1,4 @@
-"""Whole sequences: rendered once a session, watched by a monitor, held beside their truth."""
+"""Whole sequences: rendered once a run, watched by a monitor, held beside their truth."""
 
 from __future__ import annotations
 
