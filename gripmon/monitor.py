@@ -13,8 +13,17 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.camera import Camera
-from gripmon.corners import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience, finger_shares, trace_of
-from gripmon.differential import DegenerateGeometry, differential_update
+from gripmon.corners import (
+    Effort,
+    FingertipMeter,
+    Measurement,
+    MeasurementSettings,
+    Patience,
+    agreeing_fingers,
+    finger_shares,
+    trace_of,
+)
+from gripmon.differential import DegenerateGeometry, Update, differential_update
 from gripmon.geometry import (
     from_record,
     invert,
@@ -49,6 +58,9 @@ USUAL_SHARE = 0.9
 
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
+
+FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.25
+"""Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
 
 JAW_SURPRISE = 5.0
 """Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
@@ -92,7 +104,8 @@ class Monitor:
         self._cam_T_grip = self._ref_cam_T_grip
         self._covariance: Array | None = None
         self._jaw_opening_m = gripper.jaw_nominal_m
-        self._measured_s = 0.0
+        self._now_s = 0.0  # time that has passed since the first frame
+        self._measured_s: float | None = None
         self._stamp_s: float | None = None
         self._usual_share = USUAL_SHARE
         self._credit = float(settings.corners.search.eager_frames)
@@ -125,9 +138,11 @@ class Monitor:
         judgement = self._policy.measured(evidence)
         origin, alerts = Origin.UPDATE, judgement.alerts
         if judgement.recalibrate:
-            recalibrated = self._recalibrate(measurement, frame.stamp_ns)
-            if recalibrated is not None:
-                origin, alerts, drift = Origin.RECALIBRATION, (*alerts, recalibrated), self._drift()
+            revision = self._reference.revision
+            told = self._recalibrate(measurement, frame.stamp_ns)
+            alerts = alerts if told is None else (*alerts, told)
+            if self._reference.revision != revision:
+                origin, drift = Origin.RECALIBRATION, self._drift()
         return self._record(frame, judgement, origin, alerts, measurement, drift)
 
     def trace(self) -> MeasurementTrace | None:
@@ -137,16 +152,12 @@ class Monitor:
         return trace_of(self._newest, self._camera, self._gripper)
 
     def _tick(self, frame: Frame) -> None:
-        """Time passes to the frame's stamp; a stamp before the last one counts as no time."""
-        now_s = 1e-9 * frame.stamp_ns
-        if self._stamp_s is not None and now_s > self._stamp_s:
-            self._average.wander(now_s - self._stamp_s)
-        self._stamp_s = now_s if self._stamp_s is None else max(now_s, self._stamp_s)
-
-    @property
-    def _now_s(self) -> float:
-        assert self._stamp_s is not None
-        return self._stamp_s
+        """Time passes to the frame's stamp; a clock that was set back stops it for this one frame only."""
+        stamp_s = 1e-9 * frame.stamp_ns
+        elapsed_s = max(stamp_s - self._stamp_s, 0.0) if self._stamp_s is not None else 0.0
+        self._stamp_s = stamp_s
+        self._now_s += elapsed_s
+        self._average.wander(elapsed_s)
 
     def _measure(self, frame: Frame) -> Measurement:
         """Measure where the gripper is expected; look further when clearly fewer edge points agree than usually.
@@ -183,18 +194,28 @@ class Monitor:
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         usable = measurement.corners.usable
         if self._settings.measurement == "corners" and np.count_nonzero(usable) >= 3:
-            prediction = measurement.prediction
             try:
-                update = differential_update(
-                    measurement.corners_cam_m[usable],
-                    measurement.corners.xy[usable],
-                    measurement.inflation * measurement.corners.covariance_xy[usable],
-                    prediction.cam_T_grip[:3, 3],
-                )
-                cam_T_grip, covariance = perturb(prediction.cam_T_grip, update.xi), update.covariance
+                update = self._corner_update(measurement, measurement.jaw_opening_m)
+                cam_T_grip = perturb(measurement.prediction.cam_T_grip, update.xi)
+                covariance = update.covariance
+                if self._gripper.has_jaw:
+                    # The corners take the opening as known: what its uncertainty does to the motion comes on top.
+                    jaw_sigma_m = float(np.sqrt(measurement.covariance[6, 6]))
+                    opened = self._corner_update(measurement, measurement.jaw_opening_m + jaw_sigma_m)
+                    covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
             except DegenerateGeometry:
                 pass  # The corners that are left lie on a line: the edges still determine the motion.
         return cam_T_grip, covariance + self._floor
+
+    def _corner_update(self, measurement: Measurement, jaw_opening_m: float) -> Update:
+        """Equation (17) on the usable corners, with the jaw at an opening."""
+        usable = measurement.corners.usable
+        return differential_update(
+            measurement.corners_at(jaw_opening_m)[usable],
+            measurement.corners.xy[usable],
+            measurement.inflation * measurement.corners.covariance_xy[usable],
+            measurement.prediction.cam_T_grip[:3, 3],
+        )
 
     def _evidence(self, measurement: Measurement, before_T: Array, drift: Drift) -> Evidence:
         assert self._covariance is not None
@@ -204,7 +225,13 @@ class Monitor:
         jumped = looked_far and self._meter.moved_px(measurement, before_T) > self._settings.corners.sampling.reach_px
         cause = self._cause(measurement) if jumped or self._policy.wants_cause else Cause.UNKNOWN
         sigma = np.sqrt(self._covariance.diagonal())
-        return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause)
+        astray = self._finger_astray(measurement)
+        return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause, astray)
+
+    def _finger_astray(self, measurement: Measurement) -> bool:
+        """Whether one finger is where the transform says and another, though sampled, is not: hidden, or bent."""
+        shares = agreeing_fingers(measurement, self._gripper)
+        return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
 
     def _drift(self) -> Drift:
         """Equation (14) for the motion from the reference to now, and the TCP's way in the camera frame."""
@@ -225,7 +252,8 @@ class Monitor:
     def _recalibrate(self, measurement: Measurement, stamp_ns: int) -> Alert | None:
         """PnP from the corners alone; if it agrees, the average since the camera came to rest becomes the reference.
 
-        None if too few corners are seen, or if the corners contradict the edges: then the next frame may try again.
+        Returns what there is to say of it.  With too few corners, or corners that contradict the edges, the reference
+        stays, and a later frame may try again.
         """
         usable = measurement.corners.usable
         points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
@@ -234,14 +262,14 @@ class Monitor:
             pnp = recalibrate(
                 points_grip_m[usable], measurement.corners.xy[usable], covariance_xy[usable], self._cam_T_grip
             )
-        except RecalibrationRefused:
-            return None
-        new_T, new_covariance = self._average.cam_T_grip, self._average.covariance
+        except RecalibrationRefused as refusal:
+            return self._policy.not_recalibrated(str(refusal))
+        new_T, new_covariance = self._average.cam_T_grip, self._average.claimed_covariance
         if new_T is None:
             return None
         difference = perturbation_between(new_T, pnp.cam_T_grip)
         if difference @ np.linalg.solve(pnp.covariance + new_covariance + self._floor, difference) > GATE:
-            return None
+            return self._policy.not_recalibrated("the corners contradict the edges")
         before = self._drift()
         self._set_reference(new_T, new_covariance + self._floor, stamp_ns, "recalibration")
         return self._policy.recalibrated(
@@ -260,16 +288,16 @@ class Monitor:
 
     def _unmeasured(self, frame: Frame, reason: str, fault: CornerFault, refusal: str | None) -> FrameRecord:
         """The last transform held with a covariance that grows, or none when it is too old."""
-        judgement = self._policy.unmeasured(self._now_s, refusal, self._covariance is not None)
+        judgement = self._policy.unmeasured(self._now_s, refusal, self._measured_s)
         corners = tuple(CornerRecord(name, None, None, False, fault) for name in self._gripper.corner_ids)
-        if judgement.verdict is Verdict.UNKNOWN or self._covariance is None:
+        if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
             return self._blank(frame, judgement, corners, reason)
-        held = self._covariance + np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
+        growth = np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
         return msgspec.structs.replace(
             self._blank(frame, judgement, corners, reason),
             cam_T_grip=to_record(self._cam_T_grip),
-            covariance=_flat(held),
-            smoothed=self._smoothed(),
+            covariance=_flat(self._covariance + growth),
+            smoothed=self._smoothed(growth),
             drift=self._drift(),
         )
 
@@ -289,7 +317,7 @@ class Monitor:
             reference_id=self._reference.reference_id,
             revision=self._reference.revision,
             rms_px=None,
-            jaw_opening_m=frame.jaw_opening_m,
+            jaw_opening_m=None,
             corners=corners,
             alerts=judgement.alerts,
             reason=reason,
@@ -325,11 +353,12 @@ class Monitor:
             name=frame.name,
         )
 
-    def _smoothed(self) -> Smoothed | None:
+    def _smoothed(self, growth: Array | float = 0.0) -> Smoothed | None:
         if self._average.cam_T_grip is None:
             return None
         transform = to_record(self._average.cam_T_grip)
-        return Smoothed(transform.translation_m, transform.rotation_xyzw, _flat(self._average.covariance + self._floor))
+        covariance = self._average.claimed_covariance + self._floor + growth
+        return Smoothed(transform.translation_m, transform.rotation_xyzw, _flat(covariance))
 
 
 def _flat(covariance: Array) -> tuple[float, ...]:

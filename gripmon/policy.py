@@ -58,6 +58,10 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             ge=1, le=10000, description="frames that the gripper must stand still in the image before a recalibration"
         ),
     ] = 20
+    correlation_frames: Annotated[
+        float,
+        Meta(ge=1.0, le=10000.0, description="so many frames in a row err together, since the background stands still"),
+    ] = 10.0
     confirm_frames: Annotated[
         int, Meta(ge=1, le=1000, description="frames that must agree after a jump before the transform counts as valid")
     ] = 2
@@ -83,6 +87,10 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 3e-4
 
 
+GRIPPER_CAUSES = (Cause.FINGER_BENT, Cause.JAW_OPENING)
+"""Causes of a drift that lie in the gripper: the camera may be where it was, and is not calibrated anew."""
+
+
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
@@ -96,6 +104,7 @@ class Evidence:
     delta_rad: float
     jumped: bool
     cause: Cause
+    finger_astray: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +120,7 @@ class DriftTest:
 
     def __init__(self, settings: PolicySettings):
         self.smallest = np.array([settings.smallest_drift_m] * 3 + [settings.smallest_drift_rad] * 3)
+        self._correlation_frames = settings.correlation_frames
         frames_a_day = 86400.0 * settings.frames_per_s
         self.threshold = math.log(2 * len(self.smallest) * frames_a_day / settings.false_alarms_per_day)
         self._sums = np.zeros((2, 6))
@@ -120,7 +130,8 @@ class DriftTest:
         """One frame's shift against the reference (6,) and its standard deviations; True while a drift is
         established: from the threshold on until all that spoke for it is taken back.
         """
-        gain = self.smallest / (sigma * sigma)
+        # Frames that err together tell no more than one of them.
+        gain = self.smallest / (sigma * sigma * self._correlation_frames)
         centred, half = gain * shift, 0.5 * gain * self.smallest
         # No single frame may decide: whatever it says counts for at most a fifth of the threshold.
         limit = 0.2 * self.threshold
@@ -189,7 +200,9 @@ class Policy:
         self._still_shift: Array = np.zeros(6)
         self._drift_alerted = False
         self._bad_since_s: float | None = None
-        self._bad_alerted = False
+        self._in_a_row = 0
+        self._told: set[AlertKind] = set()
+        self._drift_cause = Cause.UNKNOWN
 
     def measured(self, evidence: Evidence) -> Judgement:
         """A frame from which a transform could be measured."""
@@ -206,7 +219,7 @@ class Policy:
         recalibrate = False
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
             state: State = State.ACQUIRING if self.state is State.LOST else self.state
-        elif past_limit and settings.recalibrate:
+        elif past_limit and settings.recalibrate and self._drift_cause not in GRIPPER_CAUSES:
             state = State.RECALIBRATING
             recalibrate = self._still >= settings.settle_frames
         elif drifting:
@@ -214,14 +227,19 @@ class Policy:
         else:
             state = State.TRACKING
         if drifting and not self._drift_alerted:
+            self._drift_cause = evidence.cause
             alerts.append(_drift_alert(evidence, past_limit))
         elif self._drift_alerted and not drifting:
             alerts.append(
                 Alert(AlertKind.RECOVERED, evidence.cause, Severity.INFO, "the drift against the reference is gone")
             )
         self._drift_alerted = drifting
+        if not drifting:
+            self._drift_cause = Cause.UNKNOWN
         self.state = state
-        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
+        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m and not evidence.finger_astray
+        # The gripper is not what its model says: the transform follows the finger or the jaw, not the camera.
+        sure = sure and self._drift_cause not in GRIPPER_CAUSES
         return Judgement(state, Verdict.VALID if confirmed and sure else Verdict.SUSPECT, tuple(alerts), recalibrate)
 
     def recalibrated(self, text: str) -> Alert:
@@ -229,41 +247,48 @@ class Policy:
         self.test.reset()
         self._baseline = Baseline(None, 0)
         self._drift_alerted = False
-        return Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.WARNING, text)
+        cause, self._drift_cause = self._drift_cause, Cause.UNKNOWN
+        return Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)
+
+    def not_recalibrated(self, why: str) -> Alert | None:
+        """The reference could not be measured anew: try again when the camera has stood still for as long again."""
+        self._still = 0
+        if not self._news(AlertKind.RECALIBRATED):
+            return None
+        text = f"past the limit, but not calibrated anew: {why}"
+        return Alert(AlertKind.DRIFT, self._drift_cause, Severity.ERROR, text)
 
     @property
     def wants_cause(self) -> bool:
         """Whether the next judgement may have to name the cause of a drift."""
         return not self._drift_alerted and self.test.suspicious
 
-    def unmeasured(self, stamp_s: float, refusal: str | None, has_transform: bool) -> Judgement:
+    def unmeasured(self, now_s: float, refusal: str | None, measured_s: float | None) -> Judgement:
         """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper
-        isn't seen in it.
+        isn't seen in it.  ``measured_s`` is when a transform was last measured, None for never.
         """
         settings = self._settings
-        self._since_jump = self._still = 0
+        self._since_jump = self._still = self._in_a_row = 0
         if self._bad_since_s is None:
-            self._bad_since_s = stamp_s
-        lasted_s = stamp_s - self._bad_since_s
-        held = has_transform and lasted_s <= settings.hold_s
-        alerts = []
-        before = self.state
-        if has_transform or self.state is not State.ACQUIRING:
+            self._bad_since_s = now_s
+        lasted_s = now_s - self._bad_since_s
+        held = measured_s is not None and now_s - measured_s <= settings.hold_s
+        if held:
             # A bad image says nothing about the gripper: only time makes it lost.
-            self.state = (
-                State.LOST if not held else (before if refusal and before is not State.LOST else State.OCCLUDED)
-            )
-        if self.state is State.LOST and before is not State.LOST:
+            known = refusal is not None and self.state is not State.LOST
+            self.state = self.state if known else State.OCCLUDED
+        elif measured_s is not None or lasted_s > settings.hold_s:
+            self.state = State.LOST
+        alerts = []
+        if self.state is State.LOST and self._news(AlertKind.LOST):
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
-            cause = Cause.IMAGE_BAD if refusal else Cause.VIEW_BLOCKED
-            alerts.append(
-                Alert(AlertKind.LOST, cause, Severity.ERROR, f"{what} for {lasted_s:.1f} s; no transform is given")
-            )
-        elif self.state is State.OCCLUDED and before is not State.OCCLUDED:
+            cause = Cause.IMAGE_BAD if refusal else Cause.UNKNOWN if measured_s is None else Cause.VIEW_BLOCKED
+            text = f"{what} for {lasted_s:.1f} s; no transform is given"
+            alerts.append(Alert(AlertKind.LOST, cause, Severity.ERROR, text))
+        elif self.state is State.OCCLUDED and self._news(AlertKind.OCCLUDED):
             text = "too few edges of the gripper are seen; the last transform is held"
             alerts.append(Alert(AlertKind.OCCLUDED, Cause.VIEW_BLOCKED, Severity.WARNING, text))
-        if refusal and lasted_s >= settings.image_alert_after_s and not self._bad_alerted:
-            self._bad_alerted = True
+        if refusal and lasted_s >= settings.image_alert_after_s and self._news(AlertKind.IMAGE):
             text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
             alerts.append(Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text))
         return Judgement(self.state, Verdict.SUSPECT if held else Verdict.UNKNOWN, tuple(alerts))
@@ -284,12 +309,20 @@ class Policy:
         else:
             self._still += 1
 
+    def _news(self, kind: AlertKind) -> bool:
+        """Whether this kind of trouble hasn't been told yet; it may be told again once the gripper is back for good."""
+        told = kind in self._told
+        self._told.add(kind)
+        return not told
+
     def _recovered(self) -> list[Alert]:
+        """Frames that are measured one after the other end the trouble that was told of."""
         self._bad_since_s = None
-        if self._bad_alerted or self.state is State.LOST:
-            self._bad_alerted = False
-            return [Alert(AlertKind.RECOVERED, Cause.UNKNOWN, Severity.INFO, "the gripper is measured again")]
-        return []
+        self._in_a_row += 1
+        if not self._told or self._in_a_row < self._settings.settle_frames:
+            return []
+        self._told.clear()
+        return [Alert(AlertKind.RECOVERED, Cause.UNKNOWN, Severity.INFO, "the gripper is measured again")]
 
 
 def _jump_alert(evidence: Evidence) -> Alert:

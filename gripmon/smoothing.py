@@ -21,6 +21,12 @@ GATE = 37.7
 freedom).
 """
 
+INDEPENDENT_FRAMES = 10.0
+"""Averaging more frames than this doesn't help: background that stands still shifts the edges in all of them."""
+
+MEMORY = 0.05
+"""Rate of the running means of innovations, per frame."""
+
 
 class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """How far the mount may creep between frames."""
@@ -46,6 +52,20 @@ class PoseAverage:
         self.cam_T_grip: Array | None = None
         self.covariance: Array = np.zeros((6, 6))
         self._suspicions = 0
+        self._lag: Array = np.zeros(6)
+        self._surprise = 1.0
+        self._newest_covariance: Array = np.zeros((6, 6))
+
+    @property
+    def claimed_covariance(self) -> Array:
+        """Covariance (6, 6) of the average's error as it shows: the filter's own, made larger by what innovations say.
+
+        Frames err together, so the average is worth :data:`INDEPENDENT_FRAMES` frames at most; innovations that are
+        larger than they should be, or that all point the same way because the average lags behind a creeping mount,
+        count with the size that they have.
+        """
+        white = self.covariance + self._newest_covariance / INDEPENDENT_FRAMES
+        return max(1.0, self._surprise) * white + np.outer(self._lag, self._lag)
 
     def forget(self) -> None:
         """Start anew with the next measurement."""
@@ -67,7 +87,11 @@ class PoseAverage:
         _, both, failed = dposv(self.covariance + covariance, sides)
         if failed:
             raise ValueError("a covariance that is not positive definite")
-        if float(innovation @ both[:, 6]) > GATE:
+        surprise = float(innovation @ both[:, 6])
+        self._lag = self._lag + MEMORY * (innovation - self._lag)
+        self._surprise += MEMORY * (surprise / 6.0 - self._surprise)
+        self._newest_covariance = covariance
+        if surprise > GATE:
             self._suspicions += 1
             if self._suspicions >= 2:
                 self._restart(cam_T_grip, covariance)
@@ -80,4 +104,5 @@ class PoseAverage:
 
     def _restart(self, cam_T_grip: Array, covariance: Array) -> None:
         self.cam_T_grip, self.covariance = cam_T_grip, covariance.copy()
+        self._lag, self._surprise, self._newest_covariance = np.zeros(6), 1.0, covariance
         self._suspicions = 0

@@ -48,13 +48,13 @@ class Run:
     def __init__(self, settings: PolicySettings = SETTINGS, reference_sigma: np.ndarray | None = None) -> None:
         self.policy = Policy(settings, reference_sigma)
         self.now_s = 100.0
-        self.measured = False
+        self.measured_s: float | None = None
 
     def feed(self, frame: Evidence | Nothing) -> Judgement:
         self.now_s += PERIOD_S
         if isinstance(frame, Nothing):
-            return self.policy.unmeasured(self.now_s, frame.refusal, self.measured)
-        self.measured = True
+            return self.policy.unmeasured(self.now_s, frame.refusal, self.measured_s)
+        self.measured_s = self.now_s
         return self.policy.measured(frame)
 
     def feed_all(self, frames: Iterable[Evidence | Nothing]) -> list[Judgement]:

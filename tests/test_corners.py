@@ -164,8 +164,8 @@ def test_the_near_corner_of_a_cube_has_no_outlines_unless_creases_are_used():
     pose[2, 3] = 0.15
     found, scene, gripper = cube_seen(pose)
     faults = faults_of(found, gripper)
-    nearest = gripper.corner_ids[int(found.corners_cam_m[:, 2].argmin())]
-    farthest = gripper.corner_ids[int(found.corners_cam_m[:, 2].argmax())]
+    nearest = gripper.corner_ids[int(found.corners_at(0.0)[:, 2].argmin())]
+    farthest = gripper.corner_ids[int(found.corners_at(0.0)[:, 2].argmax())]
     assert faults.pop(nearest) is CornerFault.FEW_POINTS
     assert faults.pop(farthest) is CornerFault.SELF_HIDDEN
     assert set(faults.values()) == {None}

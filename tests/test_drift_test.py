@@ -26,13 +26,26 @@ def cusum(shifts: np.ndarray, sigma: np.ndarray, smallest: np.ndarray, limit: fl
 SMALLEST = np.array([SETTINGS.smallest_drift_m] * 3 + [SETTINGS.smallest_drift_rad] * 3)
 
 
+INDEPENDENT = PolicySettings(correlation_frames=1.0)
+
+
+def test_frames_that_err_together_count_as_one():
+    """Ten repetitions of each error, and the setting that says so, alarm where ten times fewer frames would."""
+    rng = np.random.default_rng(7)
+    sigma, single, repeated = SMALLEST, DriftTest(INDEPENDENT), DriftTest(PolicySettings(correlation_frames=10.0))
+    for shift in rng.normal(loc=0.8, size=(60, 1)) * SMALLEST:
+        once = single.add(shift, sigma)
+        assert [repeated.add(shift, sigma) for _ in range(10)][-1] == once
+    assert once
+
+
 def test_the_sums_are_those_of_page():
     rng = np.random.default_rng(1)
     sigma = SMALLEST * [0.5, 1.0, 2.0, 0.7, 1.0, 1.5]
     shifts = rng.normal(size=(600, 6)) * sigma
     shifts[300:, 1] += 0.4 * SMALLEST[1]
     shifts[450:, 4] -= 1.2 * SMALLEST[4]
-    test = DriftTest(SETTINGS)
+    test = DriftTest(INDEPENDENT)
     expected = cusum(shifts, sigma, SMALLEST, 0.2 * test.threshold).max(axis=(1, 2)) >= test.threshold
     first = int(expected.argmax())
     assert 450 < first < 560, "the trial has an alarm"
@@ -42,14 +55,14 @@ def test_the_sums_are_those_of_page():
 def test_the_threshold_is_the_bound_for_the_tolerated_alarms_a_day():
     """Lorden: each of twelve sums alarms once in exp(h) frames at most."""
     for rate, fps in ((0.01, 60.0), (1.0, 25.0)):
-        test = DriftTest(PolicySettings(false_alarms_per_day=rate, frames_per_s=fps))
+        test = DriftTest(PolicySettings(correlation_frames=1.0, false_alarms_per_day=rate, frames_per_s=fps))
         assert 12.0 * fps * 86400.0 / np.exp(test.threshold) == pytest.approx(rate)
 
 
 @pytest.mark.parametrize("relative", [1.0, 2.0])
 def test_white_noise_alarms_no_more_often_than_stated(relative: float):
     """One alarm in 86 frames is tolerated here; the bound must hold, and not by orders of magnitude."""
-    settings = PolicySettings(false_alarms_per_day=1000.0, frames_per_s=1.0)
+    settings = PolicySettings(correlation_frames=1.0, false_alarms_per_day=1000.0, frames_per_s=1.0)
     rng, test, sigma = np.random.default_rng(2), DriftTest(settings), relative * SMALLEST
     shifts = rng.normal(size=(30_000, 6)) * sigma
     alarms = 0
@@ -65,7 +78,7 @@ def test_white_noise_alarms_no_more_often_than_stated(relative: float):
 @pytest.mark.parametrize("relative", [0.3, 1.0, 3.0])
 def test_a_million_frames_of_an_unmoved_camera_stay_quiet(relative: float):
     """At the default rate 12 / exp(h) is one alarm in 5e8 frames."""
-    test = DriftTest(PolicySettings())
+    test = DriftTest(PolicySettings(correlation_frames=1.0))
     sigma = relative * SMALLEST
     rng = np.random.default_rng(3)
     highest = 0.0
@@ -79,7 +92,7 @@ def test_a_million_frames_of_an_unmoved_camera_stay_quiet(relative: float):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_systematic_offset_below_half_the_smallest_drift_stays_quiet(sign: float):
     """Calibration is never perfect: with the noise of real frames 0.4 of the smallest drift is no drift."""
-    run = settled(PolicySettings())
+    run = settled(PolicySettings(correlation_frames=1.0))
     rng = np.random.default_rng(4)
     offset = sign * 0.4 * SMALLEST
     sigma = SMALLEST / 50.0
@@ -96,7 +109,7 @@ def test_the_smallest_drift_is_found_within_the_expected_number_of_frames(
     relative: float, frames: int, axis: int, sign: float
 ):
     """Each frame adds (drift / sigma)² / 2 on average; bounds are twice what the default threshold of 22.6 needs."""
-    test = DriftTest(PolicySettings())
+    test = DriftTest(PolicySettings(correlation_frames=1.0))
     sigma = relative * SMALLEST
     rng = np.random.default_rng(5)
     delays = []
@@ -119,7 +132,7 @@ def test_one_wild_frame_does_not_decide():
 @pytest.mark.parametrize("relative", [0.02, 0.5, 1.0])
 def test_a_constant_drift_is_alerted_once_whatever_the_noise(relative: float):
     """An operator gets one alert, not one at every frame that by chance speaks against the drift."""
-    run = settled(PolicySettings(suspect_sigma_m=1.0))
+    run = settled(PolicySettings(correlation_frames=1.0, suspect_sigma_m=1.0))
     rng, sigma = np.random.default_rng(6), relative * SMALLEST
     judgements = []
     for _ in range(3000):

@@ -1,6 +1,15 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
 from gripmon.corners.measure import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.corners.views import finger_shares, trace_of
+from gripmon.corners.views import agreeing_fingers, finger_shares, trace_of
 
-__all__ = ["Effort", "FingertipMeter", "Measurement", "MeasurementSettings", "Patience", "finger_shares", "trace_of"]
+__all__ = [
+    "Effort",
+    "FingertipMeter",
+    "Measurement",
+    "MeasurementSettings",
+    "Patience",
+    "agreeing_fingers",
+    "finger_shares",
+    "trace_of",
+]

@@ -122,11 +122,10 @@ class Measurement:
     trusted: bool = False
     looked_far: bool = False
 
-    @property
-    def corners_cam_m(self) -> Array:
-        """Corners (c, 3) in the camera frame at the prediction's pose, but with the jaw opening that was measured."""
+    def corners_at(self, jaw_opening_m: float) -> Array:
+        """Corners (c, 3) in the camera frame at the prediction's pose, but with another jaw opening."""
         prediction = self.prediction
-        opened_m = self.jaw_opening_m - prediction.jaw_opening_m
+        opened_m = jaw_opening_m - prediction.jaw_opening_m
         return prediction.corners.cam_m + opened_m * prediction.corners.jaw_rate
 
     def corner_rms_px(self, cam_T_grip: Array) -> float | None:
@@ -139,7 +138,7 @@ class Measurement:
             return None
         prediction = self.prediction
         turn = cam_T_grip[:3, :3] @ prediction.cam_T_grip[:3, :3].T
-        points = (self.corners_cam_m - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
+        points = (self.corners_at(self.jaw_opening_m) - prediction.cam_T_grip[:3, 3]) @ turn.T + cam_T_grip[:3, 3]
         miss_xy = self.corners.xy - points[:, :2] / points[:, 2:]
         miss_px = (prediction.corners.d_uv_d_xy @ miss_xy[..., None])[usable]
         return math.sqrt(float(np.vdot(miss_px, miss_px)) / count)

@@ -143,12 +143,13 @@ def find_candidates(
     sample, column = np.divmod(flat, middle.shape[1])
     at = flat + 2 * sample + 1
     values = height.ravel()
-    left, centre, right = values[at - 1], values[at], values[at + 1]
+    # A flat top would round to a curvature of zero in single precision.
+    left, centre, right = (values[at + k].astype(np.float64) for k in (-1, 0, 1))
     shift = 0.5 * (left - right) / (left - 2.0 * centre + right)
     offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
     step = response.ravel()[at].astype(np.float64)
     sigma_px = (noise * kernel.curvature_noise_px) / centre
-    return Candidates(sample, offset_px.astype(np.float64), step, sigma_px.astype(np.float64), noise, grey_range)
+    return Candidates(sample, offset_px, step, sigma_px, noise, grey_range)
 
 
 def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:

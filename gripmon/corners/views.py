@@ -35,6 +35,16 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
     )
 
 
+def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
+    """Share of each finger's profiles that agree with the measured pose; 1 for a finger that isn't sampled."""
+    prediction = measurement.prediction
+    finger = gripper.edge_finger[prediction.layout.edge]
+    fingers = len(gripper.finger_ids)
+    agreeing = np.bincount(finger, measurement.consensus.supported, fingers).tolist()
+    sampled = np.bincount(finger, prediction.ok, fingers).tolist()
+    return [a / n if n else 1.0 for a, n in zip(agreeing, sampled, strict=True)]
+
+
 def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array) -> Array:
     """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that
     isn't sampled.
