@@ -74,8 +74,6 @@ class CornerFault(enum.StrEnum):
     HIDDEN = "hidden"
     PARALLEL = "parallel"
     UNCERTAIN = "uncertain"
-    OUTLIER = "outlier"
-    NOT_SELECTED = "not_selected"
     FRAME_REFUSED = "frame_refused"
     NO_FIT = "no_fit"
 
@@ -86,7 +84,6 @@ class Cause(enum.StrEnum):
     CAMERA_MOUNT = "camera_mount_moved"
     FINGER_BENT = "finger_bent"
     JAW_OPENING = "jaw_opening_wrong"
-    FOCUS = "focus_or_zoom_changed"
     VIEW_BLOCKED = "view_blocked"
     IMAGE_BAD = "image_bad"
     NO_CAMERA = "no_camera"
@@ -201,6 +198,38 @@ class ReferenceRecord(msgspec.Struct, frozen=True):
     origin: str
     cam_T_grip: Transform
     covariance: tuple[float, ...]
+
+
+def unmeasured_record(
+    frame: Frame,
+    reference: ReferenceRecord,
+    reason: str | None,
+    *,
+    verdict: Verdict = Verdict.UNKNOWN,
+    state: State = State.LOST,
+    corners: tuple[CornerRecord, ...] = (),
+    alerts: tuple[Alert, ...] = (),
+) -> FrameRecord:
+    """The record of a frame that gave no measurement, without a transform: by default there is nothing to stand by."""
+    return FrameRecord(
+        seq=frame.seq,
+        stamp_ns=frame.stamp_ns,
+        verdict=verdict,
+        state=state,
+        source=Origin.HELD,
+        cam_T_grip=None,
+        covariance=None,
+        smoothed=None,
+        drift=None,
+        reference_id=reference.reference_id,
+        revision=reference.revision,
+        rms_px=None,
+        jaw_opening_m=frame.jaw_opening_m,
+        corners=corners,
+        alerts=alerts,
+        reason=reason,
+        name=frame.name,
+    )
 
 
 class StateRecord(msgspec.Struct, frozen=True):

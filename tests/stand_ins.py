@@ -80,7 +80,7 @@ class ScriptedSource:
 
 
 class Listener:
-    """Publisher and recorder at once: writes everything down."""
+    """Publisher and recorder at once: writes everything down, except what ``fails`` names ("everything": all)."""
 
     def __init__(self, *, fails: str = "", closing_fails: bool = False) -> None:
         self.transforms: list[FrameRecord] = []
@@ -91,28 +91,33 @@ class Listener:
         self.closed = 0
         self.dropped = 0
         self.failure: str | None = None
-        self._fails, self._closing_fails = fails, closing_fails
+        self.order: list[tuple[str, int]] = []  # what came, and the revision that it names
+        self.fails, self._closing_fails = fails, closing_fails
 
     def transform(self, record: FrameRecord) -> None:
-        if self._fails == "transform":
-            raise OSError("the network is gone")
+        self._take("transform", record.revision)
         self.transforms.append(record)
 
     def state(self, record: StateRecord) -> None:
+        self._take("state", record.revision)
         self.states.append(record)
 
     def alert(self, record: AlertRecord) -> None:
-        if self._fails == "transform":
-            raise OSError("the network is gone")
+        self._take("alert", record.revision)
         self.alerts.append(record)
 
     def reference(self, record: ReferenceRecord) -> None:
+        self._take("reference", record.revision)
         self.references.append(record)
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
-        if self._fails == "offer":
-            raise RuntimeError("the recorder is broken")
+        self._take("offer", record.revision)
         self.offered.append((frame, record))
+
+    def _take(self, what: str, revision: int) -> None:
+        if self.fails in (what, "everything"):
+            raise OSError("the line is cut")
+        self.order.append((what, revision))
 
     def close(self, timeout_s: float = 0.0) -> None:
         self.closed += 1

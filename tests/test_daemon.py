@@ -170,6 +170,29 @@ def test_a_new_revision_is_published_and_recorded():
     assert (4, 2) in [(state.revision, state.seq) for state in bench.network.states]
 
 
+def test_a_new_reference_is_known_before_anything_names_it():
+    alert = Alert(AlertKind.RECALIBRATED, Cause.CAMERA_MOUNT, Severity.INFO, "new reference")
+    bench = Bench(range(2), ScriptedMonitor(lambda seq: {"revision": 4, "alerts": (alert,)} if seq else {}))
+    bench.run()
+    first = bench.network.order.index(("reference", 4))
+    assert bench.network.order[first : first + 3] == [("reference", 4), ("transform", 4), ("alert", 4)]
+    assert all(revision == 3 for _, revision in bench.network.order[:first])
+    assert bench.recording.order == [("offer", 3), ("reference", 4), ("offer", 4)]
+
+
+def test_an_alert_has_the_stamp_of_its_frame():
+    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    told: dict[int, dict[str, object] | Exception] = {1: {"alerts": (alert,)}, 2: ValueError("singular")}
+    script = [0, 1, 2, pause(0.05), Waiting("unplugged"), 3]
+    bench = Bench(script, ScriptedMonitor(lambda seq: told.get(seq, {})), no_camera_alert_after_s=0.04)
+    bench.run()
+    jump, lost, missing, back = bench.network.alerts
+    assert [(a.kind, a.stamp_ns) for a in (jump, lost, back)] == [
+        (AlertKind.JUMP, 1_001), (AlertKind.LOST, 1_002), (AlertKind.RECOVERED, 1_003)
+    ]  # fmt: skip
+    assert abs(missing.stamp_ns - time.time_ns()) < 60e9
+
+
 def test_one_failing_frame_is_survived_and_said(caplog: pytest.LogCaptureFixture):
     bench = Bench(range(4), ScriptedMonitor(lambda seq: ValueError("singular\nmatrix") if seq == 1 else {}))
     with caplog.at_level(logging.INFO, "gripmon"):
@@ -205,13 +228,48 @@ def test_errors_that_come_and_go_do_not_add_up():
     assert bench.run() == 0
 
 
-@pytest.mark.parametrize("fails", ["transform", "offer"])
+@pytest.mark.parametrize("fails", ["transform", "offer", "everything"])
 def test_a_broken_output_is_survived_for_a_while(fails: str):
     bench = Bench(range(100), give_up_after_errors=5)
     bench.network, bench.recording = Listener(fails=fails), Listener(fails=fails)
     assert bench.run() == 3
     assert len(bench.monitor.frames) == 5
-    assert any(state is State.LOST for state, _ in bench.states)
+
+
+def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
+    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)}))
+    bench.network = Listener(fails="transform")
+    assert bench.run(estimates=tmp_path / "estimates.jsonl") == 0
+    assert [frame.seq for frame, _ in bench.recording.offered] == [0, 1, 2]
+    assert len((tmp_path / "estimates.jsonl").read_bytes().splitlines()) == 3
+    assert [said.kind for said in bench.network.alerts] == [AlertKind.JUMP] * 3
+    assert bench.network.states[-1].frames == 3
+    assert bench.states[1] == (State.TRACKING, "transform not delivered: OSError: the line is cut")
+    assert State.LOST not in [state for state, _ in bench.states]
+
+
+def test_a_broken_recorder_costs_the_network_nothing_and_its_end_is_said(caplog: pytest.LogCaptureFixture):
+    bench = Bench([0, 1, lambda _: setattr(bench.recording, "fails", ""), 2])
+    bench.recording = Listener(fails="offer")
+    with caplog.at_level(logging.ERROR, "gripmon"):
+        assert bench.run() == 0
+    assert [record.seq for record in bench.network.transforms] == [0, 1, 2]
+    assert [frame.seq for frame, _ in bench.recording.offered] == [2]
+    fault = "recording not delivered: OSError: the line is cut"
+    assert bench.states[1:3] == [(State.TRACKING, fault), (State.TRACKING, "")]
+    assert caplog.messages == [fault]
+
+
+def test_a_monitor_that_fails_is_alerted_though_the_network_failed_before():
+    bench = Bench(
+        [0, lambda _: setattr(bench.network, "fails", ""), 1],
+        ScriptedMonitor(lambda seq: ValueError("singular") if seq == 1 else {}),
+    )
+    bench.network = Listener(fails="everything")
+    bench.run()
+    assert bench.alerts == [(AlertKind.LOST, Cause.UNKNOWN)]
+    assert [reference.revision for reference in bench.network.references] == [3]  # sent again when it could be
 
 
 def test_a_source_that_breaks_ends_the_daemon_with_code_3():

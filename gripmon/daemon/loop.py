@@ -7,7 +7,8 @@ import gc
 import logging
 import math
 import time
-from typing import Protocol
+from collections.abc import Callable
+from typing import ParamSpec, Protocol
 
 import msgspec
 
@@ -25,16 +26,16 @@ from gripmon.records import (
     Frame,
     FrameRecord,
     MeasurementTrace,
-    Origin,
     ReferenceRecord,
     Severity,
     State,
     StateRecord,
-    Verdict,
+    unmeasured_record,
 )
 from gripmon.sources import Source, Waiting
 
 _log = logging.getLogger(__name__)
+_P = ParamSpec("_P")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
@@ -94,7 +95,7 @@ class Daemon:
         self._robot, self._camera = robot, camera
         self._estimates = estimates
         self._jaw = jaw
-        self._reference = monitor.reference
+        self._reference, self._reference_due = monitor.reference, True
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
@@ -102,7 +103,8 @@ class Daemon:
         self._next_state_s = self._start_s
         self._stop = stop
         self._source_broke = False
-        self._last_error = ""
+        self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
+        self._said_faults: dict[str, str] = {}  # in the log
 
     def run(self, duration_s: float | None = None) -> int:
         """Handle frames until the source ends, the time is over, errors persist, or a stop is requested.
@@ -113,7 +115,7 @@ class Daemon:
             "watching %s/%s against %s, revision %d",
             self._robot, self._camera, self._reference.reference_id, self._reference.revision,
         )  # fmt: skip
-        self._publisher.reference(self._reference)
+        self._make_reference_known()
         end_s = self._start_s + duration_s if duration_s is not None else math.inf
         self._say_state(time.monotonic())
         while self._stop.exit_code is None and time.monotonic() < end_s and self._next_item():
@@ -152,82 +154,76 @@ class Daemon:
     def _handle(self, frame: Frame) -> None:
         handed_over_ns = time.monotonic_ns()
         self._seq = frame.seq
-        fault: Exception | None = None
+        self._faults.clear()
+        frame, record, failure = self._judge(frame)
+        record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
+        self._deliver("transform", self._publisher.transform, record)
+        # The rest is less urgent.
+        for alert in record.alerts:
+            self._alert(alert, record.state, frame.stamp_ns, recorded=True)
+        for alert in self._watch.frame(record, time.monotonic()):
+            self._alert(alert, record.state, frame.stamp_ns)
+        self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace)
+        self._deliver("estimates", self._estimates.write, record)
+        for alert in self._watch.end_of_frame(failure, "; ".join(self._faults.values())):
+            self._alert(alert, record.state, frame.stamp_ns)
+
+    def _judge(self, frame: Frame) -> tuple[Frame, FrameRecord, str]:
+        """The frame with its jaw opening, what the monitor makes of it, and the monitor's failure (mostly empty).
+
+        A reference that came with the frame is made known first: what follows names it.
+        """
         try:
             if self._jaw is not None:
                 frame = dataclasses.replace(frame, jaw_opening_m=self._jaw.opening_m())
             record = self._monitor.process(frame)
-        except Exception as error:  # noqa: BLE001  said and counted below
-            fault = error
-            record = self._unjudged(frame, error)
+        except Exception as error:  # noqa: BLE001  said and counted
+            failure = f"internal error: {_in_short(error)}"
+            self._log_once("monitor", f"frame {frame.seq}: ", failure, error)
+            self._make_reference_known()
+            return frame, unmeasured_record(frame, self._reference, failure), failure
+        self._said_faults.pop("monitor", None)
+        self._make_reference_known()
+        return frame, record, ""
+
+    def _make_reference_known(self) -> None:
+        newest, known = self._monitor.reference, self._reference
+        if (newest.reference_id, newest.revision) != (known.reference_id, known.revision):
+            self._reference, self._reference_due = newest, True
+            self._deliver("recording", self._recorder.reference, newest)
+        if self._reference_due:
+            self._reference_due = not self._deliver("reference", self._publisher.reference, self._reference)
+
+    def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
+        """Hand something to one receiver, whose failure is no other's; False, said and counted, if it failed."""
         try:
-            record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
-            self._publisher.transform(record)
-            self._hand_out(frame, record)
-        except Exception as error:  # noqa: BLE001  said and counted below
-            fault = fault or error
-        if fault is not None:
-            self._survive(fault)
-        else:
-            self._watch.errors_in_a_row = 0
-            self._last_error = ""
+            put(*values, **named)
+        except Exception as error:  # noqa: BLE001  said here, counted at the end of the frame
+            self._faults[what] = f"{what} not delivered: {_in_short(error)}"
+            self._log_once(what, "", self._faults[what], error)
+            return False
+        self._said_faults.pop(what, None)
+        return True
 
-    def _hand_out(self, frame: Frame, record: FrameRecord) -> None:
-        """What is less urgent than the transform."""
-        for alert in record.alerts:
-            self._alert(alert, record.state, recorded=True)
-        for alert in self._watch.frame(record, time.monotonic()):
-            self._alert(alert, record.state)
-        self._recorder.offer(frame, record, self._monitor.trace)
-        if (record.reference_id, record.revision) != (self._reference.reference_id, self._reference.revision):
-            self._reference = self._monitor.reference
-            self._publisher.reference(self._reference)
-            self._recorder.reference(self._reference)
-        self._estimates.write(record)
+    def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:
+        """Say a fault, but not again until it has changed or was over."""
+        if self._said_faults.get(what) != text:
+            self._said_faults[what] = text
+            _log.error("%s%s", where, text)
+            _log.debug("%s%s", where, what, exc_info=error)
 
-    def _unjudged(self, frame: Frame, error: Exception) -> FrameRecord:
-        """The record of a frame on which the monitor failed: nothing to stand by."""
-        return FrameRecord(
-            seq=frame.seq,
-            stamp_ns=frame.stamp_ns,
-            verdict=Verdict.UNKNOWN,
-            state=State.LOST,
-            source=Origin.HELD,
-            cam_T_grip=None,
-            covariance=None,
-            smoothed=None,
-            drift=None,
-            reference_id=self._reference.reference_id,
-            revision=self._reference.revision,
-            rms_px=None,
-            jaw_opening_m=frame.jaw_opening_m,
-            corners=(),
-            alerts=(),
-            reason=f"internal error: {_in_short(error)}",
-            name=frame.name,
-        )
+    def _alert(self, alert: Alert, state: State, stamp_ns: int | None = None, *, recorded: bool = False) -> None:
+        """Say it on the network and in the log.
 
-    def _survive(self, error: Exception) -> None:
-        text = _in_short(error)
-        alerts = self._watch.error(text)
-        if text != self._last_error:
-            self._last_error = text
-            _log.error("frame %d: internal error: %s", self._seq, text)
-            _log.debug("frame %d", self._seq, exc_info=error)
-        try:
-            for alert in alerts:
-                self._alert(alert, State.LOST)
-        except Exception as second:  # noqa: BLE001  the network may be what is broken
-            _log.error("the alert could not be sent: %s", _in_short(second))
-
-    def _alert(self, alert: Alert, state: State, *, recorded: bool = False) -> None:
-        """Say it on the network and in the log; ``recorded`` if a frame's record carries it into the recording."""
+        ``stamp_ns`` is that of the frame that the alert belongs to, if there is one; ``recorded`` if the frame's record
+        carries it into the recording.
+        """
         _log.log(_LEVELS[alert.severity], "%s: %s", alert.kind.value, alert.text)
         message = AlertRecord(
             robot=self._robot,
             camera=self._camera,
             seq=self._seq,
-            stamp_ns=time.time_ns(),
+            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
             state=state,
             reference_id=self._reference.reference_id,
             revision=self._reference.revision,
@@ -236,15 +232,16 @@ class Daemon:
             severity=alert.severity,
             text=alert.text,
         )
-        self._publisher.alert(message)
+        self._deliver("alert", self._publisher.alert, message)
         if not recorded:
-            self._recorder.alert(message)
+            self._deliver("alert's recording", self._recorder.alert, message)
 
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
         watch, said = self._watch, self._said
         faults = (
             watch.message,
+            watch.undelivered,
             self._jaw.fault() if self._jaw else "",
             self._recorder.failure,
             self._estimates.failure,
@@ -275,7 +272,7 @@ class Daemon:
             message=message,
             version=__version__,
         )
-        self._publisher.state(self._said)
+        self._deliver("state", self._publisher.state, self._said)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
             self._keep_house()

@@ -13,8 +13,8 @@ _RATE_OVER_FRAMES = 64
 class Watch:
     """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
 
-    ``state``, ``verdict`` and ``message`` are what the state message says now.  Alerts about images are the monitor's,
-    those about their absence come from here: one when it has lasted, one when it is over.
+    ``state``, ``verdict``, ``message`` and ``undelivered`` are what the state message says now.  Alerts about images
+    are the monitor's, those about their absence come from here: one when it has lasted, one when it is over.
     """
 
     def __init__(self, settings: DaemonSettings, now_s: float) -> None:
@@ -25,7 +25,9 @@ class Watch:
         self.frames = 0
         self.frames_refused = 0
         self.frames_usable = 0
+        self.undelivered = ""
         self.errors_in_a_row = 0
+        self._failed = False
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._silence_alerted = False
@@ -57,14 +59,18 @@ class Watch:
         text = f"no frame for {silence_s:.1f} s: {reason}"
         return [Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, text)]
 
-    def error(self, text: str) -> list[Alert]:
-        """Handling a frame failed here, not in the camera."""
-        self.errors_in_a_row += 1
-        self.state, self.verdict = State.LOST, Verdict.UNKNOWN
-        self.message = f"internal error: {text}"
-        if self.errors_in_a_row > 1:
+    def end_of_frame(self, failure: str, undelivered: str) -> list[Alert]:
+        """What failed here, not in the camera: the monitor on the frame, or passing on what it had to say.
+
+        Only the first says something about the transform.
+        """
+        self.undelivered = undelivered
+        self.errors_in_a_row = self.errors_in_a_row + 1 if failure or undelivered else 0
+        failed_before, self._failed = self._failed, bool(failure)
+        if not failure:
             return []
-        return [Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, self.message)]
+        self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
+        return [] if failed_before else [Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)]
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

@@ -130,7 +130,9 @@ class RowWriter:
             self._send.columns("events", [e.stamp_ns for e in events], [e.seq for e in events], columns)
 
     def _on_frames_clock(self, stamp_ns: int) -> int:
-        """Frames of old files have old stamps: an alert of today among them would stretch the timeline over years."""
+        """Frames of old files have old stamps: among them an alert of today, which belongs to no frame, would stretch
+        the timeline over years.
+        """
         if self._newest_stamp_ns is None or abs(stamp_ns - self._newest_stamp_ns) < _LONGEST_SILENCE_NS:
             return stamp_ns
         return self._newest_stamp_ns
