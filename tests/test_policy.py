@@ -74,7 +74,11 @@ TABLES: dict[str, list[Row]] = {
         (seen(), ACQUIRING, SUSPECT, [], False),
         (seen(), TRACKING, VALID, [], False),
         (HIDDEN, OCCLUDED, SUSPECT, [K.OCCLUDED], False),
-        *[(seen(), OCCLUDED, SUSPECT, [], False), (seen(), TRACKING, VALID, [], False), (HIDDEN, OCCLUDED, SUSPECT, [], False)] * 5,
+        *[
+            (seen(), OCCLUDED, SUSPECT, [], False),
+            (seen(), TRACKING, VALID, [], False),
+            (HIDDEN, OCCLUDED, SUSPECT, [], False),
+        ] * 5,
     ],
     "a long occlusion: held, lost, found": [
         (seen(), ACQUIRING, SUSPECT, [], False),

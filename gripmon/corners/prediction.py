@@ -62,8 +62,6 @@ class EdgeLayout:
     edges: NDArray[np.intp]
     first: NDArray[np.intp]
     visible: NDArray[np.bool_]
-    crease: NDArray[np.bool_]
-    inside_point_m: Array
 
     @cached_property
     def stretch(self) -> NDArray[np.intp]:
@@ -200,8 +198,6 @@ def lay_out(
         edges,
         first,
         view.visible,
-        view.crease,
-        view.inside_point_m,
     )
 
 

@@ -117,11 +117,6 @@ def _kernel(samples: int, blur_px: float) -> _Kernel:
     )
 
 
-def response_matrix(samples: int, blur_px: float) -> NDArray[np.float32]:
-    """Matrix (s, r) whose product with profiles (n, s) is the edge response (n, r), in grey levels of a step."""
-    return _kernel(samples, blur_px).matrix
-
-
 def find_candidates(
     profiles: NDArray[np.float32], ok: NDArray[np.bool_], noise: float, grey_range: float, settings: EdgeSettings
 ) -> Candidates:
