@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -258,6 +259,23 @@ def test_an_old_jaw_opening_is_not_used(endpoint: str):
             session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": 1, "opening_m": 0.02}))
             wait_until(lambda: publisher.jaw.opening_m() == 0.02, "the jaw opening")
             wait_until(lambda: publisher.jaw.opening_m() is None, "the jaw opening to grow old")
+            assert publisher.jaw.fault() == "no jaw opening for 0.2 s or longer"
+    finally:
+        publisher.close()
+
+
+def test_a_jaw_opening_grows_old_though_nobody_asked(endpoint: str):
+    """The camera was away for a while: what the robot said before must not look fresh."""
+    settings = PublishSettings(listen=(endpoint,), jaw_max_age_s=0.2)
+    publisher = ZenohPublisher(settings, "arm", "wrist", subscribe_jaw=True)
+    try:
+        with plain_session(connect=endpoint) as session:
+            putter = session.declare_publisher(f"{PREFIX}/jaw")
+            reading = json.dumps({"stamp_ns": 1, "opening_m": 0.02})
+            wait_until(lambda: publisher.jaw.opening_m() is not None or putter.put(reading), "the jaw opening")
+            putter.put(reading)
+            time.sleep(0.5)
+            assert publisher.jaw.opening_m() is None
             assert publisher.jaw.fault() == "no jaw opening for 0.2 s or longer"
     finally:
         publisher.close()

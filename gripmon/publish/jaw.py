@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 
 import msgspec
 import zenoh
 
 _log = logging.getLogger(__name__)
-_JAW_READINGS_KEPT = 64  # between two frames; the newest win
 
 
 class JawReading(msgspec.Struct, frozen=True):
@@ -22,46 +22,53 @@ class JawReading(msgspec.Struct, frozen=True):
 class ZenohJaw:
     """The newest jaw opening that the robot sent.
 
-    Ask once a frame, from one thread; nothing runs between the asks.  Age counts from arrival, so that the robot's
-    clock need not agree with ours.
+    Age counts from arrival, so that the robot's clock need not agree with ours.  Zenoh's thread stores what arrives;
+    any thread may ask.
     """
 
     def __init__(self, max_age_s: float) -> None:
         self.malformed = 0
         self._max_age_s = max_age_s
-        self._subscriber: zenoh.Subscriber[zenoh.Handler[zenoh.Sample]] | None = None
+        self._subscriber: zenoh.Subscriber[None] | None = None
         self._decode = msgspec.json.Decoder(JawReading).decode
+        self._lock = threading.Lock()  # guards what follows, and `malformed`, against Zenoh's thread
         self._newest: JawReading | None = None
         self._arrival_s = 0.0
 
     def attach(self, session: zenoh.Session, key: str) -> None:
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(_JAW_READINGS_KEPT))
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._receive, indirect=False))
 
     def opening_m(self) -> float | None:
         """The newest opening, m; None if none came, or none for ``jaw_max_age_s``."""
-        now_s = time.monotonic()
-        self._receive(now_s)
-        if self._newest is None or now_s - self._arrival_s > self._max_age_s:
-            return None
-        return self._newest.opening_m
+        with self._lock:
+            return None if self._newest is None or self._is_old() else self._newest.opening_m
 
     def fault(self) -> str:
         """What is wrong with the readings, in a few words for a person; empty if nothing is."""
         faults = []
-        if self._newest is None:
-            faults.append("no jaw opening received")
-        elif time.monotonic() - self._arrival_s > self._max_age_s:
-            faults.append(f"no jaw opening for {self._max_age_s:g} s or longer")
-        if self.malformed:
-            faults.append(f"{self.malformed} malformed jaw message{'s' * (self.malformed > 1)}")
+        with self._lock:
+            if self._newest is None:
+                faults.append("no jaw opening received")
+            elif self._is_old():
+                faults.append(f"no jaw opening for {self._max_age_s:g} s or longer")
+            if self.malformed:
+                faults.append(f"{self.malformed} malformed jaw message{'s' * (self.malformed > 1)}")
         return ", ".join(faults)
 
-    def _receive(self, now_s: float) -> None:
-        while self._subscriber is not None and (sample := self._subscriber.try_recv()) is not None:
-            try:
-                self._newest = self._decode(sample.payload.to_bytes())
-                self._arrival_s = now_s
-            except msgspec.DecodeError as error:
+    def _is_old(self) -> bool:
+        return time.monotonic() - self._arrival_s > self._max_age_s
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        arrival_s = time.monotonic()
+        try:
+            reading = self._decode(sample.payload.to_bytes())
+        except msgspec.DecodeError as error:
+            with self._lock:
                 self.malformed += 1
-                if self.malformed == 1:
-                    _log.warning("malformed message on %s: %s", sample.key_expr, error)
+                first = self.malformed == 1
+            if first:
+                _log.warning("malformed message on %s: %s", sample.key_expr, error)
+            return
+        with self._lock:
+            self._newest, self._arrival_s = reading, arrival_s
