@@ -19,7 +19,8 @@ from simulated import (
 )
 
 from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.simulator import Simulator, make_scenario
+from gripmon.config import builtin_config, load_config
+from gripmon.simulator import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulator.background import _smear_kernel
 from gripmon.simulator.coverage import CoverageRaster
 from gripmon.simulator.scenario import (
@@ -332,3 +333,14 @@ def test_jpeg_is_that_of_the_uncompressed_frame() -> None:
     expected = cv2.imdecode(cv2.imencode(".jpg", raw, [cv2.IMWRITE_JPEG_QUALITY, 60])[1], cv2.IMREAD_GRAYSCALE)
     np.testing.assert_array_equal(packed, expected)
     assert 1.0 < np.abs(packed.astype(float) - raw).mean() < 8.0
+
+
+@pytest.mark.parametrize("name", SCENARIO_NAMES)
+def test_every_scenario_can_be_drawn_at_its_defaults(name: str):
+    """Frame 77 of grasp has a fingertip that touches the image with its blur alone."""
+    config = load_config(builtin_config("demo.yaml"), check_source=False)
+    scenario = make_scenario(name, finger=config.gripper.finger_ids[0])
+    drawn = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, 0)
+    count = drawn.frame_count
+    for index in sorted({*range(0, count, max(1, count // 4)), min(77, count - 1), count - 1}):
+        assert drawn.render(index).std() > 1.0

@@ -75,6 +75,8 @@ class CoverageRaster:
         v = points_px[:, 1] - top
         near = (u < right - left + reach - 1) & (v > -reach) & (v < bottom - top + reach - 1)
         u, v, dy = u[near], v[near], dy_px[near]
+        if not len(u):
+            return None  # no boundary in the window or left of it: nothing is covered
         column, row = np.floor(u), np.floor(v)
         weights_u = self._columns[((u - column) * _PHASES).astype(np.intp)]
         weights_v = self._rows[((v - row) * _PHASES).astype(np.intp)]
