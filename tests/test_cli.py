@@ -96,6 +96,7 @@ def test_help_explains_every_argument(command: str, capsys: pytest.CaptureFixtur
         ["demo", "--seconds", "-3"],
         ["demo", "--seconds", "nan"],
         ["demo", "--fps", "fast"],
+        ["demo", "--seed", "-1"],
         ["simulate", "bump", "--out", "x", "--seed", "-1"],
         ["check", "x.yaml", "--jsn"],
     ],
@@ -135,6 +136,8 @@ def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(tmp_path: Path
         (["simulate", "series1", "--fps", "3", "--out", "{folder}/x"], "neither duration_s nor fps"),
         (["demo", "--seconds", "1"], "at least"),
         (["demo", "--out", "{config}"], "can't be made"),
+        (["demo", "--fps", "1e9"], "$.fps"),
+        (["demo", "--seconds", "1e9"], "$.duration_s"),
     ],
 )
 def test_other_faults_end_with_2_and_one_line(
@@ -146,6 +149,13 @@ def test_other_faults_end_with_2_and_one_line(
     assert main(filled) == 2
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and said in lines[0]
+
+
+def test_estimates_that_cannot_be_written_are_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    estimates = tmp_path / "estimates.jsonl"
+    estimates.mkdir()
+    assert main(["run", str(builtin_config("demo.yaml")), "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err == f"--out {estimates}: can't be written (Is a directory); a file\n"
 
 
 def test_check_says_what_the_calibration_expects(capsys: pytest.CaptureFixture[str]):

@@ -16,9 +16,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from loopback import frame_record
 
 from gripmon.cli import main
-from gripmon.records import Refusal
+from gripmon.cli.replay import _Counts
+from gripmon.monitor import Monitor
+from gripmon.records import Frame, FrameRecord, Refusal
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPMON = (sys.executable, "-m", "gripmon")
@@ -185,6 +188,52 @@ def test_an_output_that_cannot_be_written_is_said_before_work_begins(
     arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", str(tmp_path)]
     assert main(arguments) == 2
     assert "can't be written" in capsys.readouterr().err
+
+
+def test_a_recording_that_cannot_be_written_is_said_before_work_begins(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    replayed(sequence, tmp_path / "out.jsonl", "--recording", str(tmp_path), code=2)
+    assert capsys.readouterr().err.splitlines() == [f"--recording {tmp_path}: is a folder; a file"]
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full")
+@pytest.mark.parametrize("out", ["/dev/full", "-"])
+def test_a_disk_that_is_full_ends_with_3_and_one_line(sequence: Path, out: str):
+    arguments = [*GRIPMON, "replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", out]
+    with Path("/dev/full").open("wb") as full:
+        done = subprocess.run(arguments, stdout=full, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    assert done.returncode == 3
+    summary, fault = done.stderr.splitlines()
+    assert summary.startswith("replay: ") and fault == f"--out {out}: writing failed (No space left on device)"
+
+
+def test_a_monitor_that_fails_on_a_frame_costs_that_frame_only(
+    sequence: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    process = Monitor.process
+
+    def failing(self: Monitor, frame: Frame) -> FrameRecord:
+        if frame.seq in (4, 9):
+            raise ValueError(f"singular {frame.seq}")
+        return process(self, frame)
+
+    monkeypatch.setattr(Monitor, "process", failing)
+    lines = replayed(sequence, tmp_path / "out.jsonl")
+    assert len(lines) == 20
+    assert lines[9]["reason"] == "internal error: ValueError: singular 9" and lines[9]["cam_T_grip"] is None
+    assert lines[10]["cam_T_grip"] is not None
+    assert "2 failed (internal error: ValueError: singular 4)" in capsys.readouterr().err
+
+
+def test_the_summary_needs_no_memory_for_each_frame():
+    counts = _Counts()
+    latencies_ns = np.random.default_rng(3).lognormal(14.0, 0.5, 5001).astype(int).tolist()
+    for seq, latency_ns in enumerate(latencies_ns):
+        counts.add(frame_record(seq, latency_ns=latency_ns, reason=f"few_points: {seq} left"))
+    said = re.search(r"median ([0-9.]+) ms", counts.summary())
+    assert said and float(said[1]) == pytest.approx(1e-6 * float(np.median(latencies_ns)), rel=0.015)
+    assert len(counts._reasons) == 1 and len(counts._latencies) < 300
 
 
 def test_ctrl_c_leaves_whole_lines_and_130(sequence: Path, tmp_path: Path):

@@ -19,6 +19,7 @@ EXIT_USAGE = 2
 EXIT_FAILED = 3
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
+_LARGEST_SEED = 2**32 - 1
 
 
 class CommandFailedError(Exception):
@@ -60,6 +61,13 @@ def positive_number(text: str) -> float:
     return value
 
 
+def seed(text: str) -> int:
+    """An argument that seeds a simulation."""
+    if not text.isdecimal() or int(text) > _LARGEST_SEED:
+        raise argparse.ArgumentTypeError(f"'{text}' is no seed; a whole number, 0 to {_LARGEST_SEED}")
+    return int(text)
+
+
 def load(path: str, *, check_source: bool = True) -> Config:
     """The checked configuration in a file; a fault ends the command with exit code 2."""
     from gripmon.config import ConfigError, load_config
@@ -77,17 +85,30 @@ def load_demo_or(path: str | None) -> Config:
     return load(str(builtin_config("demo.yaml")) if path is None else path, check_source=False)
 
 
-def make_directory(path: Path) -> Path:
-    """Create a directory for output; a fault ends the command with exit code 2."""
+def make_directory(path: Path, option: str = "--out") -> Path:
+    """Create a directory for output, which ``option`` names; a fault ends the command with exit code 2."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CommandFailedError(
-            f"--out {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE
+            f"{option} {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE
         ) from None
     if not os.access(path, os.W_OK | os.X_OK):
-        raise CommandFailedError(f"--out {path}: may not be written to; a directory of your own", EXIT_USAGE)
+        raise CommandFailedError(f"{option} {path}: may not be written to; a directory of your own", EXIT_USAGE)
     return path
+
+
+def not_writable(path: Path, error: OSError, option: str = "--out") -> CommandFailedError:
+    """What to raise when a file for output can't be opened."""
+    return CommandFailedError(f"{option} {path}: can't be written ({error.strerror or error}); a file", EXIT_USAGE)
+
+
+def check_file(path: Path, option: str = "--out") -> None:
+    """End the command with exit code 2, before any work, if a file can't be written; it is made but not changed."""
+    try:
+        path.open("ab").close()
+    except OSError as error:
+        raise not_writable(path, error, option) from None
 
 
 def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[[], None]]:

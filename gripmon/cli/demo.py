@@ -60,7 +60,9 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--fps", type=common.positive_number, metavar="HZ", help="frame rate of the camera (1/s; default 60)"
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="random seed of the simulation (default 1)")
+    parser.add_argument(
+        "--seed", type=common.seed, default=1, metavar="N", help="random seed of the simulation (default 1)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -71,11 +73,14 @@ def run(arguments: argparse.Namespace) -> int:
             common.EXIT_USAGE,
         )
     config = _demo_config(arguments)
-    out = common.make_directory(Path(arguments.out or f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
-    from gripmon.sources import SimulatedSettings, make_simulator
+    from gripmon.sources import SimulatedSettings, SourceError, make_simulator
 
     assert isinstance(config.settings.source, SimulatedSettings), "the shipped demo.yaml has a simulated camera"
-    simulator = make_simulator(config.settings.source, config.scene, config.directory)
+    try:
+        simulator = make_simulator(config.settings.source, config.scene, config.directory)
+    except SourceError as error:
+        raise common.CommandFailedError(f"demo: {error}", common.EXIT_USAGE) from None
+    out = common.make_directory(Path(arguments.out or f"gripmon-demo-{time.strftime('%Y%m%d-%H%M%S')}"))
     print(
         f"{arguments.seconds:g} s of a simulated wrist camera; transforms on {_endpoint(config)}; results in {out}",
         file=sys.stderr,
@@ -107,7 +112,10 @@ def _demo_config(arguments: argparse.Namespace) -> Config:
     changes: dict[str, Any] = {"duration_s": arguments.seconds, "ends": True, "seed": arguments.seed}
     if arguments.fps is not None:
         changes["fps"] = arguments.fps
-    source = msgspec.structs.replace(settings.source, **changes)
+    try:
+        source = msgspec.convert(msgspec.to_builtins(settings.source) | changes, type(settings.source))
+    except msgspec.ValidationError as error:
+        raise common.CommandFailedError(f"demo: {error}", common.EXIT_USAGE) from None
     publish = msgspec.structs.replace(settings.publish, listen=(f"tcp/127.0.0.1:{_free_port()}",))
     return dataclasses.replace(config, settings=msgspec.structs.replace(settings, source=source, publish=publish))
 

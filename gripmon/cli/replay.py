@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
+import math
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,6 +36,7 @@ exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used; 13
 was done until then is in FILE)"""
 
 
+_LATENCY_BIN = 0.02  # natural logarithm
 _RECORDING_PATIENCE_S = 30.0  # replay outruns any camera: it waits for the recording rather than drop a frame
 
 
@@ -84,7 +88,6 @@ def run(arguments: argparse.Namespace) -> int:
                         counts.add(record)
                         step()
             finally:
-                out.flush()
                 print(counts.summary(), file=sys.stderr)
     finally:
         source.close()
@@ -96,7 +99,7 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
     import msgspec
 
     from gripmon.monitor import Monitor
-    from gripmon.records import Frame, to_json
+    from gripmon.records import Frame, to_json, unmeasured_record
 
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
     with_jaw = _jaw_of(config)
@@ -105,7 +108,11 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
         assert isinstance(frame, Frame), "only a live source waits"
         frame = with_jaw(frame)
         start_ns = time.perf_counter_ns()
-        record = monitor.process(frame)
+        try:
+            record = monitor.process(frame)
+        except Exception as error:  # noqa: BLE001  said in the record and in the summary
+            reason = f"internal error: {type(error).__name__}: {' '.join(str(error).split())}"
+            record = unmeasured_record(frame, monitor.reference, reason)
         record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
         if record.revision != revision:
             revision = record.revision
@@ -115,37 +122,49 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
 
 
 class _Counts:
-    """What became of the frames."""
+    """What became of the frames, in memory that does not grow with them."""
 
     def __init__(self) -> None:
         self.frames = 0
         self.usable = 0
-        self._verdicts: dict[str, int] = {}
-        self._reasons: dict[str, int] = {}
-        self._latencies_ns: list[int] = []
+        self._verdicts: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()  # by what comes before the colon: the rest may differ in every frame
+        self._first_failure = ""
+        self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
         from gripmon.records import Origin
 
         self.frames += 1
         self.usable += record.source is not Origin.HELD
-        self._verdicts[record.verdict] = self._verdicts.get(record.verdict, 0) + 1
+        self._verdicts[record.verdict] += 1
         if record.reason:
-            self._reasons[record.reason] = self._reasons.get(record.reason, 0) + 1
-        self._latencies_ns.append(record.latency_ns)
+            kind = record.reason.partition(":")[0]
+            self._reasons[kind] += 1
+            if kind == "internal error":
+                self._first_failure = self._first_failure or record.reason
+        self._latencies[round(math.log(max(record.latency_ns, 1)) / _LATENCY_BIN)] += 1
 
     def summary(self) -> str:
         if not self.frames:
             return "replay: no frames"
-        verdicts = ", ".join(
-            f"{count} {verdict}" for verdict, count in sorted(self._verdicts.items(), key=lambda v: -v[1])
-        )
-        median_ms = 1e-6 * sorted(self._latencies_ns)[self.frames // 2]
-        text = f"replay: {self.frames} frames: {verdicts}; median {median_ms:.2f} ms a frame"
+        verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
+        text = f"replay: {self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
+        if self._first_failure:
+            text += f"; {self._reasons['internal error']} failed ({self._first_failure})"
         if not self.usable:
             reason = max(self._reasons, key=self._reasons.__getitem__, default="no measurement")
             text += f"; no frame could be used ({reason})"
         return text
+
+    def _median_ms(self) -> float:
+        """To one percent."""
+        below = 0
+        for index in sorted(self._latencies):
+            below += self._latencies[index]
+            if 2 * below > self.frames:
+                return 1e-6 * math.exp(index * _LATENCY_BIN)
+        return math.nan
 
 
 def _jaw_of(config: Config) -> Callable[[Any], Any]:
@@ -194,21 +213,51 @@ def _open_recording(path: Path) -> Source:
     return frames
 
 
+class _Lines:
+    """A file whose faults end the command with one line and exit code 3."""
+
+    def __init__(self, file: IO[bytes], name: str):
+        self._file = file
+        self._name = name
+
+    def write(self, line: bytes) -> None:
+        with self._said():
+            self._file.write(line)
+
+    def flush(self) -> None:
+        with self._said():
+            self._file.flush()
+
+    @contextmanager
+    def _said(self) -> Iterator[None]:
+        try:
+            yield
+        except BrokenPipeError:
+            raise  # a reader that has seen enough is no fault
+        except OSError as error:
+            raise common.CommandFailedError(f"--out {self._name}: writing failed ({error.strerror})") from None
+
+
 @contextmanager
-def _output(name: str) -> Iterator[IO[bytes]]:
+def _output(name: str) -> Iterator[_Lines]:
     if name == "-":
-        yield sys.stdout.buffer
+        lines = _Lines(sys.stdout.buffer, name)
+        yield lines
+        lines.flush()
         return
     path = Path(name)
     common.make_directory(path.parent)
     try:
         file = path.open("wb")
     except OSError as error:
-        raise common.CommandFailedError(
-            f"--out {path}: can't be written ({error.strerror}); a file", common.EXIT_USAGE
-        ) from None
-    with file:
-        yield file
+        raise common.not_writable(path, error) from None
+    lines = _Lines(file, name)
+    try:
+        yield lines
+        lines.flush()
+    finally:
+        with contextlib.suppress(OSError):  # the same fault once more
+            file.close()
 
 
 @contextmanager
@@ -224,8 +273,14 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
     path = Path(name)
     # One file, whatever its length.
     settings = msgspec.structs.replace(config.settings.recording, enabled=True, max_file_bytes=2**62)
-    common.make_directory(path.parent)
-    with tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent) as scratch:
+    if path.is_dir():
+        raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+    common.make_directory(path.parent, "--recording")
+    with contextlib.ExitStack() as opened:
+        try:
+            scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
+        except OSError as error:
+            raise common.not_writable(path, error, "--recording") from None
         recorder = open_recorder(
             settings,
             robot=config.settings.robot,
@@ -241,8 +296,16 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             yield recorder
         finally:
             recorder.close(timeout_s=60.0)
-            for written in Path(scratch).glob("*.rrd"):
-                written.replace(path)
+            _keep(Path(scratch), path)
         if recorder.dropped or recorder.failure:
             reason = f" ({recorder.failure})" if recorder.failure else ""
             print(f"replay: {recorder.dropped} frames are missing in {path}{reason}", file=sys.stderr)
+
+
+def _keep(scratch: Path, path: Path) -> None:
+    """Give the finished recording its name."""
+    for written in scratch.glob("*.rrd"):
+        try:
+            written.replace(path)
+        except OSError as error:
+            raise common.CommandFailedError(f"--recording {path}: writing failed ({error.strerror})") from None

@@ -77,6 +77,9 @@ def run_daemon(
     from gripmon.sources import SourceError, open_source
 
     settings = config.settings
+    estimates = None if out is None else out / "estimates.jsonl"
+    if estimates is not None:
+        common.check_file(estimates)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
     monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
@@ -99,7 +102,7 @@ def run_daemon(
             settings.daemon,
             robot=settings.robot,
             camera=settings.camera_name,
-            estimates=None if out is None else out / "estimates.jsonl",
+            estimates=estimates,
             jaw=jaw,
             duration_s=duration_s,
         )
@@ -159,6 +162,8 @@ def _open_recorder(
             truth_tcp_m=truth_tcp_m,
         )
     except OSError as error:
+        if out is not None:
+            raise common.not_writable(out, error) from None
         raise common.CommandFailedError(
             f"{config.path}: recording.directory: {settings.recording.directory} can't be made ({error.strerror}); "
             "a folder that may be written",

@@ -28,7 +28,6 @@ _EXAMPLES = """\
   gripmon simulate my_scenario.yaml --config my_robot.yaml --out mine/
   gripmon replay bump/ --config bump/config.yaml --out bump.jsonl"""
 
-_LARGEST_SEED = 2**32 - 1
 
 
 def add_parser(commands: Any) -> None:
@@ -38,7 +37,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("scenario", nargs="?", metavar="SCENARIO", help="a built-in name (see --list) or a YAML file")
     parser.add_argument("--out", metavar="DIR", help="folder to write to; made if it is missing, refused if not empty")
-    parser.add_argument("--seed", type=_seed, default=0, metavar="N", help="random seed, 0 or more (default 0)")
+    parser.add_argument("--seed", type=common.seed, default=0, metavar="N", help="random seed, 0 or more (default 0)")
     parser.add_argument(
         "--config",
         metavar="CONFIG",
@@ -78,12 +77,6 @@ def run(arguments: argparse.Namespace) -> int:
     replay = shlex.join(["gripmon", "replay", str(out), "--config", str(out / "config.yaml"), "--out", f"{out}.jsonl"])
     print(f"{count} frames in {out}; next: {replay}")
     return common.EXIT_DONE
-
-
-def _seed(text: str) -> int:
-    if not text.isdecimal() or int(text) > _LARGEST_SEED:
-        raise argparse.ArgumentTypeError(f"'{text}' is no seed; a whole number, 0 to {_LARGEST_SEED}")
-    return int(text)
 
 
 def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
