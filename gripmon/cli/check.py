@@ -15,6 +15,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config
+    from gripmon.config.checks import View
     from gripmon.sources import LiveSettings
 
 _DESCRIPTION = """\
@@ -52,41 +53,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def expectation(config: Config) -> dict[str, Any]:
     """What the calibration expects to see, as plain values for JSON: metres, radians, px."""
-    import numpy as np
-
-    from gripmon.geometry import rotation_angle
-
-    settings, camera, gripper = config.settings, config.camera, config.gripper
-    view = config.view()
-    cam_T_grip = config.cam_T_grip
-    corners = [
-        {
-            "id": name,
-            "uv_px": uv.round(2).tolist() if np.isfinite(uv).all() else None,
-            "distance_m": round(float(np.linalg.norm(point)), 6),
-            "visible": bool(visible),
-            "reason": None if visible else "outside" if not inside else "self_hidden",
-        }
-        for name, uv, point, visible, inside in zip(
-            gripper.corner_ids, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
-        )
-    ]
-    depth_m = float(cam_T_grip[2, 3])
+    settings, gripper, view = config.settings, config.gripper, config.view()
     return {
         "config": str(config.path),
         "robot": settings.robot,
         "camera_name": settings.camera_name,
-        "camera": {
-            "model": type(settings.camera).__struct_config__.tag,
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "fx_px": camera.fx_px,
-            "fy_px": camera.fy_px,
-            "field_of_view_rad": [
-                2.0 * math.atan(0.5 * camera.width_px / camera.fx_px),
-                2.0 * math.atan(0.5 * camera.height_px / camera.fy_px),
-            ],
-        },
+        "camera": _camera_values(config),
         "gripper": {
             "file": str(config.gripper_path),
             "name": gripper.name,
@@ -95,22 +67,63 @@ def expectation(config: Config) -> dict[str, Any]:
             "faces": len(gripper.faces),
             "jaw_m": [gripper.jaw_min_m, gripper.jaw_max_m] if gripper.has_jaw else None,
         },
-        "reference": {
-            "id": config.reference.reference_id,
-            "translation_m": list(config.reference.cam_T_grip.translation_m),
-            "rotation_xyzw": list(config.reference.cam_T_grip.rotation_xyzw),
-            "distance_m": float(np.linalg.norm(cam_T_grip[:3, 3])),
-            "turn_rad": rotation_angle(cam_T_grip[:3, :3]),
-            "metres_per_px": depth_m / camera.fx_px,
-        },
+        "reference": _reference_values(config),
         "jaw": {"source": settings.jaw.source, "opening_m": config.jaw_opening_m},
-        "corners": corners,
+        "corners": _corner_values(gripper.corner_ids, view),
         "edges": [
             {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
         ],
         "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         "recording": settings.recording.directory if settings.recording.enabled else None,
     }
+
+
+def _camera_values(config: Config) -> dict[str, Any]:
+    camera = config.camera
+    return {
+        "model": type(config.settings.camera).__struct_config__.tag,
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "fx_px": camera.fx_px,
+        "fy_px": camera.fy_px,
+        "field_of_view_rad": [
+            2.0 * math.atan(0.5 * camera.width_px / camera.fx_px),
+            2.0 * math.atan(0.5 * camera.height_px / camera.fy_px),
+        ],
+    }
+
+
+def _reference_values(config: Config) -> dict[str, Any]:
+    import numpy as np
+
+    from gripmon.geometry import rotation_angle
+
+    reference, cam_T_grip = config.reference, config.cam_T_grip
+    return {
+        "id": reference.reference_id,
+        "translation_m": list(reference.cam_T_grip.translation_m),
+        "rotation_xyzw": list(reference.cam_T_grip.rotation_xyzw),
+        "distance_m": float(np.linalg.norm(cam_T_grip[:3, 3])),
+        "turn_rad": rotation_angle(cam_T_grip[:3, :3]),
+        "metres_per_px": float(cam_T_grip[2, 3]) / config.camera.fx_px,
+    }
+
+
+def _corner_values(names: tuple[str, ...], view: View) -> list[dict[str, Any]]:
+    import numpy as np
+
+    return [
+        {
+            "id": name,
+            "uv_px": uv.round(2).tolist() if np.isfinite(uv).all() else None,
+            "distance_m": round(float(np.linalg.norm(point)), 6),
+            "visible": bool(visible),
+            "reason": None if visible else "outside" if not inside else "self_hidden",
+        }
+        for name, uv, point, visible, inside in zip(
+            names, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
+        )
+    ]
 
 
 def _source_report(config: Config) -> dict[str, Any]:

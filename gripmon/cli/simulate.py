@@ -29,7 +29,6 @@ _EXAMPLES = """\
   gripmon replay bump/ --config bump/config.yaml --out bump.jsonl"""
 
 
-
 def add_parser(commands: Any) -> None:
     """Add the subcommand."""
     parser = common.add_command(
