@@ -31,6 +31,7 @@ from gripmon.records import (
 )
 
 START_NS = 1_700_000_000_123_456_789
+OVERLAY = "rig/camera/image"
 INTERVAL_NS = 16_666_667
 WIDTH_PX, HEIGHT_PX = 320, 240
 CAMERA = make_camera(

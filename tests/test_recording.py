@@ -15,6 +15,7 @@ from recorded import (
     GRIPPER,
     HEIGHT_PX,
     INTERVAL_NS,
+    OVERLAY,
     REFERENCE,
     START_NS,
     WIDTH_PX,
@@ -36,7 +37,6 @@ from gripmon.records import (
     AlertRecord,
     Cause,
     FrameRecord,
-    MeasurementTrace,
     Severity,
     State,
     Verdict,
@@ -44,7 +44,6 @@ from gripmon.records import (
 
 COUNT = 24
 JUMP = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
-OVERLAY = "rig/camera/image"
 
 
 def story(i: int) -> FrameRecord:
@@ -317,51 +316,6 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
     (path,) = tmp_path.iterdir()
     stamps = {cell.stamp_ns for cells in Recorded(path).cells.values() for cell in cells if cell.stamp_ns is not None}
     assert stamps == {START_NS + i * INTERVAL_NS for i in range(3)}
-
-
-def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
-    writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), lambda: None)
-    writer.close(10.0)
-    (path,) = tmp_path.iterdir()
-    told = Recorded(path)
-    (cell,) = told.timed(OVERLAY)
-    assert cell.values["media_type"] == ["image/jpeg"]
-    difference = decoded(cell.values["blob"]).astype(float) - image(0)
-    assert np.abs(difference).max() < 12.0
-
-
-@pytest.mark.parametrize(
-    "picture",
-    [
-        np.zeros((3, 4, 5, 6), np.uint8),
-        np.zeros((0, 4), np.uint8),
-        np.zeros((HEIGHT_PX, WIDTH_PX, 7), np.uint8),
-        np.zeros((10 * HEIGHT_PX, 10 * WIDTH_PX), np.float32),
-        np.array(["no", "image"], dtype=object),
-    ],
-)
-def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.ndarray) -> None:
-    refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image")
-    writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0), partial(trace, 0))
-    writer.offer(frame(1, picture), refused, lambda: None)
-    writer.close(10.0)
-    (path,) = tmp_path.iterdir()
-    told = Recorded(path)
-    assert (told.seqs(), set(told.by_seq(OVERLAY, "blob"))) == ([0, 1], {0})
-    overlay = told.by_seq(f"{OVERLAY}/edges/used", "positions")
-    assert overlay[0] != [] and overlay[1] == []
-
-
-def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
-    none = np.empty((0, 2))
-    empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), (), np.full((8, 2), np.nan))
-    writer = recorder(tmp_path)
-    writer.offer(frame(0), record(0, corners=()), lambda: empty)
-    writer.close(10.0)
-    (path,) = tmp_path.iterdir()
-    assert Recorded(path).by_seq("quality/edge_points", "scalars") == {0: [0.0, 0.0]}
 
 
 def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:

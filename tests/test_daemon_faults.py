@@ -1,0 +1,138 @@
+"""The loop with stand-ins at its four seams: what it survives, and what a fault costs."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+from daemon_bench import Bench
+from stand_ins import Listener, ScriptedMonitor
+
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Cause,
+    Origin,
+    Severity,
+    State,
+    Verdict,
+)
+
+
+def test_one_failing_frame_is_survived_and_said(caplog: pytest.LogCaptureFixture):
+    bench = Bench(range(4), ScriptedMonitor(lambda seq: ValueError("singular\nmatrix") if seq == 1 else {}))
+    with caplog.at_level(logging.INFO, "gripmon"):
+        assert bench.run() == 0
+    assert [record.seq for record in bench.network.transforms] == [0, 1, 2, 3]
+    broken = bench.network.transforms[1]
+    assert (broken.verdict, broken.source, broken.cam_T_grip) == (Verdict.UNKNOWN, Origin.HELD, None)
+    assert broken.reason == "internal error: ValueError: singular matrix"
+    assert bench.alerts == [(AlertKind.LOST, Cause.UNKNOWN)]
+    assert (State.LOST, "internal error: ValueError: singular matrix") in bench.states
+    assert bench.states[-2:] == [(State.TRACKING, ""), (State.STALE, "stopped")]
+    errors = [entry for entry in caplog.records if entry.levelno >= logging.ERROR]
+    assert [entry.getMessage() for entry in errors if "frame 1" in entry.getMessage()] == [
+        "frame 1: internal error: ValueError: singular matrix"
+    ]
+    assert not any(entry.exc_info for entry in errors)
+
+
+def test_errors_that_persist_end_the_daemon_with_code_3():
+    bench = Bench(
+        range(100), ScriptedMonitor(lambda seq: RuntimeError("broken") if seq >= 10 else {}), give_up_after_errors=5
+    )
+    assert bench.run() == 3
+    assert [record.seq for record in bench.network.transforms] == list(range(15))
+    assert bench.alerts == [(AlertKind.LOST, Cause.UNKNOWN)]
+    assert (bench.source.closed, bench.network.closed, bench.recording.closed) == (1, 1, 1)
+
+
+def test_errors_that_come_and_go_do_not_add_up():
+    bench = Bench(
+        range(40), ScriptedMonitor(lambda seq: RuntimeError("broken") if seq % 2 else {}), give_up_after_errors=2
+    )
+    assert bench.run() == 0
+
+
+@pytest.mark.parametrize("fails", ["transform", "offer", "everything"])
+def test_a_broken_output_is_survived_for_a_while(fails: str):
+    bench = Bench(range(100), give_up_after_errors=5)
+    bench.network, bench.recording = Listener(fails=fails), Listener(fails=fails)
+    assert bench.run() == 3
+    assert len(bench.monitor.frames) == 5
+
+
+def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
+    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)}))
+    bench.network = Listener(fails="transform")
+    assert bench.run(estimates=tmp_path / "estimates.jsonl") == 0
+    assert [frame.seq for frame, _ in bench.recording.offered] == [0, 1, 2]
+    assert len((tmp_path / "estimates.jsonl").read_bytes().splitlines()) == 3
+    assert [said.kind for said in bench.network.alerts] == [AlertKind.JUMP] * 3
+    assert bench.network.states[-1].frames == 3
+    assert bench.states[1] == (State.TRACKING, "transform not delivered: OSError: the line is cut")
+    assert State.LOST not in [state for state, _ in bench.states]
+
+
+def test_a_broken_recorder_costs_the_network_nothing_and_its_end_is_said(caplog: pytest.LogCaptureFixture):
+    bench = Bench([0, 1, lambda _: setattr(bench.recording, "fails", ""), 2])
+    bench.recording = Listener(fails="offer")
+    with caplog.at_level(logging.ERROR, "gripmon"):
+        assert bench.run() == 0
+    assert [record.seq for record in bench.network.transforms] == [0, 1, 2]
+    assert [frame.seq for frame, _ in bench.recording.offered] == [2]
+    fault = "recording not delivered: OSError: the line is cut"
+    assert bench.states[1:3] == [(State.TRACKING, fault), (State.TRACKING, "")]
+    assert caplog.messages == [fault]
+
+
+def test_a_monitor_that_fails_is_alerted_though_the_network_failed_before():
+    bench = Bench(
+        [0, lambda _: setattr(bench.network, "fails", ""), 1],
+        ScriptedMonitor(lambda seq: ValueError("singular") if seq == 1 else {}),
+    )
+    bench.network = Listener(fails="everything")
+    bench.run()
+    assert bench.alerts == [(AlertKind.LOST, Cause.UNKNOWN)]
+    assert [reference.revision for reference in bench.network.references] == [3]  # sent again when it could be
+
+
+def test_a_source_that_breaks_ends_the_daemon_with_code_3():
+    bench = Bench([0, 1, RuntimeError("driver crashed"), 2])
+    assert bench.run() == 3
+    assert len(bench.network.transforms) == 2
+    assert bench.alerts == [(AlertKind.SOURCE, Cause.NO_CAMERA)]
+    assert bench.network.alerts[0].text == "the source failed: RuntimeError: driver crashed"
+    assert bench.source.closed == 1
+
+
+def test_a_recording_that_fails_is_said():
+    bench = Bench([0])
+    bench.recording.failure = "disk full"
+    bench.run()
+    assert bench.states[1] == (State.TRACKING, "disk full")
+
+
+def test_everything_is_closed_even_if_closing_fails():
+    bench = Bench([0])
+    bench.recording = Listener(closing_fails=True)
+    with pytest.raises(RuntimeError, match="can't close"):
+        bench.run()
+    assert (bench.source.closed, bench.network.closed, bench.recording.closed) == (1, 1, 1)
+
+
+def test_everything_is_closed_when_the_estimates_can_not_be_opened(tmp_path: Path):
+    bench = Bench([0])
+    with pytest.raises(FileNotFoundError):
+        bench.run(estimates=tmp_path / "missing" / "estimates.jsonl")
+    assert (bench.source.closed, bench.network.closed, bench.recording.closed) == (1, 1, 1)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs the device that is always full")
+def test_a_full_disk_stops_the_estimates_and_nothing_else():
+    bench = Bench(range(200), state_period_s=1e-9)
+    assert bench.run(estimates=Path("/dev/full")) == 0
+    assert len(bench.network.transforms) == 200
+    assert bench.states[-2] == (State.TRACKING, "/dev/full can't be written: No space left on device")

@@ -1,0 +1,70 @@
+"""The judgement beside the monitor, as tables: what happens (and when, in seconds) -> the alerts."""
+
+from __future__ import annotations
+
+import pytest
+from loopback import frame_record
+from stand_ins import REFUSED
+
+from gripmon.daemon import DaemonSettings
+from gripmon.daemon.watch import Watch
+from gripmon.records import (
+    State,
+)
+
+GOOD, BAD, NONE = "good", "bad", "none"
+SETTINGS = DaemonSettings(stale_after_s=0.5, no_camera_alert_after_s=3.0)
+
+
+@pytest.mark.parametrize(
+    ("events", "alerts", "state"),
+    [
+        ([(0.1, GOOD), (0.2, GOOD)], [], State.TRACKING),
+        ([(0.1, GOOD), (0.59, NONE)], [], State.TRACKING),
+        ([(0.1, GOOD), (0.61, NONE)], [], State.STALE),
+        ([(0.6, NONE)], [], State.STALE),
+        ([(0.6, NONE), (2.9, NONE)], [], State.STALE),
+        ([(2.0, NONE), (3.0, NONE), (9.0, NONE)], [(3.0, "source")], State.STALE),
+        ([(3.0, NONE), (5.0, GOOD), (5.1, GOOD)], [(3.0, "source"), (5.0, "recovered")], State.TRACKING),
+        ([(1.0, NONE), (1.5, GOOD)], [], State.TRACKING),
+        ([(3.0, NONE), (4.0, GOOD), (7.1, NONE)], [(3.0, "source"), (4.0, "recovered"), (7.1, "source")], State.STALE),
+        ([(1.0, BAD), (4.0, NONE), (4.1, BAD)], [(4.0, "source"), (4.1, "recovered")], State.TRACKING),
+        ([(1.0, BAD), (2.9, BAD), (9.0, BAD)], [], State.TRACKING),
+    ],
+)  # fmt: skip
+def test_what_the_watch_says(events: list[tuple[float, object]], alerts: list[tuple[float, str]], state: State):
+    watch = Watch(SETTINGS, now_s=0.0)
+    said: list[tuple[float, str]] = []
+    for now_s, event in events:
+        if event == NONE:
+            due = watch.no_frame("unplugged", now_s)
+        else:
+            due = watch.frame(frame_record(**({} if event == GOOD else REFUSED)), now_s)
+        said += [(now_s, alert.kind.value) for alert in due]
+    assert said == alerts
+    assert watch.state is state
+
+
+def test_a_refusal_is_said_once_though_its_figures_change():
+    watch = Watch(SETTINGS, now_s=0.0)
+    messages = []
+    for reason in ("black: at most 1 %", "black: at most 2 %", "white: at least 99 %", "white: at least 98 %"):
+        watch.frame(frame_record(**(REFUSED | {"reason": reason})), now_s=1.0)
+        messages.append(watch.message)
+    assert messages == ["frames refused: black: at most 1 %"] * 2 + ["frames refused: white: at least 99 %"] * 2
+    assert watch.frames_refused == 4
+    watch.frame(frame_record(reason="too few edges agree"), now_s=1.0)
+    assert watch.message == "too few edges agree"
+    watch.frame(frame_record(), now_s=1.0)
+    assert watch.message == ""
+
+
+def test_the_rate_is_that_of_the_last_frames():
+    watch = Watch(SETTINGS, now_s=0.0)
+    for i in range(200):
+        watch.frame(frame_record(i), now_s=10.0 + i / (30.0 if i < 100 else 50.0))
+    assert watch.frames_per_s(10.0 + 199 / 50.0) == pytest.approx(50.0)
+    assert watch.frames_per_s(10.0 + 199 / 50.0 + 0.6) == 0.0
+    watch.frame(frame_record(200), now_s=30.0)
+    watch.frame(frame_record(201), now_s=30.1)
+    assert watch.frames_per_s(30.1) == pytest.approx(10.0)
