@@ -225,11 +225,15 @@ class Monitor:
         jumped = looked_far and self._meter.moved_px(measurement, before_T) > self._settings.corners.sampling.reach_px
         cause = self._cause(measurement) if jumped or self._policy.wants_cause else Cause.UNKNOWN
         sigma = np.sqrt(self._covariance.diagonal())
-        astray = self._finger_astray(measurement)
+        astray = self._gripper_astray(measurement)
         return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause, astray)
 
-    def _finger_astray(self, measurement: Measurement) -> bool:
-        """Whether one finger is where the transform says and another, though sampled, is not: hidden, or bent."""
+    def _gripper_astray(self, measurement: Measurement) -> bool:
+        """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled,
+        is not (hidden, or bent), or the seen jaw opening is not the reported one.
+        """
+        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+            return True
         shares = agreeing_fingers(measurement, self._gripper)
         return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
 

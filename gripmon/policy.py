@@ -94,8 +94,8 @@ GRIPPER_CAUSES = (Cause.FINGER_BENT, Cause.JAW_OPENING)
 @dataclass(frozen=True, slots=True)
 class Evidence:
     """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
-    motion ``d_m`` and ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, and what
-    would explain a drift.
+    motion ``d_m`` and ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, what
+    would explain a drift, and whether the gripper contradicts its model (a finger or the jaw is not where it should be).
     """
 
     shift: Array
@@ -104,7 +104,7 @@ class Evidence:
     delta_rad: float
     jumped: bool
     cause: Cause
-    finger_astray: bool = False
+    gripper_astray: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +237,7 @@ class Policy:
         if not drifting:
             self._drift_cause = Cause.UNKNOWN
         self.state = state
-        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m and not evidence.finger_astray
+        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m and not evidence.gripper_astray
         # The gripper is not what its model says: the transform follows the finger or the jaw, not the camera.
         sure = sure and self._drift_cause not in GRIPPER_CAUSES
         return Judgement(state, Verdict.VALID if confirmed and sure else Verdict.SUSPECT, tuple(alerts), recalibrate)

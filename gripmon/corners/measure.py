@@ -52,6 +52,9 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
+FOUND = 0.75
+"""The same for a place where the gripper was looked for."""
+
 SETTLED_STARTS = 3
 """Starts of a wide search that are followed to the end."""
 
@@ -208,8 +211,10 @@ class FingertipMeter:
 
     def _trusted(self, measurement: Measurement, usual_share: float) -> bool:
         consensus = self._settings.consensus
-        needed = consensus.trusted_share if measurement.effort is Effort.NARROW else consensus.found_share
-        return measurement.consensus.share >= max(needed, TRUSTED * usual_share)
+        if measurement.effort is Effort.NARROW:
+            return measurement.consensus.share >= max(consensus.trusted_share, TRUSTED * usual_share)
+        # Half hidden, a gripper looks like itself slid along its fingers: elsewhere it must show nearly as usual.
+        return measurement.consensus.share >= max(consensus.found_share, FOUND * usual_share)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
