@@ -229,8 +229,8 @@ class Monitor:
         return Evidence(shift, sigma, drift.translation_m, drift.rotation_rad, jumped, cause, astray)
 
     def _gripper_astray(self, measurement: Measurement) -> bool:
-        """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled,
-        is not (hidden, or bent), or the seen jaw opening is not the reported one.
+        """Whether the gripper contradicts its model: one finger is where the transform says and another, though
+        sampled, is not (hidden, or bent), or the seen jaw opening is not the reported one.
         """
         if abs(measurement.jaw_surprise) > JAW_SURPRISE:
             return True

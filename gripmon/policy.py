@@ -95,7 +95,8 @@ GRIPPER_CAUSES = (Cause.FINGER_BENT, Cause.JAW_OPENING)
 class Evidence:
     """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
     motion ``d_m`` and ``delta_rad`` of equation (14), whether the pose jumped against the previous frame, what
-    would explain a drift, and whether the gripper contradicts its model (a finger or the jaw is not where it should be).
+    would explain a drift, and whether the gripper contradicts its model (a finger or the jaw is not where it should
+    be).
     """
 
     shift: Array

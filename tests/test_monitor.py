@@ -201,7 +201,7 @@ def test_a_start_from_a_wrong_calibration_ends_at_the_right_one():
         "bump",
         "hand",
         pytest.param("lighting", marks=pytest.mark.xfail(reason="over-exposure and shadows move edges")),
-        pytest.param("bent_finger", marks=pytest.mark.xfail(reason="the pose follows the bent finger")),
+        "bent_finger",
     ],
 )
 def test_what_is_called_valid_is_near_the_truth(scene: str):

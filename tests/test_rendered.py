@@ -19,6 +19,9 @@ from gripmon.cli import main
 ROOT = Path(__file__).resolve().parent.parent
 SEQUENCES = ROOT.parent / "shared" / "data" / "rendered"
 TOOL = ROOT / "tools" / "rendered_config"
+HELD = {"bump_y": 2}
+"""Frames in which the last transform is held: right after a jump the gripper must show nearly whole."""
+
 LIE_M = 2e-4  # no frame may be valid and further from the truth than this
 
 # 95 % of the frames: error of the TCP's position across and along the optical axis, m; a third above what was measured.
@@ -85,7 +88,9 @@ def test_every_sequence_is_tested():
 @pytest.mark.parametrize("name", BOUNDS_M)
 def test_the_tcp_is_where_the_truth_says(replayed: dict[str, Lines], name: str):
     errors_m = tcp_errors_m(replayed[name], truth(name))
-    assert all(line["source"] == "update" for line in replayed[name])
+    held = [line["source"] == "held" for line in replayed[name]]
+    assert sum(held) <= HELD.get(name, 0)
+    errors_m = errors_m[~np.array(held)]
     across_m, along_m = np.hypot(errors_m[:, 0], errors_m[:, 1]), np.abs(errors_m[:, 2])
     assert np.percentile(across_m, 95.0) < BOUNDS_M[name][0]
     assert np.percentile(along_m, 95.0) < BOUNDS_M[name][1]
@@ -93,11 +98,12 @@ def test_the_tcp_is_where_the_truth_says(replayed: dict[str, Lines], name: str):
 
 @pytest.mark.parametrize("name", [*BOUNDS_M, "clean"])
 def test_no_valid_transform_is_far_from_the_truth(replayed: dict[str, Lines], name: str):
-    """Neither a valid one, nor any other: these sequences hide little."""
+    """Neither a valid one, nor any other that was measured: these sequences hide little."""
     distances_m = np.linalg.norm(tcp_errors_m(replayed[name], truth(name)), axis=1)
     valid = np.array([line["verdict"] == "valid" for line in replayed[name]])
     assert not (distances_m[valid] > LIE_M).any()
-    assert np.nanmax(distances_m) < LIE_M
+    measured = np.array([line["source"] != "held" for line in replayed[name]])
+    assert np.nanmax(distances_m[measured]) < LIE_M
 
 
 def test_ground_truth_and_conventions_agree(replayed: dict[str, Lines]):
@@ -116,17 +122,21 @@ def test_ground_truth_and_conventions_agree(replayed: dict[str, Lines]):
 
 
 def test_the_bump_is_found_when_it_happens(replayed: dict[str, Lines]):
-    """4.5 mm along camera y at frame 45: nothing before, a jump then, a drift of the true size soon after."""
+    """4.5 mm along camera y at frame 45: nothing before, the old transform held and suspect then, a jump and a drift of
+    the true size soon after.
+    """
     lines, frames = replayed["bump_y"], truth("bump_y")
     alerts = [(line["seq"], alert["kind"], alert["cause"]) for line in lines for alert in line["alerts"]]
-    assert alerts[0] == (45, "jump", "camera_mount_moved")
+    assert alerts[0][:2] == (45, "occluded")
+    [(found, _, cause)] = [alert for alert in alerts if alert[1] == "jump"]
+    assert 45 <= found <= 47 and cause == "camera_mount_moved"
     assert [kind for _, kind, _ in alerts].count("jump") == 1
     drifts = [seq for seq, kind, _ in alerts if kind == "drift"]
-    assert len(drifts) == 1 and 45 <= drifts[0] <= 50
-    assert lines[45]["verdict"] == "suspect"
-    assert all(line["verdict"] == "valid" for line in lines[1:45] + lines[47:])
+    assert len(drifts) == 1 and 45 <= drifts[0] <= 52
+    assert all(line["verdict"] == "suspect" for line in lines[45 : found + 1])
+    assert all(line["verdict"] == "valid" for line in lines[1:45] + lines[found + 1 :])
     for line, frame in zip(lines, frames, strict=True):
-        if line["revision"] == lines[0]["revision"]:
+        if line["revision"] == lines[0]["revision"] and line["source"] != "held":
             true_shift_m = 1e-3 * np.array(frame["tcp_shift_mm"])
             assert np.abs(line["drift"]["tcp_shift_m"] - true_shift_m).max() < 1e-4
     assert np.linalg.norm(lines[-1]["drift"]["tcp_shift_m"]) > 4e-3

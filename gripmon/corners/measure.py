@@ -52,8 +52,8 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about a jaw opening that nobody reports, m: it changes by this much between frames at most."""
 
 
-FOUND = 0.75
-"""The same for a place where the gripper was looked for."""
+FOUND_EDGES = 0.85
+"""Part of the sampled edges that must be seen where the gripper was looked for."""
 
 SETTLED_STARTS = 3
 """Starts of a wide search that are followed to the end."""
@@ -213,8 +213,10 @@ class FingertipMeter:
         consensus = self._settings.consensus
         if measurement.effort is Effort.NARROW:
             return measurement.consensus.share >= max(consensus.trusted_share, TRUSTED * usual_share)
-        # Half hidden, a gripper looks like itself slid along its fingers: elsewhere it must show nearly as usual.
-        return measurement.consensus.share >= max(consensus.found_share, FOUND * usual_share)
+        # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
+        seen = measurement.consensus.edge_seen[measurement.prediction.layout.edges]
+        enough = np.count_nonzero(seen) >= FOUND_EDGES * len(seen)
+        return enough and measurement.consensus.share >= max(consensus.found_share, TRUSTED * usual_share)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
