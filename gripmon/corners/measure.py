@@ -216,7 +216,7 @@ class FingertipMeter:
         # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
         seen = measurement.consensus.edge_seen[measurement.prediction.layout.edges]
         enough = np.count_nonzero(seen) >= FOUND_EDGES * len(seen)
-        return enough and measurement.consensus.share >= max(consensus.found_share, TRUSTED * usual_share)
+        return bool(enough) and measurement.consensus.share >= max(consensus.found_share, TRUSTED * usual_share)
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
