@@ -50,6 +50,7 @@ from gripmon.records import (
     ReferenceRecord,
     Smoothed,
     Verdict,
+    unmeasured_record,
 )
 from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
 
@@ -294,38 +295,24 @@ class Monitor:
         """The last transform held with a covariance that grows, or none when it is too old."""
         judgement = self._policy.unmeasured(self._now_s, refusal, self._measured_s)
         corners = tuple(CornerRecord(name, None, None, False, fault) for name in self._gripper.corner_ids)
+        blank = unmeasured_record(
+            frame,
+            self._reference,
+            reason,
+            verdict=judgement.verdict,
+            state=judgement.state,
+            corners=corners,
+            alerts=judgement.alerts,
+        )
         if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
-            return self._blank(frame, judgement, corners, reason)
+            return blank
         growth = np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
         return msgspec.structs.replace(
-            self._blank(frame, judgement, corners, reason),
+            blank,
             cam_T_grip=to_record(self._cam_T_grip),
             covariance=_flat(self._covariance + growth),
             smoothed=self._smoothed(growth),
             drift=self._drift(),
-        )
-
-    def _blank(
-        self, frame: Frame, judgement: Judgement, corners: tuple[CornerRecord, ...], reason: str | None
-    ) -> FrameRecord:
-        return FrameRecord(
-            seq=frame.seq,
-            stamp_ns=frame.stamp_ns,
-            verdict=judgement.verdict,
-            state=judgement.state,
-            source=Origin.HELD,
-            cam_T_grip=None,
-            covariance=None,
-            smoothed=None,
-            drift=None,
-            reference_id=self._reference.reference_id,
-            revision=self._reference.revision,
-            rms_px=None,
-            jaw_opening_m=None,
-            corners=corners,
-            alerts=judgement.alerts,
-            reason=reason,
-            name=frame.name,
         )
 
     def _record(

@@ -224,7 +224,7 @@ def unmeasured_record(
         reference_id=reference.reference_id,
         revision=reference.revision,
         rms_px=None,
-        jaw_opening_m=frame.jaw_opening_m,
+        jaw_opening_m=None,
         corners=corners,
         alerts=alerts,
         reason=reason,
