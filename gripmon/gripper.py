@@ -129,6 +129,7 @@ class Gripper:
         self._check_places()
         self.corner_points = np.flatnonzero([p.corner for p in model.points.values()])
         self.corner_ids = tuple(self.point_ids[i] for i in self.corner_points)
+        self._corners_outwards = self._from_the_tcp_outwards()
         self.edge_points = np.array([self._ends(n, e) for n, e in model.edges.items()], dtype=np.intp).reshape(-1, 2)
         self.edge_finger = self.point_finger[self.edge_points[:, 0]]
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
@@ -186,6 +187,37 @@ class Gripper:
     def edges_at_corner(self, corner: int) -> NDArray[np.intp]:
         """Indices of the edges that end in a corner (index into ``corner_ids``)."""
         return np.flatnonzero((self.edge_points == self.corner_points[corner]).any(axis=1))
+
+    def innermost_corners(self, among: NDArray[np.bool_], count: int | None) -> NDArray[np.bool_]:
+        """(c,) at most ``count`` (None: all) of the corners ``among`` (c,): the nearest to the TCP, fingers taking
+        turns.
+
+        On two fingertips with the inner corners ``among`` them, 4 is the paper's rectangle about the TCP, 5 adds an
+        outer corner, 3 leaves out one of the rectangle.  A finger of which none is ``among`` them is passed over; where
+        those taken would lie on a line, the last one gives way to the next one that doesn't.
+        """
+        if count is None:
+            return among
+        outwards = self._corners_outwards[among[self._corners_outwards]]
+        finger = self.point_finger[self.corner_points[outwards]]
+        # How many corners of the same finger lie further inside: the turn in which this one comes.
+        turn = np.array([np.count_nonzero(finger[:i] == finger[i]) for i in range(len(finger))], dtype=np.intp)
+        order = outwards[np.argsort(turn, kind="stable")]
+        taken = order[:count]
+        for instead in order[count:]:
+            if not _on_a_line(self._nominal_points_m[self.corner_points[taken]]):
+                break
+            taken = np.append(order[: count - 1], instead)
+        chosen = np.zeros(len(self.corner_points), dtype=bool)
+        chosen[taken] = True
+        return chosen
+
+    def _from_the_tcp_outwards(self) -> NDArray[np.intp]:
+        """(c,) indices of the corners by distance from the TCP at the nominal opening, so that the order doesn't change
+        while jaws move; equally far ones (to a tenth of a millimetre) as the file has them.
+        """
+        distance_m = np.linalg.norm(self._nominal_points_m[self.corner_points], axis=1)
+        return np.argsort(np.round(distance_m, 4), kind="stable")
 
     def _ends(self, name: str, edge: EdgeModel) -> tuple[int, int]:
         for key, point in (("from", edge.start), ("to", edge.end)):
@@ -304,8 +336,7 @@ class Gripper:
             raise GripperError(
                 f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line"
             )
-        spread = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
-        if spread[1] < SMALLEST_SPREAD_RATIO * spread[0]:
+        if _on_a_line(corners):
             raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
         if len(self.edge_ids) < 3:
             raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
@@ -323,6 +354,12 @@ def _normal(loop: Array) -> Array:
     """Outward normal (3,) of a planar loop (Newell), not normalised."""
     following = np.roll(loop, -1, axis=0)
     return np.cross(loop, following).sum(axis=0)
+
+
+def _on_a_line(points_m: Array) -> bool:
+    """Whether points (n, 3) lie on a line, or nearly so."""
+    spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
+    return bool(spread[1] < SMALLEST_SPREAD_RATIO * spread[0])
 
 
 def _interpolate(table: Array, opening_m: float) -> Array:

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.corners import (
@@ -63,6 +64,9 @@ USUAL_RATES = (0.02, 0.1)
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.25
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
 
+CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
+"""Most corners that a variant takes; named as in the paper."""
+
 JAW_SURPRISE = 5.0
 """Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
 
@@ -74,6 +78,18 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Literal["edges", "corners"],
         Meta(description="what the update rests on: all agreed edge points, or the corners of equation (17)"),
     ] = "edges"
+    update_corners: Annotated[
+        Literal["all", "3P", "4P", "5P"],
+        Meta(
+            description="with measurement: corners, which ones: all that are usable, or so many of them next to the TCP"
+        ),
+    ] = "all"
+    recalibrate_corners: Annotated[
+        Literal["all", "4P", "5P"],
+        Meta(
+            description="which corners a recalibration takes: all that are usable, or so many of them next to the TCP"
+        ),
+    ] = "all"
     jaw_sigma_m: Annotated[
         float, Meta(ge=0.0, le=0.05, description="standard deviation of the reported jaw opening (m)")
     ] = 5e-5
@@ -193,8 +209,8 @@ class Monitor:
         (17).
         """
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
-        usable = measurement.corners.usable
-        if self._settings.measurement == "corners" and np.count_nonzero(usable) >= 3:
+        taken = self._taken(measurement, self._settings.update_corners)
+        if self._settings.measurement == "corners" and np.count_nonzero(taken) >= 3:
             try:
                 update = self._corner_update(measurement, measurement.jaw_opening_m)
                 cam_T_grip = perturb(measurement.prediction.cam_T_grip, update.xi)
@@ -209,14 +225,18 @@ class Monitor:
         return cam_T_grip, covariance + self._floor
 
     def _corner_update(self, measurement: Measurement, jaw_opening_m: float) -> Update:
-        """Equation (17) on the usable corners, with the jaw at an opening."""
-        usable = measurement.corners.usable
+        """Equation (17) on the corners that the settings take, with the jaw at an opening."""
+        taken = self._taken(measurement, self._settings.update_corners)
         return differential_update(
-            measurement.corners_at(jaw_opening_m)[usable],
-            measurement.corners.xy[usable],
-            measurement.inflation * measurement.corners.covariance_xy[usable],
+            measurement.corners_at(jaw_opening_m)[taken],
+            measurement.corners.xy[taken],
+            measurement.inflation * measurement.corners.covariance_xy[taken],
             measurement.prediction.cam_T_grip[:3, 3],
         )
+
+    def _taken(self, measurement: Measurement, variant: str) -> NDArray[np.bool_]:
+        """(c,) the usable corners that a variant takes."""
+        return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[variant])
 
     def _evidence(self, measurement: Measurement, before_T: Array, drift: Drift) -> Evidence:
         assert self._covariance is not None
@@ -260,12 +280,12 @@ class Monitor:
         Returns what there is to say of it.  With too few corners, or corners that contradict the edges, the reference
         stays, and a later frame may try again.
         """
-        usable = measurement.corners.usable
+        taken = self._taken(measurement, self._settings.recalibrate_corners)
         points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
         covariance_xy = measurement.inflation * measurement.corners.covariance_xy
         try:
             pnp = recalibrate(
-                points_grip_m[usable], measurement.corners.xy[usable], covariance_xy[usable], self._cam_T_grip
+                points_grip_m[taken], measurement.corners.xy[taken], covariance_xy[taken], self._cam_T_grip
             )
         except RecalibrationRefused as refusal:
             return self._policy.not_recalibrated(str(refusal))
@@ -279,7 +299,7 @@ class Monitor:
         self._set_reference(new_T, new_covariance + self._floor, stamp_ns, "recalibration")
         return self._policy.recalibrated(
             f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} "
-            f"degrees; it was calibrated anew from {np.count_nonzero(usable)} corners: "
+            f"degrees; it was calibrated anew from {np.count_nonzero(taken)} corners: "
             f"revision {self._reference.revision}"
         )
 
@@ -339,7 +359,9 @@ class Monitor:
             revision=self._reference.revision,
             rms_px=measurement.corner_rms_px(self._cam_T_grip),
             jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
-            corners=_corner_records(measurement, self._gripper.corner_ids),
+            corners=_corner_records(
+                measurement, self._gripper.corner_ids, self._taken(measurement, self._settings.update_corners)
+            ),
             alerts=alerts,
             name=frame.name,
         )
@@ -356,11 +378,15 @@ def _flat(covariance: Array) -> tuple[float, ...]:
     return tuple(covariance.ravel().tolist())
 
 
-def _corner_records(measurement: Measurement, names: tuple[str, ...]) -> tuple[CornerRecord, ...]:
+def _corner_records(
+    measurement: Measurement, names: tuple[str, ...], taken: NDArray[np.bool_]
+) -> tuple[CornerRecord, ...]:
     corners = measurement.corners
     return tuple(
-        CornerRecord(name, (u, v), sigma, True) if fault is None else CornerRecord(name, None, None, False, fault)
-        for name, (u, v), sigma, fault in zip(
-            names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, strict=True
+        CornerRecord(name, None, None, False, fault)
+        if fault is not None
+        else CornerRecord(name, (u, v), sigma, used, None if used else CornerFault.LEFT_OUT)
+        for name, (u, v), sigma, fault, used in zip(
+            names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, taken.tolist(), strict=True
         )
     )

@@ -74,6 +74,7 @@ class CornerFault(enum.StrEnum):
     HIDDEN = "hidden"
     PARALLEL = "parallel"
     UNCERTAIN = "uncertain"
+    LEFT_OUT = "left_out"
     FRAME_REFUSED = "frame_refused"
     NO_FIT = "no_fit"
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import gripmon
 from gripmon.camera import Camera, make_camera
-from gripmon.config.checks import View, covariance_of, predict_view, reference_transform, view_fault
+from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
 from gripmon.config.errors import ConfigError
 from gripmon.config.settings import JawSettings, Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
@@ -80,7 +80,11 @@ def load_config(path: Path, *, check_source: bool = True) -> Config:
     gripper = _gripper(path, gripper_path)
     reference = _reference(path, settings)
     config = Config(path, settings, camera, gripper, gripper_path, reference)
-    fault = _jaw_fault(settings.jaw, gripper, settings) or view_fault(config.view(), gripper, camera)
+    fault = (
+        monitor_fault(settings.monitor)
+        or _jaw_fault(settings.jaw, gripper, settings)
+        or view_fault(config.view(), gripper, camera)
+    )
     if fault is None and check_source:
         fault = _source_fault(settings, path.parent)
         if isinstance(settings.source, SimulatedSettings) and settings.source.scenario.endswith((".yaml", ".yml")):

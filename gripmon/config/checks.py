@@ -13,6 +13,7 @@ from gripmon.config.settings import ReferenceSettings
 from gripmon.config.typed import Fault
 from gripmon.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.gripper import Gripper
+from gripmon.monitor import MonitorSettings
 from gripmon.records import Array
 
 NEAREST_M = 0.005
@@ -85,6 +86,17 @@ def covariance_of(settings: ReferenceSettings) -> tuple[float, ...] | Fault:
     if np.linalg.eigvalsh(normalised).min() <= 0.0:
         return Fault(key, "is not positive definite", right)
     return settings.covariance
+
+
+def monitor_fault(settings: MonitorSettings) -> Fault | None:
+    """A setting of the monitor that would have no effect."""
+    if settings.measurement != "corners" and settings.update_corners != "all":
+        return Fault(
+            "monitor.update_corners",
+            f"is {settings.update_corners}, but without effect while monitor.measurement is {settings.measurement}",
+            "monitor.measurement: corners, or update_corners: all",
+        )
+    return None
 
 
 def predict_view(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> View:
