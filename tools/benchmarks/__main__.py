@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import latency
+from benchmarks import accuracy, latency
 
-_BENCHMARKS = (latency,)
+_BENCHMARKS = (accuracy, latency)
 
 
 def main() -> int:

@@ -1,0 +1,129 @@
+"""``tools/bench accuracy``: errors, honesty and time of the transform in every condition, one table."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_DESCRIPTION = """\
+Runs the monitor, by edges and by corners, over simulated scenes of every condition (clutter, occlusion, blur, noise,
+light, jaws, bumps …) and over the rendered sequences beside the checkout, if they are there; compares with the truth:
+errors of the TCP in camera x, y, z (µm) and of the rotation, how often the transform is given, valid, and valid but
+wrong, its squared normalised error (NEES, 6 where the covariance is true) and the time a frame takes."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run, and how much of it; None: as each condition says."""
+
+    only: tuple[str, ...] = ()
+    scenes: int | None = None
+    frames: int | None = None
+    seed: int = 1
+    jobs: int = 2
+    peers: bool = True
+
+
+def add_parser(commands: Any) -> None:
+    """Add the benchmark to ``tools/bench``."""
+    parser = commands.add_parser(
+        "accuracy",
+        help="errors, honesty and time of the transform in every condition; against others",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--quick", action="store_true", help="three scenes of each condition")
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="rows whose name starts so")
+    parser.add_argument("--list", action="store_true", help="print the names of all rows and end")
+    parser.add_argument("--scenes", type=_count, metavar="N", help="scenes of each condition")
+    parser.add_argument("--frames", type=_count, metavar="N", help="frames of each scene")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of everything random (default 1)")
+    parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="rows at the same time (default 2)")
+    parser.add_argument("--no-peers", action="store_true", help="only our own monitor")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
+    parser.set_defaults(handler=run)
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value}; at least 1")
+    return value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``tools/bench accuracy``."""
+    from benchmarks import accuracy_table
+    from benchmarks.rows import row_names
+
+    if arguments.list:
+        print("\n".join(row_names()))
+        return 0
+    unknown = [o for o in arguments.only if not any(name.startswith(o) for name in row_names())]
+    if unknown:
+        print(f"accuracy: --only {unknown[0]}: there is no such row; one of {', '.join(row_names())}", file=sys.stderr)
+        return 2
+    plan = Plan(
+        tuple(arguments.only),
+        3 if arguments.quick and arguments.scenes is None else arguments.scenes,
+        arguments.frames,
+        arguments.seed,
+        arguments.jobs,
+        not arguments.no_peers,
+    )
+    results = measure(plan)
+    print(accuracy_table.as_text(results))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
+    return 0
+
+
+def measure(plan: Plan) -> dict[str, Any]:
+    """All rows; plain values."""
+    from benchmarks import machine
+    from benchmarks.rows import row_names
+
+    names = [name for name in row_names() if not plan.only or name.startswith(plan.only)]
+    results: dict[str, Any] = {"machine": machine.description(), "plan": {"seed": plan.seed, "jobs": plan.jobs}}
+    results["rows"] = dict(zip(names, _in_processes(_row, names, plan), strict=True))
+    results["machine"]["load_after"] = machine.load()
+    return results
+
+
+def _in_processes(function: Callable[..., Any], names: list[str], plan: Plan) -> Iterator[Any]:
+    """The function's results by name, in order; new processes, one thread each."""
+    from tqdm import tqdm
+
+    context = multiprocessing.get_context("spawn")
+    jobs = min(plan.jobs, len(names))
+    with (
+        ProcessPoolExecutor(max_workers=jobs, mp_context=context, initializer=_prepare) as pool,
+        tqdm(total=len(names), desc="accuracy", unit="row", file=sys.stderr, disable=None) as bar,
+    ):
+        waiting = [pool.submit(function, name, plan) for name in names]
+        for one in waiting:
+            one.add_done_callback(lambda _: bar.update())
+        yield from [one.result() for one in waiting]
+
+
+def _prepare() -> None:
+    """One thread for everybody, and everything imported and run once before anything is timed."""
+    import cv2
+
+    from benchmarks.rows import warm_up
+
+    cv2.setNumThreads(1)
+    warm_up()
+
+
+def _row(name: str, plan: Plan) -> dict[str, Any]:
+    from benchmarks.rows import measure_row
+
+    return measure_row(name, scenes=plan.scenes, frames=plan.frames, seed=plan.seed, peers=plan.peers)

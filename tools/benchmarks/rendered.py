@@ -1,0 +1,120 @@
+"""Sequences of an independent renderer beside the checkout (``../shared/data/rendered``), as the benchmark takes them.
+
+Each runs twice: as a robot would report its jaws (rounded; the monitor's default sigma), and with the true opening.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from benchmarks.conditions import CLEAN, HARD, Limit
+from benchmarks.machine import ROOT
+from benchmarks.scenes import START_SIGMA_M, START_SIGMA_RAD, Sequence, Shot
+from gripmon.camera import PaperLens, make_camera
+from gripmon.gripper import Gripper, GripperModel
+from gripmon.records import Frame
+
+FOLDER = ROOT.parent / "shared" / "data" / "rendered"
+_PREFIX, _TRUE_JAW = "rendered ", ", true jaw"
+_NAMES = ("clean", "static_background", "grasp_occlusion", "jaw_cycle", "bump_y", "series2")
+LIMITS: dict[str, Limit] = {"clean": CLEAN}
+_JUDGED_FROM = {"bump_y": 50}
+"""Frames from which errors count: the fifth after the jump."""
+
+
+def row_names() -> list[str]:
+    """Two rows a sequence, whether it is there or not."""
+    return [_PREFIX + name + jaw for jaw in ("", _TRUE_JAW) for name in _NAMES]
+
+
+@dataclass(frozen=True)
+class Rendered(Sequence):
+    """A rendered sequence, or one of the unrelated frames of ``clean``."""
+
+    folder: Path
+    frames: tuple[dict[str, Any], ...]
+    repeat: int
+    judged_from: int
+
+    def shots(self) -> Iterator[Shot]:
+        period_ns = round(1e9 / self.fps)
+        index = 0
+        for frame in self.frames:
+            image = cv2.imread(str(self.folder / frame["file"]), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                raise FileNotFoundError(self.folder / frame["file"])
+            for _ in range(self.repeat):
+                jaw_m = frame["jaw_reported"] if self.jaw_sigma_m is None else frame["jaw"]
+                shown = Frame(index, index * period_ns, np.asarray(image, np.uint8), float(jaw_m), frame["file"])
+                judged = index >= self.judged_from
+                yield Shot(shown, np.array(frame["camera_T_gripper"]), float(frame["jaw"]), judged)
+                index += 1
+
+
+def sequences(row: str) -> list[Rendered]:
+    """What belongs to a row; empty where the data is missing.
+
+    The frames of ``clean`` are unrelated: each starts from its truth and is shown twice, since the first frame of all
+    is never valid.
+    """
+    true_jaw = row.endswith(_TRUE_JAW)
+    name = row.removeprefix(_PREFIX).removesuffix(_TRUE_JAW)
+    folder = FOLDER / name
+    if not folder.is_dir():
+        return []
+    camera, gripper, truth = (json.loads((folder / f"{n}.json").read_text()) for n in ("camera", "gripper", "truth"))
+    lens = PaperLens(
+        width_px=camera["width"],
+        height_px=camera["height"],
+        fx_px=float(camera["fx"]),
+        fy_px=float(camera["fy"]),
+        cx_px=float(camera["cx"]),
+        cy_px=float(camera["cy"]),
+        kappa_per_px2=float(camera["k"]),
+    )
+    model = Gripper(msgspec.convert(_converter().gripper_model(gripper), GripperModel))
+    sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
+
+    def part(frames: list[dict[str, Any]], start: Any, repeat: int, judged_from: int) -> Rendered:
+        return Rendered(
+            make_camera(lens),
+            model,
+            np.array(start),
+            np.diag(sigma**2),
+            0.0 if true_jaw else None,
+            float(truth["fps"]),
+            folder,
+            tuple(frames),
+            repeat,
+            judged_from,
+        )
+
+    if name == "clean":
+        return [part([frame], frame["camera_T_gripper"], 2, 1) for frame in truth["frames"]]
+    return [part(truth["frames"], truth["start_camera_T_gripper"], 1, _JUDGED_FROM.get(name, 1))]
+
+
+def limit_um(row: str) -> Limit:
+    return LIMITS.get(row.removeprefix(_PREFIX).removesuffix(_TRUE_JAW), HARD)
+
+
+@cache
+def _converter() -> Any:
+    """``tools/rendered_config``, which has no suffix."""
+    loader = SourceFileLoader("rendered_config", str(ROOT / "tools" / "rendered_config"))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    return module

@@ -1,0 +1,205 @@
+"""Scenes of ``tools/bench accuracy``: a condition's scenario with a drawn gripper, pose, opening, light and background.
+
+Every scene is a pure function of the condition, the seed and the scene's number.
+"""
+
+from __future__ import annotations
+
+import zlib
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+
+from benchmarks.conditions import Condition, Draw, scenario
+from benchmarks.machine import ROOT
+from gripmon.camera import Camera, PaperLens, make_camera
+from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.gripper import Gripper, GripperModel
+from gripmon.records import Array, Frame
+from gripmon.simulator import FrameTruth, Simulator
+from gripmon.simulator.scenario import Background, FingerLook, Sensor
+
+CAMERA = PaperLens(
+    width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
+)
+"""That of the self-viewing paper, and of what was measured with others."""
+
+START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
+"""By how much a scene's reference is wrong, each axis; the monitor is told."""
+WRONG_START_M, WRONG_START_RAD = 10e-3, np.deg2rad(4.0)
+_BORDER_PX = 14.0
+_KINDS = ("blobs", "speckle", "stripes", "printed")
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A frame with its truth; ``judged``: its error counts."""
+
+    frame: Frame
+    cam_T_grip: Array
+    jaw_opening_m: float
+    judged: bool
+
+
+@dataclass(frozen=True)
+class Sequence(ABC):
+    """What a monitor and its peers look at: frames with truth, and what they may know before the first.
+
+    ``jaw_sigma_m`` is what the monitor is told about the reported opening, None for the product's default.
+    """
+
+    camera: Camera
+    gripper: Gripper
+    start_cam_T_grip: Array
+    start_covariance: Array
+    jaw_sigma_m: float | None
+    fps: float
+
+    @abstractmethod
+    def shots(self) -> Iterator[Shot]:
+        """All frames in order."""
+
+
+@dataclass(frozen=True)
+class Scene(Sequence):
+    """One run of a condition."""
+
+    simulator: Simulator
+    judged_s: float
+    frames: int
+
+    def shots(self) -> Iterator[Shot]:
+        """All frames; the first, in which the monitor acquires, is not judged."""
+        for index in range(self.frames):
+            truth = self.simulator.truth(index)
+            judged = index > 0 and truth.time_s >= self.judged_s
+            yield Shot(self.simulator.frame(index), truth.cam_T_grip, truth.jaw_opening_m, judged)
+
+    def truth(self, index: int) -> FrameTruth:
+        return self.simulator.truth(index)
+
+
+def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Scene:
+    """Scene ``number`` of a condition."""
+    rng = np.random.default_rng([seed, zlib.crc32(condition.name.encode()), number])
+    camera = make_camera(CAMERA)
+    models = _models()
+    model = models[number % len(models)]
+    if condition.bevel_m is not None:
+        model = bevelled(model, float(rng.uniform(*condition.bevel_m)))
+    gripper = Gripper(msgspec.convert(model, GripperModel))
+    cam_T_grip, opening_m = _placed(rng, camera, gripper)
+    look = _look(rng)
+    draw = Draw(rng, frames, opening_m, (gripper.jaw_min_m, gripper.jaw_max_m), *look)
+    shown = gripper
+    if condition.missing_finger:
+        shown = Gripper(msgspec.convert(without_finger(model, str(rng.choice(gripper.finger_ids))), GripperModel))
+    simulator = Simulator(camera, shown, cam_T_grip, scenario(condition, draw), seed=int(rng.integers(2**31)))
+    if condition.wrong_start:
+        error, sigma = _wrong(rng), np.array([WRONG_START_M] * 3 + [WRONG_START_RAD] * 3) / np.sqrt(3.0)
+    else:
+        sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
+        error = rng.normal(0.0, sigma)
+    return Scene(
+        camera,
+        gripper,
+        perturb(simulator.truth(0).cam_T_grip, error),
+        np.diag(sigma**2),
+        condition.jaw_sigma_m,
+        simulator.scenario.fps,
+        simulator,
+        condition.judged_s,
+        frames,
+    )
+
+
+def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
+    """A pose about the paper's and an opening at which all of the fingertips are in the image, also 10 mm wider."""
+    for _ in range(1000):
+        turn = exp_rotation(np.deg2rad([rng.uniform(27.0, 37.0), rng.uniform(-4.0, 4.0), rng.uniform(-4.0, 4.0)]))
+        tcp_m = np.array([rng.uniform(-3e-3, 3e-3), rng.uniform(-3e-3, 4e-3), rng.uniform(0.108, 0.128)])
+        cam_T_grip = make_transform(turn, tcp_m)
+        opening_m = gripper.jaw_nominal_m + float(rng.uniform(-8e-3, 6e-3))
+        widest_m = min(opening_m + 0.01, gripper.jaw_max_m)
+        corners = gripper.points_grip_m(widest_m)[gripper.corner_points]
+        uv = camera.project(corners @ turn.T + tcp_m)
+        limit = np.array([camera.width_px, camera.height_px]) - 1.0 - _BORDER_PX
+        if (uv > _BORDER_PX).all() and (uv < limit).all():
+            return cam_T_grip, opening_m
+    raise ValueError(f"gripper {gripper.name} does not fit into the image")
+
+
+def _look(rng: np.random.Generator) -> tuple[Background, FingerLook, Sensor]:
+    """An ordinary scene's background, fingers and sensor."""
+    background = Background(
+        kind=_KINDS[rng.integers(len(_KINDS))],  # type: ignore[arg-type]
+        level_dn=float(rng.uniform(60.0, 180.0)),
+        distance_m=float(rng.uniform(0.08, 0.25)),
+        speed_m_per_s=float(rng.uniform(0.04, 0.1)),
+    )
+    fingers = FingerLook(
+        level_dn=float(rng.uniform(70.0, 150.0)),
+        ambient=float(rng.uniform(0.25, 0.5)),
+        lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
+        texture=float(rng.uniform(0.05, 0.2)),
+    )
+    return background, fingers, Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)))
+
+
+def _wrong(rng: np.random.Generator) -> Array:
+    """Perturbation (6,) of uniform size up to the limits, in any direction."""
+    directions = rng.normal(0.0, 1.0, (2, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return np.concatenate(
+        [rng.uniform(0, WRONG_START_M) * directions[0], rng.uniform(0, WRONG_START_RAD) * directions[1]]
+    )
+
+
+@cache
+def _models() -> tuple[dict[str, Any], ...]:
+    """Models of the grippers that scenes take in turn."""
+    folder = ROOT / "configs" / "grippers"
+    box, arc = (
+        yaml.safe_load((folder / f"{name}.yaml").read_text(encoding="utf-8"))
+        for name in ("two_box_fingers", "adaptive_arc_fingers")
+    )
+    return box, tapered_gripper(box), arc
+
+
+def tapered_gripper(box: dict[str, Any]) -> dict[str, Any]:
+    """Fingers of 7 x 11 mm at the tip and 12 x 18 mm at the root, 34 mm long, sharp; names as in the box fingers."""
+    nominal_m = 0.026
+    points = {}
+    for name, point in box["points"].items():
+        back = name.endswith("_back")
+        side = -1.0 if point["finger"] == "left" else 1.0
+        x = side * (0.5 * nominal_m + (0.0 if "_in_" in name else 0.012 if back else 0.007))
+        y = (-1.0 if "_near" in name else 1.0) * (0.009 if back else 0.0055)
+        points[name] = {**point, "xyz_m": [x, y, -0.034 if back else 0.0]}
+    edges = {name: {key: end for key, end in edge.items() if key != "bevel_m"} for name, edge in box["edges"].items()}
+    jaw = {"nominal_m": nominal_m, "min_m": 0.0, "max_m": 0.05}
+    return {**box, "name": "tapered_fingers", "jaw": jaw, "points": points, "edges": edges}
+
+
+def bevelled(model: dict[str, Any], width_m: float) -> dict[str, Any]:
+    """The model with a bevel on every edge."""
+    edges = {name: {**edge, "bevel_m": width_m} for name, edge in model["edges"].items()}
+    return {**model, "edges": edges}
+
+
+def without_finger(model: dict[str, Any], finger: str) -> dict[str, Any]:
+    """The model without one of its fingers."""
+    points = {name: point for name, point in model["points"].items() if point["finger"] != finger}
+    return {
+        **model,
+        "fingers": {name: motion for name, motion in model["fingers"].items() if name != finger},
+        "points": points,
+        "edges": {name: edge for name, edge in model["edges"].items() if edge["from"] in points},
+        "faces": [face for face in model["faces"] if face["finger"] != finger],
+    }
