@@ -1,7 +1,8 @@
 """On-line recalibration: the full pose from measured corners, without the previous one.
 
-The start comes from OpenCV's closed forms (IPPE for coplanar corners, SQPNP else); the weighted refinement is ours,
-since it needs the corners' covariances and gives that of the pose.
+The starts come from OpenCV's closed forms: SQPNP, and for coplanar corners also IPPE, which gives both poses that look
+alike, but fails where all corners but one lie on a line: a plane's homography isn't determined then, the pose is.  The
+weighted refinement is ours, since it needs the corners' covariances and gives that of the pose.
 """
 
 from __future__ import annotations
@@ -56,29 +57,38 @@ def recalibrate(
         raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least {needed} are needed")
     if spread[1] <= COPLANAR_RATIO * spread[0]:
         raise RecalibrationRefused("the corners lie on a line")
-    method = cv2.SOLVEPNP_IPPE if coplanar else cv2.SOLVEPNP_SQPNP
-    try:
-        found, rotations, translations, _ = cv2.solvePnPGeneric(
-            points_grip_m, measured_xy, np.eye(3), None, flags=method
-        )
-    except cv2.error as error:
-        raise RecalibrationRefused(f"the corners' images don't determine a pose ({error.err})") from None
-    starts = [
-        make_transform(np.asarray(cv2.Rodrigues(r)[0], float), np.asarray(t, float).ravel())
-        for r, t in zip(rotations, translations, strict=True)
-    ]
-    starts = [start for start in starts if (points_grip_m @ start[2, :3] + start[2, 3] > 0.0).all()]
-    if not found or not starts:
-        raise RecalibrationRefused("no pose has all corners in front of the camera")
+    starts = _closed_forms(points_grip_m, measured_xy, coplanar)
     weight_xy: Array = np.linalg.inv(covariance_xy)
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
-    return _choose(refined, expected_cam_T_grip, len(points_grip_m))
+    sound = [r for r in refined if r is not None]
+    if not sound:
+        raise RecalibrationRefused("the corners' images don't determine a pose with all of them in front of the camera")
+    return _choose(sound, expected_cam_T_grip, len(points_grip_m))
+
+
+def _closed_forms(points_grip_m: Array, measured_xy: Array, coplanar: bool) -> list[Array]:
+    """Poses (4, 4) that OpenCV's closed forms give; those behind the camera left out."""
+    starts = []
+    for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP) if coplanar else (cv2.SOLVEPNP_SQPNP,):
+        try:
+            _, turns, shifts, _ = cv2.solvePnPGeneric(points_grip_m, measured_xy, np.eye(3), None, flags=method)
+        except cv2.error:
+            continue
+        starts += [
+            make_transform(np.asarray(cv2.Rodrigues(r)[0], float), np.asarray(t, float).ravel())
+            for r, t in zip(turns, shifts, strict=True)
+        ]
+    return [start for start in starts if _in_front(start, points_grip_m)]
+
+
+def _in_front(cam_T_grip: Array, points_grip_m: Array) -> bool:
+    return bool((points_grip_m @ cam_T_grip[2, :3] + cam_T_grip[2, 3] > 0.0).all())
 
 
 def _refine(
     cam_T_grip: Array, points_grip_m: Array, measured_xy: Array, weight_xy: Array, iterations: int
-) -> Recalibration:
-    """Gauss-Newton on the weighted image error, on the manifold."""
+) -> Recalibration | None:
+    """Gauss-Newton on the weighted image error, on the manifold; None where it leads nowhere."""
     for _ in range(iterations):
         levers = points_grip_m @ cam_T_grip[:3, :3].T
         points = levers + cam_T_grip[:3, 3]
@@ -93,8 +103,10 @@ def _refine(
         try:
             step = np.linalg.solve(normal, np.einsum("nli,nl->i", weighted, residual))
         except np.linalg.LinAlgError:
-            raise RecalibrationRefused("the corners don't determine all six parameters") from None
+            return None
         cam_T_grip = perturb(cam_T_grip, step)
+        if not _in_front(cam_T_grip, points_grip_m):
+            return None
         if np.abs(step[:3]).max() < 1e-10 and np.abs(step[3:]).max() < 1e-9:
             break
     error = float(np.einsum("nk,nkl,nl->", residual, weight_xy, residual))
