@@ -174,6 +174,12 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     bevel_gain: Annotated[float, Meta(ge=0.0, le=5.0, description="brightness of bevels over that of their faces")] = (
         1.35
     )
+    highlights: Annotated[
+        float,
+        Meta(
+            ge=0.0, le=20.0, description="glossy fingers: brightness of a streak across each face over the face's shade"
+        ),
+    ] = 0.0
     carriers: Annotated[bool, Meta(description="draw the bodies that carry the fingers")] = True
 
 

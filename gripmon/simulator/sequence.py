@@ -74,13 +74,17 @@ class Simulator:
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """Image (height, width) of a frame."""
-        _, sensor = self._painters()
-        return sensor.expose(self.light(index), index, self.time_s(index))
+        return self.expose(self.light(index), index)
 
     def light(self, index: int) -> NDArray[np.float32]:
         """Light on the sensor (height, width) of a frame in DN at exposure 1, before vignetting, exposure and noise."""
         renderer, _ = self._painters()
         return renderer.render(self.time_s(index))
+
+    def expose(self, light: NDArray[np.float32], index: int) -> NDArray[np.uint8]:
+        """Image of a frame from the light on the sensor, which is used up: :meth:`light`'s, or what was made of it."""
+        _, sensor = self._painters()
+        return sensor.expose(light, index, self.time_s(index))
 
     def _painters(self) -> tuple[Renderer, SensorModel]:
         """Renderer and sensor, made when the first picture is asked for: truth needs neither."""

@@ -50,6 +50,9 @@ class Painter:
             if look.texture > 0.0:
                 texture = textures.metal(self._rng, rows, columns, px_per_m, look.texture)
                 texture = level * self._foreshortened(texture, body_T_plane, px_per_m)
+            if look.highlights > 0.0:
+                matt = np.full((rows, columns), level, np.float32) if texture is None else texture
+                texture = matt * textures.streak(self._rng, columns, look.highlights)
             surfaces.append(Surface(level, texture, px_per_m, body_T_plane))
         return tuple(surfaces)
 

@@ -56,6 +56,14 @@ def printed(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
     return out.astype(np.float32)
 
 
+def streak(rng: Rng, columns: int, strength: float) -> Factor:
+    """A lamp's reflection (1, columns) in a brushed face: a soft bright band across it, somewhere along its length."""
+    centre, width = rng.uniform(0.1, 0.9), rng.uniform(0.05, 0.15)
+    along = (np.arange(columns, dtype=np.float32) + 0.5) / columns
+    band = 1.0 + strength * np.exp(-0.5 * ((along - centre) / width) ** 2)
+    return np.asarray(band[None, :], dtype=np.float32)
+
+
 def skin(rng: Rng, height_px: int, width_px: int, px_per_m: float) -> Factor:
     """Soft blotches, creases across the fingers, shading towards the borders."""
     mm = px_per_m * 1e-3

@@ -32,7 +32,6 @@ CAMERA = PaperLens(
 
 START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
 """By how much a scene's reference is wrong, each axis; the monitor is told."""
-WRONG_START_M, WRONG_START_RAD = 10e-3, np.deg2rad(4.0)
 _BORDER_PX = 14.0
 _KINDS = ("blobs", "speckle", "stripes", "printed")
 
@@ -101,15 +100,11 @@ def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Sce
     if condition.missing_finger:
         shown = Gripper(msgspec.convert(without_finger(model, str(rng.choice(gripper.finger_ids))), GripperModel))
     simulator = Simulator(camera, shown, cam_T_grip, scenario(condition, draw), seed=int(rng.integers(2**31)))
-    if condition.wrong_start:
-        error, sigma = _wrong(rng), np.array([WRONG_START_M] * 3 + [WRONG_START_RAD] * 3) / np.sqrt(3.0)
-    else:
-        sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
-        error = rng.normal(0.0, sigma)
+    sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
     return Scene(
         camera,
         gripper,
-        perturb(simulator.truth(0).cam_T_grip, error),
+        perturb(simulator.truth(0).cam_T_grip, rng.normal(0.0, sigma)),
         np.diag(sigma**2),
         condition.jaw_sigma_m,
         simulator.scenario.fps,
@@ -150,15 +145,6 @@ def _look(rng: np.random.Generator) -> tuple[Background, FingerLook, Sensor]:
         texture=float(rng.uniform(0.05, 0.2)),
     )
     return background, fingers, Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)))
-
-
-def _wrong(rng: np.random.Generator) -> Array:
-    """Perturbation (6,) of uniform size up to the limits, in any direction."""
-    directions = rng.normal(0.0, 1.0, (2, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    return np.concatenate(
-        [rng.uniform(0, WRONG_START_M) * directions[0], rng.uniform(0, WRONG_START_RAD) * directions[1]]
-    )
 
 
 @cache
