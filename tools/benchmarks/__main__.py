@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, latency
+from benchmarks import accuracy, latency, series
 
-_BENCHMARKS = (accuracy, latency)
+_BENCHMARKS = (accuracy, latency, series)
 
 
 def main() -> int:
