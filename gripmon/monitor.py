@@ -145,7 +145,7 @@ class Monitor:
         if not measurement.trusted:
             return self._unmeasured(frame, "too few edges of the gripper agree", CornerFault.NO_FIT, None)
         before_T = self._cam_T_grip
-        self._cam_T_grip, self._covariance = self._update(measurement)
+        self._cam_T_grip, self._covariance = self.update(measurement)
         self._jaw_opening_m, self._measured_s = measurement.jaw_opening_m, self._now_s
         drift = self._drift()
         evidence = self._evidence(measurement, before_T, drift)
@@ -204,7 +204,7 @@ class Monitor:
             self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         return measurement
 
-    def _update(self, measurement: Measurement) -> tuple[Array, Array]:
+    def update(self, measurement: Measurement) -> tuple[Array, Array]:
         """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation
         (17).
         """

@@ -15,6 +15,9 @@ import numpy as np
 from gripmon.geometry import make_transform, perturb, perturbation_between, skew
 from gripmon.records import Array
 
+FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
+"""Corners that determine a pose: so many in one plane, or so many in general."""
+
 COPLANAR_RATIO = 1e-3
 """Corners whose thickness is below this part of their extent count as coplanar."""
 
@@ -48,16 +51,10 @@ def recalibrate(
     ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals don't tell apart.  Raises
     :class:`RecalibrationRefused` for too few or collinear corners.
     """
-    if len(points_grip_m) < 4:
-        raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least 4 coplanar ones or 6 are needed")
-    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False)
-    coplanar = bool(spread[2] <= COPLANAR_RATIO * spread[0])
-    needed = 4 if coplanar else 6
-    if len(points_grip_m) < needed:
-        raise RecalibrationRefused(f"{len(points_grip_m)} corners; at least {needed} are needed")
-    if spread[1] <= COPLANAR_RATIO * spread[0]:
-        raise RecalibrationRefused("the corners lie on a line")
-    starts = _closed_forms(points_grip_m, measured_xy, coplanar)
+    why = refusal(points_grip_m)
+    if why is not None:
+        raise RecalibrationRefused(why)
+    starts = _closed_forms(points_grip_m, measured_xy, coplanar(points_grip_m))
     weight_xy: Array = np.linalg.inv(covariance_xy)
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
     sound = [r for r in refined if r is not None]
@@ -66,10 +63,27 @@ def recalibrate(
     return _choose(sound, expected_cam_T_grip, len(points_grip_m))
 
 
-def _closed_forms(points_grip_m: Array, measured_xy: Array, coplanar: bool) -> list[Array]:
+def coplanar(points_grip_m: Array) -> bool:
+    """Whether points (n, 3) lie in a plane, or nearly so."""
+    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False)
+    return bool(spread[2] <= COPLANAR_RATIO * spread[0])
+
+
+def refusal(points_grip_m: Array) -> str | None:
+    """Why corners (n, 3) at these places can't give a pose, however well they are seen; None if they can."""
+    count = len(points_grip_m)
+    if count < FEWEST_COPLANAR:
+        return f"{count} corners; at least {FEWEST_COPLANAR} coplanar ones or {FEWEST_GENERAL} are needed"
+    if count < FEWEST_GENERAL and not coplanar(points_grip_m):
+        return f"{count} corners; at least {FEWEST_GENERAL} are needed"
+    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False)
+    return "the corners lie on a line" if spread[1] <= COPLANAR_RATIO * spread[0] else None
+
+
+def _closed_forms(points_grip_m: Array, measured_xy: Array, flat: bool) -> list[Array]:
     """Poses (4, 4) that OpenCV's closed forms give; those behind the camera left out."""
     starts = []
-    for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP) if coplanar else (cv2.SOLVEPNP_SQPNP,):
+    for method in (cv2.SOLVEPNP_IPPE, cv2.SOLVEPNP_SQPNP) if flat else (cv2.SOLVEPNP_SQPNP,):
         try:
             _, turns, shifts, _ = cv2.solvePnPGeneric(points_grip_m, measured_xy, np.eye(3), None, flags=method)
         except cv2.error:

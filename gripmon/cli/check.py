@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from gripmon.cli import common
+from gripmon.cli import common, expected
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and print what the calibration expects
 to see: where the fingertip corners are in the image (px), which of them and which edges are
-visible, and how far away the gripper is (mm)."""
+visible, how far away the gripper is (mm), how exact one frame will be along each axis, what the
+view can't tell apart (an unknown jaw opening and the distance), and whether its corners suffice
+to calibrate anew."""
 
 _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
@@ -73,6 +75,7 @@ def expectation(config: Config) -> dict[str, Any]:
         "edges": [
             {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
         ],
+        "accuracy": expected.accuracy(config),
         "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         "recording": settings.recording.directory if settings.recording.enabled else None,
     }
@@ -203,6 +206,7 @@ def _as_text(report: dict[str, Any]) -> str:
     lines = [f"{report['config']}: sound"]
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
     lines += [_corner_line(corner) for corner in report["corners"]]
+    lines += expected.accuracy_lines(report["accuracy"])
     lines += [f"{name:<10} {text}" for name, text in outside.items()]
     return "\n".join(lines)
 

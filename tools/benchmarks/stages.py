@@ -30,7 +30,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     ),
     "corners": ((gripmon.corners.measure, "intersect_edges"),),
     "update and judge": (
-        (Monitor, "_update"),
+        (Monitor, "update"),
         (Monitor, "_evidence"),
         (Monitor, "process"),
         (PoseAverage, "add"),

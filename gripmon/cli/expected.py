@@ -1,0 +1,124 @@
+"""The part of ``gripmon check`` that says how exact a frame will be, and what the view can't tell apart."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.outlook import JawOutlook, Outlook
+    from gripmon.records import Array
+
+_DIRECTIONS = (
+    "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
+)  # fmt: skip
+_POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
+_JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is told
+
+
+def accuracy(config: Config) -> dict[str, Any]:
+    """What one frame may tell, as plain values for JSON: metres, radians, px.  With too few edges only that."""
+    from gripmon.outlook import EDGE_POINT_SIGMA_PX, FEWEST_EDGES, expect
+
+    settings = config.settings.monitor
+    outlook = expect(config.camera, config.gripper, settings, config.reference, config.jaw_opening_m)
+    out: dict[str, Any] = {
+        "measurement": settings.measurement,
+        "edges": outlook.edges,
+        "edges_needed": FEWEST_EDGES,
+        "edge_point_sigma_px": EDGE_POINT_SIGMA_PX,
+        "recalibration": _recalibration(config, outlook),
+    }
+    if not outlook.enough:
+        return {**out, "expected": None, "weakest": None, "jaw": None}
+    return {
+        **out,
+        "expected": _split(outlook.sigma),
+        "weakest": _split(outlook.weakest),
+        "jaw": None if outlook.jaw is None else _jaw(outlook.jaw, outlook.lever_m, settings.jaw_sigma_m),
+    }
+
+
+def _split(values: Array) -> dict[str, list[float]]:
+    return {"tcp_m": values[:3].tolist(), "rotation_rad": values[3:].tolist()}
+
+
+def _jaw(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> dict[str, Any]:
+    per_m = [abs(v) * (1.0 if k < 3 else lever_m) for k, v in enumerate(jaw.pose_per_m.tolist())]
+    return {
+        "reported_sigma_m": reported_sigma_m,
+        "unknown": {**_split(jaw.sigma), "jaw_m": jaw.sigma_m},
+        "pose_per_jaw_m": _split(jaw.pose_per_m),
+        "like": _DIRECTIONS[per_m.index(max(per_m))],
+        "correlation": jaw.correlation,
+        "growth": jaw.growth,
+    }
+
+
+def _recalibration(config: Config, outlook: Outlook) -> dict[str, Any]:
+    """Whether the corners that this view shows give a full pose by themselves."""
+    from gripmon.monitor import CORNER_COUNTS
+    from gripmon.recalibrate import coplanar, refusal
+
+    gripper, variant = config.gripper, config.settings.monitor.recalibrate_corners
+    taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[variant])
+    points_grip_m = gripper.points_grip_m(config.jaw_opening_m)[gripper.corner_points][taken]
+    reason = refusal(points_grip_m)
+    return {
+        "corners": len(points_grip_m),
+        "coplanar": bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
+        "possible": reason is None,
+        "reason": reason,
+    }
+
+
+def accuracy_lines(values: dict[str, Any]) -> list[str]:
+    """The same for a person: mm and degrees."""
+    edges, expected, weakest = values["edges"], values["expected"], values["weakest"]
+    if expected is None:
+        accuracy = [f"accuracy   NONE: {edges} edges can be sampled, at least {values['edges_needed']} are needed"]
+    else:
+        way, sigma_px = values["measurement"], values["edge_point_sigma_px"]
+        turn = _degrees(weakest["rotation_rad"])
+        accuracy = [
+            f"accuracy   standard deviations of a frame by {way}, {edges} edges seen to {sigma_px:g} px a point:",
+            f"           {_sigmas(expected)}",
+            f"weakest    TCP by {_mm(weakest['tcp_m'])} mm while turned by {turn}°",
+        ]
+    jaw = [] if values["jaw"] is None else _jaw_lines(values["jaw"])
+    return [*accuracy, *jaw, f"new pose   {_recalibration_text(values['recalibration'])}"]
+
+
+def _jaw_lines(jaw: dict[str, Any]) -> list[str]:
+    unknown, growth = jaw["unknown"], jaw["growth"]
+    shift_m = [_JAW_ERROR_M * v for v in jaw["pose_per_jaw_m"]["tcp_m"]]
+    told = f"{'hardly tells' if growth >= _POORLY else 'tells'} the opening from {jaw['like']}"
+    less = f"{growth:.1f} times less certain than with it"
+    return [
+        f"jaw        opening reported to {1e3 * jaw['reported_sigma_m']:.3f} mm; if it were unknown:",
+        f"           {_sigmas(unknown)}; opening {1e3 * unknown['jaw_m']:.3f} mm",
+        f"           the image {told}: correlation {jaw['correlation']:.2f}, {less}",
+        f"           taken as exact but wrong by {1e3 * _JAW_ERROR_M:.3f} mm it shifts the TCP by {_mm(shift_m)} mm",
+    ]
+
+
+def _recalibration_text(values: dict[str, Any]) -> str:
+    if not values["possible"]:
+        return f"NOT from corners in this view: {values['reason']}; past the limit the reference stays"
+    where = "in one plane (4 are needed)" if values["coplanar"] else "(6 are needed)"
+    return f"past the limit from {values['corners']} corners {where}"
+
+
+def _sigmas(values: dict[str, list[float]]) -> str:
+    x, y, z = (1e3 * v for v in values["tcp_m"])
+    a, b, c = (math.degrees(v) for v in values["rotation_rad"])
+    return f"TCP x {x:.3f}, y {y:.3f}, z {z:.3f} mm, turn about x {a:.3f}, y {b:.3f}, z {c:.3f}°"
+
+
+def _mm(values: list[float]) -> str:
+    return "({:+.3f}, {:+.3f}, {:+.3f})".format(*(1e3 * v for v in values))
+
+
+def _degrees(values: list[float]) -> str:
+    return "({:+.3f}, {:+.3f}, {:+.3f})".format(*(math.degrees(v) for v in values))

@@ -1,0 +1,145 @@
+"""What a calibration may expect: how certain a frame's transform will be, and what the view can't tell apart.
+
+The monitor's own measurement and update are run on edge points where the model puts them, each with the same assumed
+standard deviation: what comes out is the covariance that the geometry gives, without any image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.corners import FingertipMeter, Measurement, Patience
+from gripmon.corners.consensus import base_weights
+from gripmon.corners.prediction import Prediction
+from gripmon.corners.profiles import Candidates
+from gripmon.geometry import from_record
+from gripmon.gripper import Gripper
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.records import Array, Image, ReferenceRecord
+
+EDGE_POINT_SIGMA_PX = 0.05
+"""Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
+
+FEWEST_EDGES = 3
+"""Edges that must be seen for a fit to be believed."""
+
+_STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0
+
+
+@dataclass(frozen=True, slots=True)
+class JawOutlook:
+    """What an unknown opening does, the seventh unknown of the fit.
+
+    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when nobody reports it.  ``pose_per_m`` (6,): by how much
+    the pose is wrong for each metre by which an opening that is taken as exact is wrong.  ``correlation`` of the
+    opening with the pose's weakest direction when it is unknown, 0 to 1: near 1 the image can't separate them.
+    """
+
+    sigma: Array
+    sigma_m: float
+    pose_per_m: Array
+    correlation: float
+
+    @property
+    def growth(self) -> float:
+        """By what factor the weakest direction is less certain than with an exactly known opening."""
+        return float(1.0 / np.sqrt(max(1.0 - self.correlation**2, 1e-12)))
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """Expected of one frame in which all visible edges are seen; vectors are (position, rotation), m and rad.
+
+    ``covariance`` (6, 6) as it would be published; ``weakest`` (6,) one standard deviation along its least certain
+    direction, rotations counted by how far they move the fingertips.  ``edges``: how many can be sampled; with fewer
+    than :data:`FEWEST_EDGES` nothing will be measured.  ``jaw`` is None for a gripper without one.
+    """
+
+    covariance: Array
+    weakest: Array
+    edges: int
+    corners: NDArray[np.bool_]
+    lever_m: float
+    jaw: JawOutlook | None
+
+    @property
+    def sigma(self) -> Array:
+        """(6,) standard deviations."""
+        return np.asarray(np.sqrt(self.covariance.diagonal()))
+
+    @property
+    def enough(self) -> bool:
+        """Whether anything can be measured at all."""
+        return self.edges >= FEWEST_EDGES
+
+
+def expect(
+    camera: Camera, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord, jaw_opening_m: float | None
+) -> Outlook:
+    """What a frame at the reference's pose and an opening (nominal if None) may tell."""
+    monitor = Monitor(camera, gripper, settings, reference)
+    cam_T_grip = from_record(reference.cam_T_grip)
+    opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+    meter = _ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
+    given = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
+    covariance = monitor.update(given)[1]
+    lever_m = _lever_m(given.prediction)
+    jaw = None
+    if gripper.has_jaw:
+        free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
+        jaw = _jaw_outlook(monitor.update(free)[1], free.covariance, lever_m)
+    edges, corners = len(given.prediction.layout.edges), given.corners.usable
+    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw)
+
+
+def weakest_direction(covariance: Array, lever_m: float) -> Array:
+    """(6,) one standard deviation along the least certain direction of a covariance (6, 6), a radian counting as
+    ``lever_m``.
+    """
+    scale = np.array([1.0] * 3 + [lever_m] * 3)
+    variances, directions = np.linalg.eigh(covariance * np.outer(scale, scale))
+    weakest = directions[:, -1] * np.sqrt(variances[-1]) / scale
+    return np.asarray(weakest * (1.0 if weakest[np.abs(weakest * scale).argmax()] > 0.0 else -1.0))
+
+
+def _jaw_outlook(pose_covariance: Array, covariance: Array, lever_m: float) -> JawOutlook:
+    """``covariance`` (7, 7) of the fit itself, ``pose_covariance`` (6, 6) as it would be published."""
+    weakest = weakest_direction(covariance[:6, :6], lever_m)
+    scale = np.array([1.0] * 3 + [lever_m] * 3)
+    # Its length is one standard deviation, so that projecting on it twice takes the scale out.
+    with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
+    variance = float(covariance[6, 6])
+    return JawOutlook(
+        np.sqrt(pose_covariance.diagonal()),
+        float(np.sqrt(variance)),
+        covariance[:6, 6] / variance,
+        abs(with_jaw) / np.sqrt(variance),
+    )
+
+
+def _lever_m(prediction: Prediction) -> float:
+    """Root mean square distance of the gripper's corners from the TCP: how far a turn by one radian moves them."""
+    levers_m = prediction.corners.cam_m - prediction.cam_T_grip[:3, 3]
+    return float(np.sqrt((levers_m**2).sum(axis=1).mean()))
+
+
+class _ForeseeingMeter(FingertipMeter):
+    """Finds an edge point on every profile, where it was predicted."""
+
+    def foresee(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
+        nothing = np.zeros((1, 1), np.uint8)
+        here = Patience(when_doubtful=False, when_lost=False)
+        return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
+
+    def _look(self, image: Image, prediction: Prediction) -> tuple[Candidates, Array]:
+        sample = np.flatnonzero(prediction.ok)
+        polarity = self._gripper.edge_polarity
+        step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
+        sigma_px = np.full(len(sample), EDGE_POINT_SIGMA_PX)
+        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, _NOISE, _FULL_SCALE)
+        settings = self._settings.consensus
+        return candidates, base_weights(candidates, prediction, polarity, self._gripper.edge_bevel_m, settings)
