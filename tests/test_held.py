@@ -173,6 +173,7 @@ def test_corners_that_do_not_determine_the_motion_leave_it_to_the_edges(mask: Ma
         measured += 1
         assert sum(c.used for c in one.corners) == corners
         # Both start from what the frame before gave, and end at the same place within the fit's own tolerance.
-        np.testing.assert_allclose(error_of(one), error_of(other), atol=2e-6)
+        apart = error_of(one) - error_of(other)
+        assert apart @ np.linalg.solve(covariance_of(other), apart) < 0.25
         np.testing.assert_allclose(covariance_of(one).diagonal(), covariance_of(other).diagonal(), rtol=0.1)
     assert measured > HIDDEN // 2
