@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import sys
 from collections.abc import Callable, Iterator
@@ -29,6 +28,7 @@ class Plan:
     seed: int = 1
     jobs: int = 2
     peers: bool = True
+    series: bool = True
 
 
 def add_parser(commands: Any) -> None:
@@ -44,10 +44,12 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--list", action="store_true", help="print the names of all rows and end")
     parser.add_argument("--scenes", type=_count, metavar="N", help="scenes of each condition")
     parser.add_argument("--frames", type=_count, metavar="N", help="frames of each scene")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of everything random (default 1)")
+    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
     parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="rows at the same time (default 2)")
     parser.add_argument("--no-peers", action="store_true", help="only our own monitor")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write accuracy.md, accuracy.json and accuracy/*.png there"
+    )
     parser.set_defaults(handler=run)
 
 
@@ -60,7 +62,7 @@ def _count(text: str) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``tools/bench accuracy``."""
-    from benchmarks import accuracy_table
+    from benchmarks import accuracy_report, accuracy_table
     from benchmarks.rows import row_names
 
     if arguments.list:
@@ -77,24 +79,51 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.seed,
         arguments.jobs,
         not arguments.no_peers,
+        not arguments.only and not arguments.quick,
     )
-    results = measure(plan)
+    if arguments.out is not None:
+        try:
+            (arguments.out / accuracy_report.PICTURES).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            print(
+                f"accuracy: --out {arguments.out}: {error.strerror}; a folder that can be written to", file=sys.stderr
+            )
+            return 2
+    results, tracks = measure(plan)
     print(accuracy_table.as_text(results))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(results, indent=1) + "\n")
+    if arguments.out is not None:
+        accuracy_report.write(results, tracks, arguments.out)
     return 0
 
 
-def measure(plan: Plan) -> dict[str, Any]:
-    """All rows; plain values."""
+def measure(plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
+    """All rows: plain values, and the tracks of each row."""
     from benchmarks import machine
-    from benchmarks.rows import row_names
+    from benchmarks.accuracy_runs import WAYS
+    from benchmarks.accuracy_stats import together
+    from benchmarks.rows import is_simulated, row_names
 
     names = [name for name in row_names() if not plan.only or name.startswith(plan.only)]
     results: dict[str, Any] = {"machine": machine.description(), "plan": {"seed": plan.seed, "jobs": plan.jobs}}
-    results["rows"] = dict(zip(names, _in_processes(_row, names, plan), strict=True))
+    done = dict(zip(names, _in_processes(_row, names, plan), strict=True))
+    results["rows"] = {name: figures for name, (figures, _) in done.items()}
+    simulated = [row for name, row in results["rows"].items() if is_simulated(name)]
+    results["together"] = {way: together([row["ours"][way] for row in simulated]) for way in WAYS}
+    if plan.series:
+        results["series"] = _series(plan.seed)
     results["machine"]["load_after"] = machine.load()
-    return results
+    return results, {name: tracks for name, (_, tracks) in done.items()}
+
+
+def _series(seed: int) -> dict[str, Any]:
+    """The self-viewing paper's tables beside ours (see :mod:`benchmarks.series`)."""
+    from tqdm import tqdm
+
+    from benchmarks import series
+
+    with tqdm(desc="series", unit="pair", file=sys.stderr, disable=None) as bar:
+        rows = series.tables(seed, bar.update)
+    return {"markdown": series.markdown(rows), "verdicts": series.verdicts(rows)}
 
 
 def _in_processes(function: Callable[..., Any], names: list[str], plan: Plan) -> Iterator[Any]:
@@ -123,7 +152,7 @@ def _prepare() -> None:
     warm_up()
 
 
-def _row(name: str, plan: Plan) -> dict[str, Any]:
+def _row(name: str, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
     from benchmarks.rows import measure_row
 
     return measure_row(name, scenes=plan.scenes, frames=plan.frames, seed=plan.seed, peers=plan.peers)

@@ -1,4 +1,4 @@
-"""Our own monitor over the sequences of ``tools/bench accuracy``: each frame's error, claimed covariance and time."""
+"""Our own monitor, and peers, over the sequences of ``tools/bench accuracy``: each frame's error, covariance, time."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.peers import LOST_M, PEERS, timed
 from benchmarks.scenes import Sequence, Shot
 from gripmon.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
 from gripmon.monitor import Monitor, MonitorSettings
@@ -115,12 +116,37 @@ def judge(record: FrameRecord, shot: Shot, scene: int, index: int, time_ms: floa
     return Row(scene, index, shot.judged, valid, error, smoothed, nees, far, time_ms)
 
 
-def run_ours(sequences: Iterable[Sequence]) -> dict[str, Track]:
-    """Both ways over all sequences, on the same frames."""
-    rows: dict[str, list[Row]] = {way: [] for way in WAYS}
+class PeerRun:
+    """One peer on one sequence."""
+
+    def __init__(self, sequence: Sequence, name: str, scene: int) -> None:
+        self._scene, self._gripper, self._peer = scene, sequence.gripper, PEERS[name](sequence)
+        self.tagged = self._peer.tagged
+
+    def add(self, index: int, shot: Shot, image: NDArray[np.uint8]) -> Row:
+        """A pose that lies beyond belief counts as none."""
+        gripper, jaw_m = self._gripper, shot.frame.jaw_opening_m
+        jaw_m = gripper.jaw_nominal_m if jaw_m is None else min(max(jaw_m, gripper.jaw_min_m), gripper.jaw_max_m)
+        pose, time_ms = timed(self._peer, image, jaw_m)
+        error = NOTHING6 if pose is None else perturbation_between(pose, shot.cam_T_grip)
+        far = float(np.linalg.norm(error[:3]))
+        if far > LOST_M:
+            error = NOTHING6
+        return Row(self._scene, index, shot.judged, False, error, NOTHING3, np.nan, far, time_ms)
+
+
+def run(sequences: Iterable[Sequence], peers: tuple[str, ...]) -> dict[str, Track]:
+    """Both of our ways, and peers by name, over all sequences, on the same frames."""
+    rows: dict[str, list[Row]] = {name: [] for name in (*WAYS, *peers)}
     for number, sequence in enumerate(sequences):
-        runs = {way: OurRun(sequence, way, number) for way in WAYS}
+        ours = {way: OurRun(sequence, way, number) for way in WAYS}
+        others = {name: PeerRun(sequence, name, number) for name in peers}
+        tags = any(other.tagged for other in others.values())
         for index, shot in enumerate(sequence.shots()):
-            for way, run in runs.items():
-                rows[way].append(run.add(index, shot))
-    return {way: Track.of(track) for way, track in rows.items()}
+            for way, own in ours.items():
+                rows[way].append(own.add(index, shot))
+            plain = np.asarray(shot.frame.image, np.uint8)
+            tagged = sequence.tagged(index, shot) if tags else plain
+            for name, other in others.items():
+                rows[name].append(other.add(index, shot, tagged if other.tagged else plain))
+    return {name: Track.of(track) for name, track in rows.items()}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
 from pathlib import Path
@@ -17,10 +17,12 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.conditions import CLEAN, HARD, Limit
 from benchmarks.machine import ROOT
 from benchmarks.scenes import START_SIGMA_M, START_SIGMA_RAD, Sequence, Shot
+from benchmarks.tags import FingerTags, with_tags
 from gripmon.camera import PaperLens, make_camera
 from gripmon.gripper import Gripper, GripperModel
 from gripmon.records import Frame
@@ -60,6 +62,16 @@ class Rendered(Sequence):
                 judged = index >= self.judged_from
                 yield Shot(shown, np.array(frame["camera_T_gripper"]), float(frame["jaw"]), judged)
                 index += 1
+
+    def tagged(self, index: int, shot: Shot) -> NDArray[np.uint8]:
+        """Printed into the finished image: what may be in front of the fingers doesn't hide them."""
+        noise_dn = float(self.frames[index // self.repeat]["conditions"]["noise"])
+        rng, image = np.random.default_rng([index]), np.asarray(shot.frame.image, np.uint8)
+        return with_tags(image, self.camera, shot.cam_T_grip, shot.jaw_opening_m, rng, self._tags, noise_dn)
+
+    @cached_property
+    def _tags(self) -> FingerTags:
+        return FingerTags(self.gripper)
 
 
 def sequences(row: str) -> list[Rendered]:

@@ -9,20 +9,22 @@ import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import msgspec
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from benchmarks.conditions import Condition, Draw, scenario
 from benchmarks.machine import ROOT
+from benchmarks.tags import FingerTags
 from gripmon.camera import Camera, PaperLens, make_camera
 from gripmon.geometry import exp_rotation, make_transform, perturb
 from gripmon.gripper import Gripper, GripperModel
 from gripmon.records import Array, Frame
-from gripmon.simulator import FrameTruth, Simulator
+from gripmon.simulator import FrameTruth, Hidden, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, Sensor
 
 CAMERA = PaperLens(
@@ -33,6 +35,8 @@ CAMERA = PaperLens(
 START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
 """By how much a scene's reference is wrong, each axis; the monitor is told."""
 _BORDER_PX = 14.0
+_MOMENTS, _MOVES_M = 5, 1e-5
+"""Moments of an exposure at which tags are printed, where they move further than this within it."""
 _KINDS = ("blobs", "speckle", "stripes", "printed")
 
 
@@ -64,6 +68,10 @@ class Sequence(ABC):
     def shots(self) -> Iterator[Shot]:
         """All frames in order."""
 
+    @abstractmethod
+    def tagged(self, index: int, shot: Shot) -> NDArray[np.uint8]:
+        """The image of a frame as it would be with a tag on each finger."""
+
 
 @dataclass(frozen=True)
 class Scene(Sequence):
@@ -80,8 +88,43 @@ class Scene(Sequence):
             judged = index > 0 and truth.time_s >= self.judged_s
             yield Shot(self.simulator.frame(index), truth.cam_T_grip, truth.jaw_opening_m, judged)
 
-    def truth(self, index: int) -> FrameTruth:
-        return self.simulator.truth(index)
+    def tagged(self, index: int, shot: Shot) -> NDArray[np.uint8]:
+        """Printed into the light on the sensor, so that they are as smeared, blurred and noisy as the rest.  Tags on
+        fingers of which something covers a corner are left out.
+        """
+        simulator, truth = self.simulator, self.simulator.truth(index)
+        covered = {name[0] for name, why in zip(truth.corner_ids, truth.hidden, strict=True) if why is Hidden.COVER}
+        numbers = [number for number, side in enumerate("LR") if side not in covered]
+        light, psf_px = simulator.light(index), simulator.scenario.sensor.psf_sigma_px
+        total = np.zeros_like(light)
+        for moment, share in self._moments(truth):
+            pose, jaw_m = moment.cam_T_grip, moment.jaw_opening_m
+            total += np.float32(share) * self._tags.paint(light, self.camera, pose, jaw_m, psf_px, numbers)
+        return simulator.expose(total, index)
+
+    def _moments(self, truth: FrameTruth) -> list[tuple[FrameTruth, float]]:
+        """Moments of the exposure and their shares (trapezoids); one if nothing moves in the meantime."""
+        half_ms = 500.0 * self.simulator.scenario.sensor.exposure_time_s
+        whole_ms = np.unique(np.round(np.linspace(-half_ms, half_ms, _MOMENTS)))
+        around = [self._by_ms.truth(max(round(1e3 * truth.time_s + ms), 0)) for ms in whole_ms.tolist()]
+        ways_m = [np.abs(m.cam_T_grip[:3, 3] - truth.cam_T_grip[:3, 3]).max() for m in around]
+        ways_m += [abs(m.jaw_opening_m - truth.jaw_opening_m) for m in around]
+        if len(around) < 2 or max(ways_m) < _MOVES_M:
+            return [(truth, 1.0)]
+        weights = np.gradient(whole_ms)
+        weights[[0, -1]] *= 0.5
+        return list(zip(around, (weights / weights.sum()).tolist(), strict=True))
+
+    @cached_property
+    def _tags(self) -> FingerTags:
+        return FingerTags(self.simulator.gripper)
+
+    @cached_property
+    def _by_ms(self) -> Simulator:
+        """The same scene with a frame each millisecond; only its truth is asked for."""
+        own = self.simulator
+        fast = msgspec.structs.replace(own.scenario, fps=1e3)
+        return Simulator(own.camera, own.gripper, own.nominal_cam_T_grip, fast, own.seed)
 
 
 def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Scene:
