@@ -230,7 +230,7 @@ class Monitor:
         return differential_update(
             measurement.corners_at(jaw_opening_m)[taken],
             measurement.corners.xy[taken],
-            measurement.inflation * measurement.corners.covariance_xy[taken],
+            measurement.corners.covariance_xy[taken],
             measurement.prediction.cam_T_grip[:3, 3],
         )
 
@@ -282,7 +282,7 @@ class Monitor:
         """
         taken = self._taken(measurement, self._settings.recalibrate_corners)
         points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
-        covariance_xy = measurement.inflation * measurement.corners.covariance_xy
+        covariance_xy = measurement.corners.covariance_xy
         try:
             pnp = recalibrate(
                 points_grip_m[taken], measurement.corners.xy[taken], covariance_xy[taken], self._cam_T_grip

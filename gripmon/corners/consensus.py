@@ -9,7 +9,7 @@ px.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import msgspec
 import numpy as np
@@ -41,7 +41,7 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
             le=1.0,
             description="standard deviation of a whole edge's position that averaging along it does not remove (px)",
         ),
-    ] = 0.03
+    ] = 0.02
     support_sigmas: Annotated[
         float,
         Meta(ge=1.0, le=20.0, description="by how many standard deviations an edge must beat chance to count as seen"),
@@ -64,12 +64,51 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 GATE_PX = 0.5
-"""A profile supports a fit if a candidate lies this close to it."""
+"""A profile supports a fit if a candidate lies this close to it (px of the zoomed image)."""
+
+FARTHEST_PX = 1.0
+"""Robust spread (px) beyond which edge points are not believed to show the gripper's edges."""
 
 _TUKEY = 4.685
-_LARGEST_SCALE_PX = 0.5
+_LARGEST_SPREAD = 3.0
+_SMALLEST_SPREAD_PX = 0.05
+_SMALLEST_STIFFNESS = 0.2
+_NARROWING = 0.4  # of the width that covers the start's error, from round to round
 _ROUNDS = 6
 _CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard deviation; what is still to come is less
+
+
+@dataclass(frozen=True, slots=True)
+class Votes:
+    """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
+    ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
+    """
+
+    candidates: Candidates
+    prediction: Prediction
+    weight: Array
+    edge_spread_px: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """What holds the unknowns (m,) before the image is seen: ``mean`` relative to the prediction, ``information`` in
+    1/m², 1/rad².
+    """
+
+    mean: Array
+    information: Array
+
+
+class Fit(NamedTuple):
+    """Where a robust fit ended, before it is judged; fields as in :class:`Consensus`."""
+
+    xi: Array
+    weight: Array
+    residual_px: Array
+    information: Array
+    spread_px: float
+    stiffness: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +116,9 @@ class Consensus:
     """The common motion of the edge candidates.
 
     ``xi`` (m,) relative to the prediction's pose, m = 6, or 7 with the jaw opening; ``weight`` (k,) per candidate in
-    1/px², zero for those that don't belong; ``information`` (m, m) of the edge points alone; ``scale_px`` robust
-    spread of the inliers; ``supported`` (n,) whether a profile agrees; for all edges of the gripper ``edge_share``
+    1/px², zero for those that don't belong, each edge's together limited by what its points share; ``information``
+    (m, m) of the edge points alone; ``spread_px`` robust size of the residuals, ``stiffness`` see :func:`_stiffness`;
+    ``supported`` (n,) whether a profile agrees; for all edges of the gripper ``edge_share``
     (e,) share of its profiles that agree and ``edge_seen`` (e,).  ``share``: part of all pairs of neighbouring
     profiles in which both agree, on edges that are seen; zero with fewer than three such edges.
     """
@@ -87,7 +127,8 @@ class Consensus:
     weight: Array
     residual_px: Array
     information: Array
-    scale_px: float
+    spread_px: float
+    stiffness: float
     supported: NDArray[np.bool_]
     edge_share: Array
     edge_seen: NDArray[np.bool_]
@@ -98,83 +139,67 @@ def base_weights(
     candidates: Candidates,
     prediction: Prediction,
     polarity: NDArray[np.int8],
-    bevel_m: Array,
     settings: ConsensusSettings,
 ) -> Array:
     """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
 
-    ``polarity`` and ``bevel_m`` (e,) belong to the gripper's edges.  What moves a whole edge at once (pixel grid,
-    shading, a bevel with the spread of a uniform distribution, bevel / sqrt(12)) makes n points on it worth no more
-    than one with that spread.
+    ``polarity`` (e,) belongs to the gripper's edges.
     """
     edge = prediction.layout.edge[candidates.sample]
-    points = np.bincount(prediction.layout.edge, minlength=len(bevel_m))
-    spread = np.full(len(bevel_m), float(settings.edge_floor_px**2))
-    if bevel_m.any():
-        spread += (bevel_m * prediction.pixels_per_m) ** 2 / 12.0
-    variance = candidates.sigma_px**2
-    variance += (settings.point_floor_px**2 + points * spread)[edge]
-    weight = 1.0 / variance
+    weight = 1.0 / (candidates.sigma_px**2 + settings.point_floor_px**2)
     if polarity.any():
         wanted = polarity[edge]
         weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
     return weight
 
 
-def agree(
-    candidates: Candidates,
-    prediction: Prediction,
-    weights: Array,
-    start: Array,
-    prior_mean: Array,
-    prior: Array,
-    settings: ConsensusSettings,
-) -> Consensus:
-    """Robust fit from one start: iteratively re-weighted, the width shrinking from ``start_width_px`` to the measured
-    scale.
+def agree(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Consensus:
+    """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``start_width_px`` to what each
+    candidate's own standard deviation and the measured scatter allow.
 
-    ``weights`` (k,) from :func:`base_weights`; ``prior`` (m,) holds each unknown at ``prior_mean`` by that much
-    (1/m², 1/rad²), as a reported jaw opening does.  With fewer candidates than unknowns the fit stays at the start
-    and supports nothing.
+    With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
+    candidates, prediction, weights = votes.candidates, votes.prediction, votes.weight
     jacobian = prediction.jacobian_by_unknown[:, candidates.sample]
     offset = candidates.offset_px
     active = None if weights.all() else weights > 0.0
+    sigma = 1.0 / np.sqrt(weights if active is None else np.where(active, weights, 1.0))
+    edge = prediction.layout.edge[candidates.sample]
+    shared = votes.edge_spread_px**2
     xi = start
     residual = offset - xi @ jacobian
-    width, scale = settings.start_width_px, _LARGEST_SCALE_PX
+    width, spread, spread_px = settings.start_width_px, 1.0, FARTHEST_PX
     for round_ in range(_ROUNDS):
         if round_:
-            scale = _scale(residual, active, width, settings.point_floor_px)
-            width = min(_TUKEY * scale, width)
-        step, information, weight = _step(jacobian, residual, weights, width, prior_mean - xi, prior)
+            width *= _NARROWING
+            spread, spread_px = _spread(residual, sigma, active, settings.start_width_px)
+        reach = np.minimum(np.hypot(width, (_TUKEY * spread) * sigma), max(width, _TUKEY * spread_px))
+        weight = _biweight(residual, reach)
+        weight *= weights
+        # All points of an edge together are worth no more than one with the spread that they share.
+        weight /= (1.0 + shared * np.bincount(edge, weight, len(shared)))[edge]
+        step, information = _step(jacobian, residual, weight, prior.mean - xi, prior.information)
         xi = xi + step
         residual = offset - xi @ jacobian
-        if round_ >= 2 and float(step @ information @ step) < _CONVERGED:
+        if round_ >= 4 and float(step @ information @ step) < _CONVERGED:
             break
-    return _judge(candidates, prediction, active, xi, weight, residual, information, scale, settings)
+    stiffness = _stiffness(weight, residual, reach)
+    return _judge(votes, active, Fit(xi, weight, residual, information, spread_px, stiffness), settings)
 
 
 def agree_from_grid(
-    candidates: Candidates,
-    prediction: Prediction,
-    weights: Array,
-    starts: Array,
-    prior_mean: Array,
-    prior: Array,
-    settings: ConsensusSettings,
-    refine: int = 6,
+    votes: Votes, prior: Prior, starts: Array, settings: ConsensusSettings, refine: int = 6
 ) -> Consensus:
     """Best fit from many starts (g, m): all are scored by the candidates near them, the best few refined."""
-    jacobian = prediction.jacobian[candidates.sample].T
-    active = weights > 0.0
+    candidates = votes.candidates
+    jacobian = votes.prediction.jacobian[candidates.sample].T
+    active = votes.weight > 0.0
     distance = (candidates.offset_px - starts @ jacobian) * (1.0 / settings.start_width_px)
     np.square(distance, out=distance)
     np.subtract(1.0, distance, out=distance)
     np.maximum(distance, 0.0, out=distance)
     best = np.argsort(-(distance @ active.astype(float)), kind="stable")[:refine]
-    fits = [agree(candidates, prediction, weights, starts[i], prior_mean, prior, settings) for i in best]
-    return max(fits, key=lambda fit: fit.share)
+    return max((agree(votes, prior, starts[i], settings) for i in best), key=lambda fit: fit.share)
 
 
 def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> Array:
@@ -195,16 +220,18 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
     return starts
 
 
-def _step(
-    jacobian: Array, residual: Array, weights: Array, width: float, to_prior: Array, prior: Array
-) -> tuple[Array, Array, Array]:
-    """One weighted Gauss-Newton step: (m,) step, (m, m) information, (k,) weights."""
-    weight = residual * (1.0 / width)
+def _biweight(residual: Array, reach: Array) -> Array:
+    """Tukey's weights (1 - (r / reach)²)², zero beyond the reach."""
+    weight = residual / reach
     np.square(weight, out=weight)
     np.subtract(1.0, weight, out=weight)
     np.maximum(weight, 0.0, out=weight)
     np.square(weight, out=weight)
-    weight *= weights
+    return weight
+
+
+def _step(jacobian: Array, residual: Array, weight: Array, to_prior: Array, prior: Array) -> tuple[Array, Array]:
+    """One weighted Gauss-Newton step: (m,) step, (m, m) information of the points."""
     weighted = jacobian * weight
     information = weighted @ jacobian.T
     normal = information.copy()
@@ -212,26 +239,7 @@ def _step(
     _, step, failed = dposv(normal, weighted @ residual + prior * to_prior)
     if failed:
         raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
-    return step, information, weight
-
-
-def noise_inflation(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> float:
-    """Factor >= 1 by which the fit's covariance must grow so that it matches the residuals.
-
-    Edge points are worth less than their image noise says: texture on and behind an edge moves them, and neighbours
-    err together. Both show in the means of whole stretches of an edge: with independent errors of the assumed size
-    the weighted squares of these means add up to the number of stretches less the number of unknowns.
-    """
-    inlier = np.flatnonzero(consensus.weight)
-    stretch = prediction.layout.stretch[candidates.sample[inlier]]
-    weight = consensus.weight[inlier]
-    total = np.bincount(stretch, weight)
-    moment = np.bincount(stretch, weight * consensus.residual_px[inlier])
-    full = total > 0.0
-    freedom = int(np.count_nonzero(full)) - len(consensus.xi)
-    if freedom < 3:
-        return 1.0
-    return max(1.0, float((moment[full] ** 2 / total[full]).sum()) / freedom)
+    return step, information
 
 
 def prior_information(jaw_sigma_m: float | None) -> Array:
@@ -244,34 +252,47 @@ def prior_information(jaw_sigma_m: float | None) -> Array:
     return np.array(pose if jaw_sigma_m is None else [*pose, max(jaw_sigma_m, 1e-6) ** -2])
 
 
-def _scale(residual: Array, active: NDArray[np.bool_] | None, width: float, floor_px: float) -> float:
-    """Robust standard deviation (px) of the residuals inside the present width: 1.4826 times their median size."""
-    size = np.abs(residual if active is None else residual[active])
-    size = size[size < width]
+def _stiffness(weight: Array, residual: Array, reach: Array) -> float:
+    """How much the biweight's pull really grows with the residuals, over what its weights say: the mean of its
+    derivative, (1 - u²) (1 - 5 u²), over that of (1 - u²)².
+
+    0.83 for normal residuals; less where many points lie half way out and pull the less the farther they go.
+    """
+    inside = np.flatnonzero(weight)
+    square = np.minimum((residual[inside] / reach[inside]) ** 2, 1.0)
+    base = weight[inside] / np.maximum((1.0 - square) ** 2, 1e-6)
+    pull, growth = (1.0 - square) ** 2, (1.0 - square) * (1.0 - 5.0 * square)
+    total = float(base @ pull)
+    return max(float(base @ growth) / total, _SMALLEST_STIFFNESS) if total > 0.0 else 1.0
+
+
+def _spread(residual: Array, sigma: Array, active: NDArray[np.bool_] | None, width: float) -> tuple[float, float]:
+    """Robust size of the residuals that may belong to the fit, 1.4826 times their median: over their standard
+    deviations, at least 1, and in px.
+    """
+    size = np.abs(residual)
+    near = size < np.minimum(width, 4.0 * sigma + 0.3)
+    if active is not None:
+        near &= active
+    size = size[near]
     if len(size) < 12:
-        return _LARGEST_SCALE_PX
+        return 1.0, FARTHEST_PX
     middle = len(size) // 2
-    return min(max(1.4826 * float(np.partition(size, middle)[middle]), floor_px), _LARGEST_SCALE_PX)
+    spread_px = 1.4826 * float(np.partition(size, middle)[middle])
+    spread = 1.4826 * float(np.partition(size / sigma[near], middle)[middle])
+    return min(max(spread, 1.0), _LARGEST_SPREAD), min(max(spread_px, _SMALLEST_SPREAD_PX), FARTHEST_PX)
 
 
-def _judge(
-    candidates: Candidates,
-    prediction: Prediction,
-    active: NDArray[np.bool_] | None,
-    xi: Array,
-    weight: Array,
-    residual: Array,
-    information: Array,
-    scale_px: float,
-    settings: ConsensusSettings,
-) -> Consensus:
+def _judge(votes: Votes, active: NDArray[np.bool_] | None, fit: Fit, settings: ConsensusSettings) -> Consensus:
     """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate
     anyway.
     """
+    candidates, prediction, residual = votes.candidates, votes.prediction, fit.residual_px
     edges = len(prediction.line_origin)
+    gate_px = GATE_PX * candidates.zoom
     edge_of = prediction.layout.edge
     sample = candidates.sample if active is None else candidates.sample[active]
-    close = sample[np.abs(residual if active is None else residual[active]) < GATE_PX]
+    close = sample[np.abs(residual if active is None else residual[active]) < gate_px]
     supported = np.zeros(len(edge_of), dtype=bool)
     supported[close] = True
     profiles, some = prediction.profiles, prediction.some_profiles
@@ -279,7 +300,7 @@ def _judge(
     others = np.bincount(edge_of[sample], minlength=edges) - np.bincount(edge_of[close], minlength=edges)
     # Edge responses end before the profiles do: what was found tells how far candidates reach.
     reach_px = max(float(np.abs(candidates.offset_px).max(initial=0.0)), settings.start_width_px)
-    chance = 1.0 - np.exp(others * (-GATE_PX / max(reach_px - GATE_PX, 0.5)) / some)
+    chance = 1.0 - np.exp(others * (-gate_px / max(reach_px - gate_px, 0.5)) / some)
     needed = profiles * chance + settings.support_sigmas * np.sqrt(profiles * chance * (1.0 - chance))
     share = agreeing / some
     seen = (agreeing >= 5) & (agreeing > needed) & (share >= settings.support_share)
@@ -289,4 +310,15 @@ def _judge(
     if prediction.pairs and np.count_nonzero(seen) >= 3:
         agreeing_pairs = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
         believed = int(np.count_nonzero(agreeing_pairs)) / prediction.pairs
-    return Consensus(xi, weight, residual, information, scale_px, supported, share, seen, believed)
+    return Consensus(
+        fit.xi,
+        fit.weight,
+        residual,
+        fit.information,
+        fit.spread_px,
+        fit.stiffness,
+        supported,
+        share,
+        seen,
+        believed,
+    )

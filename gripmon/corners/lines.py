@@ -16,9 +16,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.corners.consensus import Consensus
+from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
-from gripmon.corners.profiles import Candidates
 from gripmon.gripper import Gripper
 from gripmon.records import Array, CornerFault
 
@@ -114,19 +113,20 @@ def _fault_of_view(inside: bool, facing: bool, edges: int) -> CornerFault | None
 
 
 def intersect_edges(
-    candidates: Candidates,
-    prediction: Prediction,
+    votes: Votes,
     consensus: Consensus,
+    line_weight: Array,
     geometry: CornerGeometry,
     settings: CornerSettings,
 ) -> Corners:
     """Corners as intersections of the lines through the agreed edge points; weighted least squares where three edges
-    meet.
+    meet.  ``line_weight`` (k,) is what each candidate is worth for the line of its edge, 1/px².
 
     A predicted corner lies on its predicted lines, so the measured line ``offset + slope * along`` asks for a shift
     of the corner with ``(right - slope * direction) . shift = offset + slope * along``.
     """
-    lines = _fit_lines(candidates, prediction, consensus)
+    prediction = votes.prediction
+    lines = _fit_lines(votes, line_weight)
     seen = consensus.edge_seen.tolist()
     agreed = [0, *np.cumsum(consensus.supported).tolist()]
     measured = [
@@ -217,16 +217,18 @@ class _Line(NamedTuple):
     var_slope: float
 
 
-def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consensus) -> list[_Line | None]:
+def _fit_lines(votes: Votes, line_weight: Array) -> list[_Line | None]:
     """Weighted straight lines through the agreed points of every sampled edge; None for fewer than four points."""
-    first = prediction.layout.first
-    inlier = np.flatnonzero(consensus.weight)
+    candidates, prediction = votes.candidates, votes.prediction
+    layout = prediction.layout
+    first = layout.first
+    inlier = np.flatnonzero(line_weight)
     sample = candidates.sample[inlier]
     gain = prediction.gain[sample]
     along = prediction.along[sample]
     terms = np.zeros((5, len(inlier) + 1))
     weight, weighted_along, weighted_square, weighted_offset, weighted_both = terms[:, 1:]
-    np.divide(consensus.weight[inlier], gain * gain, out=weight)
+    np.divide(line_weight[inlier], gain * gain, out=weight)
     np.multiply(weight, along, out=weighted_along)
     np.multiply(weighted_along, along, out=weighted_square)
     np.multiply(weight, gain * candidates.offset_px[inlier], out=weighted_offset)
@@ -234,12 +236,16 @@ def _fit_lines(candidates: Candidates, prediction: Prediction, consensus: Consen
     # Points come sorted by edge: sums over edges are differences of running sums.
     bounds = np.append(np.searchsorted(sample, first), len(inlier))
     sums = np.cumsum(terms, axis=1)[:, bounds]
+    # What an edge's points share moves the whole line.
+    shared = (votes.edge_spread_px[layout.edges] * prediction.gain[first]) ** 2
     lines: list[_Line | None] = []
-    for count, s0, s1, s2, t0, t1 in zip(np.diff(bounds).tolist(), *np.diff(sums, axis=1).tolist(), strict=True):
+    for count, common, s0, s1, s2, t0, t1 in zip(
+        np.diff(bounds).tolist(), shared.tolist(), *np.diff(sums, axis=1).tolist(), strict=True
+    ):
         determinant = s0 * s2 - s1 * s1
         if count < 4 or not determinant > 0.0:
             lines.append(None)
             continue
         k = 1.0 / determinant
-        lines.append(_Line((s2 * t0 - s1 * t1) * k, (s0 * t1 - s1 * t0) * k, s2 * k, -s1 * k, s0 * k))
+        lines.append(_Line((s2 * t0 - s1 * t1) * k, (s0 * t1 - s1 * t0) * k, s2 * k + common, -s1 * k, s0 * k))
     return lines

@@ -14,17 +14,17 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
-from scipy.linalg.lapack import dposv
 
 from gripmon.camera import Camera
 from gripmon.corners.consensus import (
     Consensus,
     ConsensusSettings,
+    Prior,
+    Votes,
     agree,
     agree_from_grid,
     base_weights,
     grid_of_starts,
-    noise_inflation,
     prior_information,
 )
 from gripmon.corners.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
@@ -40,6 +40,7 @@ from gripmon.corners.profiles import (
     read_profiles,
 )
 from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.corners.uncertainty import CONTRADICTION, assess, without_one_edge
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
@@ -57,6 +58,15 @@ FOUND_EDGES = 0.85
 
 SETTLED_STARTS = 3
 """Starts of a wide search that are followed to the end."""
+
+ZOOMS = (1, 2, 4)
+"""Factors on all lengths along the profiles, for images that are out of focus."""
+
+BLUR_AT_ZOOM = (0.7, 1.7)
+"""Blur of the edges at zoom 1, px, below which the next finer and above which the next coarser zoom fits better."""
+
+FEWEST_WIDTHS = 20
+"""Edge points from which the blur is told."""
 
 SATISFIED = 0.65
 """Part of the usual share below which the gripper may be elsewhere."""
@@ -103,9 +113,8 @@ class Patience:
 class Measurement:
     """``cam_T_grip`` and ``jaw_opening_m`` that the agreed edge points give, and everything that led there.
 
-    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening), already multiplied by ``inflation``, the factor by
-    which the residuals exceed the image noise; ``jaw_surprise``: the seen jaw opening against the reported one
-    (``jaw_reported_m``), in standard deviations of the latter.
+    ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_surprise``: the seen jaw opening against the
+    reported one (``jaw_reported_m``), in standard deviations of the latter.
 
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
@@ -118,7 +127,6 @@ class Measurement:
     cam_T_grip: Array
     jaw_opening_m: float
     covariance: Array
-    inflation: float
     jaw_reported_m: float
     jaw_surprise: float
     effort: Effort
@@ -164,6 +172,7 @@ class FingertipMeter:
     def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
         self._camera, self._gripper, self._settings = camera, gripper, settings
         self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
+        self._zoom = 1
         self._prior_reported = prior_information(jaw_sigma_m if gripper.has_jaw else None)
         self._prior_unreported = prior_information(JAW_UNREPORTED_SIGMA_M if gripper.has_jaw else None)
         self._prior = self._prior_reported
@@ -191,6 +200,10 @@ class FingertipMeter:
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
         satisfied = SATISFIED * usual_share
+        if best.consensus.share < satisfied:
+            best = self._at_other_zooms(image, expected, best)
+        if best.consensus.share >= self._settings.consensus.trusted_share:
+            self._zoom_to(self._fitting_zoom(best))
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
             return best
@@ -202,12 +215,49 @@ class FingertipMeter:
         beat = CLEARLY_BETTER * best.consensus.share if trusted else best.consensus.share
         for look in (self._from_grid, self._search):
             other = look(image, expected)
-            if other.consensus.share > max(beat, best.consensus.share):
+            # A place that may be true is not given up for one that isn't believed.
+            if other.consensus.share > max(beat, best.consensus.share) and (
+                not trusted or self._trusted(other, usual_share)
+            ):
                 best = other
             if best.consensus.share >= satisfied:
                 break
         best.trusted, best.looked_far = self._trusted(best, usual_share), True
         return best
+
+    def _at_other_zooms(self, image: Image, expected: _Expected, best: Measurement) -> Measurement:
+        """The best of the zooms: the image may have lost, or found, its focus."""
+        chosen = self._zoom
+        for zoom in ZOOMS:
+            if zoom == chosen:
+                continue
+            self._zoom_to(zoom)
+            other = self._settle(image, expected)
+            # A coarse zoom reaches far and sees little: only where the edges are as blurred as it expects.
+            if other.consensus.share > CLEARLY_BETTER * best.consensus.share and self._fitting_zoom(other) == zoom:
+                best, chosen = other, zoom
+        self._zoom_to(chosen)
+        return best
+
+    def _fitting_zoom(self, measurement: Measurement) -> int:
+        """The zoom for the next frame: by how blurred the edges are that agreed."""
+        widths_px = measurement.candidates.width_px[measurement.consensus.weight > 0.0]
+        if len(widths_px) < FEWEST_WIDTHS:
+            return self._zoom
+        kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
+        blur_px = math.sqrt(max(float(np.median(widths_px)) ** 2 - kernel_px**2, 0.0))
+        finer, coarser = BLUR_AT_ZOOM
+        if blur_px > coarser * self._zoom:
+            return min(2 * self._zoom, ZOOMS[-1])
+        return max(self._zoom // 2, 1) if blur_px < finer * self._zoom else self._zoom
+
+    def _zoom_to(self, zoom: int) -> None:
+        if zoom != self._zoom:
+            self._zoom, self._laid_out, self._prediction = zoom, None, None
+
+    @property
+    def _reach_px(self) -> float:
+        return self._zoom * self._settings.sampling.reach_px
 
     def _trusted(self, measurement: Measurement, usual_share: float) -> bool:
         consensus = self._settings.consensus
@@ -222,32 +272,37 @@ class FingertipMeter:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
         most.
         """
+        settings = self._settings
         for _ in range(3):
             prediction, start = self._predicted(expected)
-            candidates, weights = self._look(image, prediction)
-            prior_mean = self._prior_mean(prediction, expected)
-            consensus = agree(candidates, prediction, weights, start, prior_mean, self._prior, self._settings.consensus)
+            votes = self._look(image, prediction)
+            prior = self._prior_about(prediction, expected)
+            consensus = agree(votes, prior, start, settings.consensus)
             moved_px = prediction.moved_px(consensus.xi)
-            if moved_px > 2.0 * self._settings.sampling.reach_px:
+            if moved_px > 2.0 * self._reach_px:
                 # Nothing was seen out there: the few points that agree don't determine the motion.
                 consensus = replace(consensus, share=0.0)
                 break
             expected = self._moved(prediction, consensus.xi, expected)
-            if moved_px <= self._settings.relinearise_px:
+            if moved_px <= settings.relinearise_px:
                 break
-        corners = intersect_edges(candidates, prediction, consensus, self._geometry, self._settings.corners)
-        inflation = noise_inflation(candidates, prediction, consensus)
+        uncertainty = assess(votes, consensus, self._prior)
+        if uncertainty.contradiction > CONTRADICTION:
+            found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
+            if found is not None:
+                votes, consensus, uncertainty = found
+                expected = self._moved(prediction, consensus.xi, expected)
+        corners = intersect_edges(votes, consensus, uncertainty.line_weight, self._geometry, settings.corners)
         return Measurement(
             prediction,
-            candidates,
+            votes.candidates,
             consensus,
             corners,
             expected.cam_T_grip,
             expected.jaw_opening_m,
-            inflation * self._covariance(consensus.information),
-            inflation,
+            uncertainty.covariance,
             expected.jaw_reported_m,
-            self._jaw_surprise(prediction, consensus.xi, prior_mean),
+            self._jaw_surprise(consensus.xi, prior),
             Effort.NARROW,
         )
 
@@ -256,13 +311,10 @@ class FingertipMeter:
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
             return self._settle(image, expected)
-        candidates, weights = self._look(image, prediction)
-        settings = self._settings
-        prior_mean = self._prior_mean(prediction, expected)
-        starts = grid_of_starts(prediction, settings.sampling.reach_px, settings.consensus.start_width_px)
-        consensus = agree_from_grid(
-            candidates, prediction, weights, starts + start, prior_mean, self._prior, settings.consensus
-        )
+        settings = self._settings.consensus
+        starts = grid_of_starts(prediction, self._reach_px, settings.start_width_px)
+        prior = self._prior_about(prediction, expected)
+        consensus = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
         return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
@@ -277,12 +329,9 @@ class FingertipMeter:
             seen = self._predict(prediction.layout, there)
             if not seen.ok.any():
                 continue
-            candidates, weights = self._look(image, seen)
-            starts = grid_of_starts(seen, settings.sampling.reach_px, settings.consensus.start_width_px)
-            prior_mean = self._prior_mean(seen, there)
-            fit = agree_from_grid(
-                candidates, seen, weights, starts, prior_mean, self._prior, settings.consensus, refine=3
-            )
+            starts = grid_of_starts(seen, self._reach_px, settings.consensus.start_width_px)
+            prior = self._prior_about(seen, there)
+            fit = agree_from_grid(self._look(image, seen), prior, starts, settings.consensus, refine=3)
             tried.append((fit.share, self._moved(seen, fit.xi, there)))
         tried.sort(key=lambda item: -item[0])
         found = [self._settle(image, there) for _, there in tried[:SETTLED_STARTS]]
@@ -299,7 +348,10 @@ class FingertipMeter:
                 return kept, start
         cam_T_grip, jaw_opening_m = expected.cam_T_grip, expected.jaw_opening_m
         if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
-            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.sampling)
+            sampling = self._settings.sampling
+            margin_px = self._zoom * sampling.end_margin_px
+            sampling = msgspec.structs.replace(sampling, reach_px=self._reach_px, end_margin_px=margin_px)
+            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, sampling)
             self._laid_out = layout, self._corner_pixels(expected)
         self._prediction = self._predict(self._laid_out[0], expected)
         self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
@@ -313,7 +365,7 @@ class FingertipMeter:
             layout,
             expected.cam_T_grip,
             expected.jaw_opening_m,
-            self._offsets_px,
+            self._zoom * self._offsets_px,
             jaw_unknown,
         )
 
@@ -326,28 +378,21 @@ class FingertipMeter:
         points_grip_m = self._gripper.points_grip_m(expected.jaw_opening_m)[self._gripper.corner_points]
         return self._camera.project(points_grip_m @ expected.cam_T_grip[:3, :3].T + expected.cam_T_grip[:3, 3])
 
-    def _look(self, image: Image, prediction: Prediction) -> tuple[Candidates, Array]:
-        settings = self._settings
+    def _look(self, image: Image, prediction: Prediction) -> Votes:
+        settings, gripper = self._settings, self._gripper
         profiles = read_profiles(image, prediction.map_x, prediction.map_y)
         noise = estimate_noise(profiles, quantum(image))
-        candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges)
-        polarity, bevel_m = self._gripper.edge_polarity, self._gripper.edge_bevel_m
-        return candidates, base_weights(candidates, prediction, polarity, bevel_m, settings.consensus)
+        candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges, self._zoom)
+        weights = base_weights(candidates, prediction, gripper.edge_polarity, settings.consensus)
+        # A bevel moves its edge by anything up to its width.
+        bevel_px = gripper.edge_bevel_m * (prediction.pixels_per_m / math.sqrt(12.0))
+        return Votes(candidates, prediction, weights, np.hypot(settings.consensus.edge_floor_px, bevel_px))
 
-    def _covariance(self, information: Array) -> Array:
-        """Inverse of the edge points' information and the prior's together."""
-        normal = information.copy()
-        normal.flat[:: len(normal) + 1] += self._prior
-        _, inverse, failed = dposv(normal, np.eye(len(normal)))
-        if failed:
-            raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
-        return 0.5 * (inverse + inverse.T)
-
-    def _jaw_surprise(self, prediction: Prediction, xi: Array, prior_mean: Array) -> float:
+    def _jaw_surprise(self, xi: Array, prior: Prior) -> float:
         """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a
         jaw.
         """
-        return float((xi[6] - prior_mean[6]) * np.sqrt(self._prior[6])) if len(self._prior) == 7 else 0.0
+        return float((xi[6] - prior.mean[6]) * np.sqrt(prior.information[6])) if len(self._prior) == 7 else 0.0
 
     def _from_prediction(self, prediction: Prediction, expected: _Expected) -> Array:
         """(m,) from the prediction's pose and opening to the expected ones."""
@@ -358,10 +403,10 @@ class FingertipMeter:
         """How far the measured gripper shows from where ``cam_T_grip`` had put it, px."""
         return measurement.prediction.moved_px(perturbation_between(cam_T_grip, measurement.cam_T_grip))
 
-    def _prior_mean(self, prediction: Prediction, expected: _Expected) -> Array:
+    def _prior_about(self, prediction: Prediction, expected: _Expected) -> Prior:
         mean = np.zeros(len(self._prior))
         mean[6:] = expected.jaw_reported_m - prediction.jaw_opening_m
-        return mean
+        return Prior(mean, self._prior)
 
     def _moved(self, prediction: Prediction, xi: Array, expected: _Expected) -> _Expected:
         """The expectation after a fit; an opening beyond the jaw's range stays at its end (the fit sees the misfit)."""

@@ -27,29 +27,38 @@ GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
 class EdgeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """What counts as an edge candidate."""
 
-    blur_px: Annotated[float, Meta(ge=0.4, le=5.0, description="sigma of the derivative of Gaussian (px)")] = 0.8
+    blur_px: Annotated[float, Meta(ge=0.4, le=5.0, description="sigma of the derivative of Gaussian (px)")] = 0.65
     noise_factor: Annotated[
         float, Meta(ge=2.0, le=50.0, description="smallest edge response in standard deviations of its noise")
-    ] = 5.0
+    ] = 3.0
     contrast_fraction: Annotated[
         float, Meta(ge=0.0, le=0.5, description="smallest step in grey levels as a fraction of the image's full scale")
     ] = 0.008
+
+
+_CUBIC_AT_HALVES = (-0.094, 0.0, 0.594, 1.0, 0.594, 0.0, -0.094)
+
+UNREST_FROM_PX, UNREST_TO_PX = 2.0, 5.0
+"""Where texture is looked for that may shift an edge, from the edge to both sides, px."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
     """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal,
     ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px``
-    (k,) standard deviation from image noise.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest
-    grey level of the image's type.
+    (k,) standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a
+    Gaussian.  ``zoom``: factor on the lengths of the profiles that were read.  ``noise`` is the image noise in grey
+    levels, ``full_scale`` the largest grey level of the image's type.
     """
 
     sample: NDArray[np.intp]
     offset_px: Array
     step: Array
     sigma_px: Array
+    width_px: Array
     noise: float
     full_scale: float
+    zoom: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +83,7 @@ def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.fl
     """
     if map_x.size == 0:
         return np.zeros(map_x.shape, dtype=np.float32)
-    values = cv2.remap(image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    values = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     if values.ndim == 3:
         return values.astype(np.float32) @ GREY_BGR
     return values.astype(np.float32)
@@ -91,7 +100,7 @@ def quantum(image: Image) -> float:
 
 
 @lru_cache(maxsize=64)
-def _kernel(samples: int, blur_px: float) -> _Kernel:
+def _kernel(samples: int, blur_px: float, zoom: int) -> _Kernel:
     half = math.ceil(3.0 * blur_px / STEP_PX)
     if 2 * half + 5 > samples:
         raise ValueError(f"a blur of {blur_px} px needs profiles of at least {(half + 2) * STEP_PX} px to both sides")
@@ -103,11 +112,12 @@ def _kernel(samples: int, blur_px: float) -> _Kernel:
     matrix = np.zeros((samples, responses), dtype=np.float32)
     for k in range(responses):
         matrix[k : k + len(taps), k] = taps
-    # Pixels, not half-pixel samples, carry independent noise: bilinear interpolation spreads each over a triangle of
-    # one pixel.
-    triangle = np.array([0.5, 1.0, 0.5])
-    effective = np.convolve(taps, triangle)[::2]
-    slope = np.gradient(np.convolve(taps, triangle), STEP_PX)[::2]
+    # Pixels, not half-pixel samples, carry independent noise: cubic interpolation spreads each over its neighbours.
+    # Zoomed samples are pixels apart.
+    taps_of_pixel = np.array(_CUBIC_AT_HALVES) if zoom == 1 else np.ones(1)
+    apart = 2 if zoom == 1 else 1
+    effective = np.convolve(taps, taps_of_pixel)[::apart]
+    slope = np.gradient(np.convolve(taps, taps_of_pixel), STEP_PX)[::apart]
     response_noise = float(np.sqrt((effective**2).sum()))
     # A step blurred by the lens (about 0.6 px) answers with a Gaussian of this width; its peak moves by noise' /
     # curvature.
@@ -118,14 +128,19 @@ def _kernel(samples: int, blur_px: float) -> _Kernel:
 
 
 def find_candidates(
-    profiles: NDArray[np.float32], ok: NDArray[np.bool_], noise: float, grey_range: float, settings: EdgeSettings
+    profiles: NDArray[np.float32],
+    ok: NDArray[np.bool_],
+    noise: float,
+    grey_range: float,
+    settings: EdgeSettings,
+    zoom: int = 1,
 ) -> Candidates:
     """Local extrema of the edge response of profiles (n, s), refined by a parabola through three responses.
 
-    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`).  Nothing found is an empty
-    result.
+    ``noise`` is the image's standard deviation in grey levels (:func:`estimate_noise`); the profiles' samples lie
+    ``zoom`` half pixels apart.  Nothing found is an empty result.
     """
-    kernel = _kernel(profiles.shape[1], settings.blur_px)
+    kernel = _kernel(profiles.shape[1], settings.blur_px, zoom)
     response = profiles @ kernel.matrix
     height = np.abs(response)
     threshold = max(settings.noise_factor * noise * kernel.response_noise, settings.contrast_fraction * grey_range)
@@ -140,18 +155,42 @@ def find_candidates(
     values = height.ravel()
     # A flat top would round to a curvature of zero in single precision.
     left, centre, right = (values[at + k].astype(np.float64) for k in (-1, 0, 1))
-    shift = 0.5 * (left - right) / (left - 2.0 * centre + right)
-    offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
+    curvature = 2.0 * centre - left - right
+    offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + 0.5 * (right - left) / curvature)
     step = response.ravel()[at].astype(np.float64)
-    sigma_px = (noise * kernel.curvature_noise_px) / centre
-    return Candidates(sample, offset_px, step, sigma_px, noise, grey_range)
+    sigma_px = np.maximum(
+        (noise * kernel.curvature_noise_px) / centre, STEP_PX * _unrest(response, sample, column + 1) / curvature
+    )
+    width_px = STEP_PX * np.sqrt(centre / curvature)
+    return Candidates(sample, zoom * offset_px, step, zoom * sigma_px, zoom * width_px, noise, grey_range, zoom)
+
+
+def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
+    """Root mean square change of the response from sample to sample around each candidate (k,), but not at it.
+
+    What lies beside an edge, texture and noise alike, would go on under the edge, where it shifts the peak.
+    """
+    squares = np.empty_like(response)
+    squares[:, 0] = 0.0
+    np.subtract(response[:, 1:], response[:, :-1], out=squares[:, 1:])
+    np.square(squares, out=squares)
+    running = np.cumsum(squares, axis=1).ravel()
+    columns = response.shape[1]
+    row = sample * columns
+    last = columns - 1
+    near, far = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
+    ends = [np.clip(column + k, 0, last) for k in (-far, -near, near, far)]
+    a, b, c, d = (running[row + end] for end in ends)
+    total = (b - a) + (d - c)
+    count = (ends[1] - ends[0]) + (ends[3] - ends[2])
+    return np.sqrt(np.maximum(total, 0.0) / np.maximum(count, 1))
 
 
 def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:
     """Standard deviation of the image noise, grey levels, from the quiet parts of the profiles (n, s).
 
     Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that
-    the lower quartile is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29
+    the lowest tenth is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29
     of it.
     """
     whole = profiles[::3, ::2]
@@ -159,7 +198,7 @@ def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float
     floor = quantum / math.sqrt(12.0)
     if not third.size:
         return floor
-    quartile = float(np.partition(third, third.size // 4)[third.size // 4])
-    # Of a normal distribution a quarter lies within 0.3186 sigma; a third difference of white noise has variance 20,
-    # of which bilinear interpolation at a random phase leaves two thirds across each axis.
-    return max(quartile / (0.3186 * math.sqrt(20.0 * 4.0 / 9.0)), floor)
+    tenth = float(np.partition(third, third.size // 10)[third.size // 10])
+    # Of a normal distribution a tenth lies within 0.1257 sigma; a third difference of white noise has variance 20,
+    # of which cubic interpolation at a random phase leaves 0.64 along the profile and 0.86 across.
+    return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64 * 0.86)), floor)

@@ -57,7 +57,7 @@ def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array)
     offset_px = prediction.jacobian[:, :6] @ xi
     if prediction.jacobian.shape[1] == 7:
         offset_px = offset_px + prediction.jacobian[:, 6] * (measurement.jaw_reported_m - prediction.jaw_opening_m)
-    gate_px = min(3.0 * measurement.consensus.scale_px, GATE_PX)
+    gate_px = min(3.0 * measurement.consensus.spread_px, GATE_PX)
     close = np.abs(candidates.offset_px - offset_px[candidates.sample]) < gate_px
     agrees = np.zeros(len(prediction.uv_px), dtype=bool)
     agrees[candidates.sample[close]] = True

@@ -25,7 +25,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
         (gripmon.corners.measure, "agree"),
-        (gripmon.corners.measure, "noise_inflation"),
+        (gripmon.corners.measure, "assess"),
         (FingertipMeter, "measure"),
     ),
     "corners": ((gripmon.corners.measure, "intersect_edges"),),

@@ -1,0 +1,117 @@
+"""How uncertain a joint fit is: from the scatter that its edge points show, never only from the noise assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from gripmon.corners.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
+from gripmon.records import Array
+
+CONTRADICTION = 3.0
+"""Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
+
+_EXPLAINED = 1.0 / 3.0
+_SMALLEST_SCATTER = 0.3
+_FEWEST_FREE = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """``covariance`` (m, m) of the fit's unknowns; ``line_weight`` (k,) what each candidate is worth for the line of
+    its edge alone, 1/px², zero for those that don't belong; ``shared_px`` standard deviation that the points of a
+    stretch share; ``contradiction``: the weighted squares of the stretches' means over what independent errors of the
+    assumed size would give, about 1.
+    """
+
+    covariance: Array
+    line_weight: Array
+    shared_px: float
+    contradiction: float
+
+
+def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Uncertainty:
+    """Covariance of a fit whose points err together.
+
+    Texture on and behind an edge moves it, and neighbours with it.  That shows in the weighted means of the residuals
+    of whole stretches: with independent errors of the assumed size their weighted squares Q add up to the number of
+    stretches less the number of unknowns.  What Q has more is the variance tau² that the points of a stretch share (the
+    moment estimator of a random effect, DerSimonian and Laird 1986); what it has less says that the points are better
+    than assumed.  With N the information of the fit, k its stiffness, P the prior, and g the sum of weight times
+    Jacobian over a group, the covariance of the weighted fit is (Huber 1981, section 6.3, for groups that err
+    together)
+
+        H^-1 (c N + tau² sum_stretches g g' + k² sum_edges spread² g g' + P) H^-1,   H = k N + P
+
+    c and tau² come from the biweight's pulls, which are smaller than the residuals, so that only the edges' spread,
+    which is given in px, has to be multiplied by k.
+    """
+    inlier = np.flatnonzero(consensus.weight)
+    stiffness = consensus.stiffness
+    stiff = stiffness * consensus.information
+    stiff.flat[:: len(stiff) + 1] += prior_information
+    _, inverse, failed = dposv(stiff, np.eye(len(stiff)))
+    if failed:
+        raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
+    if not len(inlier):
+        return Uncertainty(0.5 * (inverse + inverse.T), np.zeros(len(consensus.weight)), 0.0, 1.0)
+    prediction = votes.prediction
+    sample, weight = votes.candidates.sample[inlier], consensus.weight[inlier]
+    edge, stretch = prediction.layout.edge[sample], prediction.layout.stretch[sample]
+    # The weights were limited for what an edge's points share; this undoes it.
+    spread = votes.edge_spread_px
+    worth = 1.0 - spread**2 * np.bincount(edge, weight, len(spread))
+    alone = weight / worth[edge]
+    first = np.flatnonzero(np.diff(stretch, prepend=-1))
+    total = np.add.reduceat(alone, first)
+    moment = np.add.reduceat(alone * consensus.residual_px[inlier], first)
+    contradiction = _contradiction(total, moment, len(consensus.xi))
+    scatter, shared = max(min(contradiction, 1.0), _SMALLEST_SCATTER), 0.0
+    if contradiction > 1.0:
+        shared = (contradiction - 1.0) * len(total) / float(total.sum())
+    jacobian = prediction.jacobian_by_unknown[:, sample]
+    pulls = np.add.reduceat(jacobian * weight, first, axis=1)
+    middle = scatter * ((jacobian * (weight * worth[edge])) @ jacobian.T) + shared * (pulls @ pulls.T)
+    of_stretch = edge[first]
+    begin = np.flatnonzero(np.diff(of_stretch, prepend=-1))
+    pulls = np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread[of_stretch[begin]])
+    middle += pulls @ pulls.T
+    middle.flat[:: len(middle) + 1] += prior_information
+    covariance = inverse @ middle @ inverse
+    line_weight = np.zeros(len(consensus.weight))
+    counts = np.diff(np.append(first, len(inlier)))
+    line_weight[inlier] = alone * np.repeat(stiffness**2 / (scatter + shared * total), counts)
+    shared_px = float(np.sqrt(shared)) / stiffness
+    return Uncertainty(0.5 * (covariance + covariance.T), line_weight, shared_px, contradiction)
+
+
+def _contradiction(total: Array, moment: Array, unknowns: int) -> float:
+    """Weighted squares of the stretches' means over their degrees of freedom; 1 where too few stretches are left.
+
+    Above 1 it gives tau² = (contradiction - 1) * stretches / sum of their weights.
+    """
+    freedom = len(total) - unknowns
+    return float((moment**2 / total).sum()) / freedom if freedom >= _FEWEST_FREE else 1.0
+
+
+def without_one_edge(
+    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, contradiction: float
+) -> tuple[Votes, Consensus, Uncertainty] | None:
+    """The fit, from ``start`` (m,), without the one edge of the gripper that contradicts all others; None if no single
+    edge explains the ``contradiction``.
+
+    An edge without contrast that has a straight edge of the background beside it, for example, turns the whole gripper
+    towards that, a little at each of its other edges, which are too many to be outliers.
+    """
+    edge = votes.prediction.layout.edge[votes.candidates.sample]
+    best: tuple[Votes, Consensus, Uncertainty] | None = None
+    for left_out in votes.prediction.layout.edges.tolist():
+        weight = np.where(edge == left_out, 0.0, votes.weight)
+        rest = replace(votes, weight=weight)
+        consensus = agree(rest, prior, start, settings)
+        uncertainty = assess(rest, consensus, prior.information)
+        if uncertainty.contradiction < (_EXPLAINED * contradiction if best is None else best[2].contradiction):
+            best = rest, consensus, uncertainty
+    return best
