@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, Patience
-from gripmon.corners.consensus import base_weights
+from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
+from gripmon.corners.uncertainty import Uncertainty
 from gripmon.geometry import from_record
 from gripmon.gripper import Gripper
 from gripmon.monitor import Monitor, MonitorSettings
@@ -135,11 +136,15 @@ class _ForeseeingMeter(FingertipMeter):
         here = Patience(when_doubtful=False, when_lost=False)
         return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
 
-    def _look(self, image: Image, prediction: Prediction) -> tuple[Candidates, Array]:
+    def _look(self, image: Image, prediction: Prediction) -> Votes:
         sample = np.flatnonzero(prediction.ok)
         polarity = self._gripper.edge_polarity
         step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
-        sigma_px = np.full(len(sample), EDGE_POINT_SIGMA_PX)
-        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, _NOISE, _FULL_SCALE)
-        settings = self._settings.consensus
-        return candidates, base_weights(candidates, prediction, polarity, self._gripper.edge_bevel_m, settings)
+        sigma_px, width_px = np.full(len(sample), EDGE_POINT_SIGMA_PX), np.ones(len(sample))
+        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, width_px, _NOISE, _FULL_SCALE)
+        return self._votes(candidates, prediction)
+
+    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
+        """As assumed: nothing scatters here."""
+        normal = consensus.information + np.diag(self._prior)
+        return Uncertainty(np.linalg.inv(normal), consensus.weight, 0.0, 1.0)

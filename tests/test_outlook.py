@@ -18,9 +18,8 @@ from gripmon.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.corners import MeasurementSettings
-from gripmon.corners.consensus import ConsensusSettings
+from gripmon.corners.consensus import ConsensusSettings, Votes
 from gripmon.corners.prediction import Prediction
-from gripmon.corners.profiles import Candidates
 from gripmon.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import EDGE_POINT_SIGMA_PX, Outlook, _ForeseeingMeter, expect, weakest_direction
@@ -49,14 +48,15 @@ class NoisyMeter(_ForeseeingMeter):
 
     rng = np.random.default_rng(1)
 
-    def _look(self, image: Image, prediction: Prediction) -> tuple[Candidates, np.ndarray]:
-        candidates, weights = super()._look(image, prediction)
+    def _look(self, image: Image, prediction: Prediction) -> Votes:
+        votes = super()._look(image, prediction)
+        candidates = votes.candidates
         to_truth = np.append(
             difference(prediction.cam_T_grip, nominal_cam_T_grip()), OPENING_M - prediction.jaw_opening_m
         )
         offset_px = prediction.jacobian[candidates.sample] @ to_truth
         offset_px += self.rng.normal(scale=EDGE_POINT_SIGMA_PX, size=len(offset_px))
-        return dataclasses.replace(candidates, offset_px=offset_px), weights
+        return dataclasses.replace(votes, candidates=dataclasses.replace(candidates, offset_px=offset_px))
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
@@ -103,9 +103,9 @@ def test_an_opening_that_is_wrong_shifts_the_pose_of_a_rendered_image_as_told():
     sure = type(meter())(make_camera(PAPER_LENS), box_gripper(), MeasurementSettings(), 0.0)
     right, wrong = (measure(image, using=sure, jaw_opening_m=OPENING_M + e).cam_T_grip for e in (0.0, wrong_m))
     shift = difference(right, wrong)
-    # Of the opening the prior holds a little, and floors weigh edges differently.
-    assert shift[2] == pytest.approx(told[2] * wrong_m, rel=0.1)
-    assert np.abs(shift[:2] - told[:2] * wrong_m).max() < 1e-5
+    # The image weighs the edges by their texture, which the outlook can not know.
+    assert shift[2] == pytest.approx(told[2] * wrong_m, rel=0.3)
+    assert np.abs(shift[:2] - told[:2] * wrong_m).max() < 3e-5
     assert told[2] > 2.0, "an opening looks like a distance: one part in 34 mm of 115 mm"
 
 

@@ -40,7 +40,7 @@ from gripmon.corners.profiles import (
     read_profiles,
 )
 from gripmon.corners.search import SearchSettings, search_starts
-from gripmon.corners.uncertainty import CONTRADICTION, assess, without_one_edge
+from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
@@ -286,7 +286,7 @@ class FingertipMeter:
             expected = self._moved(prediction, consensus.xi, expected)
             if moved_px <= settings.relinearise_px:
                 break
-        uncertainty = assess(votes, consensus, self._prior)
+        uncertainty = self._assess(votes, consensus)
         if uncertainty.contradiction > CONTRADICTION:
             found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
             if found is not None:
@@ -379,14 +379,21 @@ class FingertipMeter:
         return self._camera.project(points_grip_m @ expected.cam_T_grip[:3, :3].T + expected.cam_T_grip[:3, 3])
 
     def _look(self, image: Image, prediction: Prediction) -> Votes:
-        settings, gripper = self._settings, self._gripper
+        settings = self._settings
         profiles = read_profiles(image, prediction.map_x, prediction.map_y)
         noise = estimate_noise(profiles, quantum(image))
         candidates = find_candidates(profiles, prediction.ok, noise, full_scale(image), settings.edges, self._zoom)
-        weights = base_weights(candidates, prediction, gripper.edge_polarity, settings.consensus)
+        return self._votes(candidates, prediction)
+
+    def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
+        settings, gripper = self._settings.consensus, self._gripper
+        weights = base_weights(candidates, prediction, gripper.edge_polarity, settings)
         # A bevel moves its edge by anything up to its width.
         bevel_px = gripper.edge_bevel_m * (prediction.pixels_per_m / math.sqrt(12.0))
-        return Votes(candidates, prediction, weights, np.hypot(settings.consensus.edge_floor_px, bevel_px))
+        return Votes(candidates, prediction, weights, np.hypot(settings.edge_floor_px, bevel_px))
+
+    def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
+        return assess(votes, consensus, self._prior)
 
     def _jaw_surprise(self, xi: Array, prior: Prior) -> float:
         """By how many standard deviations of the reported jaw opening the seen one differs from it; zero without a
