@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from gripmon.geometry import exp_rotation, log_rotation, skew
 from gripmon.records import Array
@@ -51,24 +52,24 @@ def differential_update(
 ) -> Update:
     """Motion of the gripper in the camera frame from n >= 3 corners that are not collinear.
 
-    ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2) and ``covariance_xy``
-    (n, 2, 2): where they were measured, ideal coordinates; ``tcp_cam_m`` (3,): the transform's translation.  Raises
-    :class:`DegenerateGeometry` for fewer than three corners or a singular system.
+    ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2): where they were
+    measured, ideal coordinates; ``covariance_xy`` of each (n, 2, 2), or of all together (2n, 2n), since corners on one
+    edge err together; ``tcp_cam_m`` (3,): the transform's translation.  Raises :class:`DegenerateGeometry` for fewer
+    than three corners or a singular system.
     """
     if len(points_cam_m) < 3:
         raise DegenerateGeometry(f"{len(points_cam_m)} corners; the update needs at least 3")
     rotation, tcp = np.eye(3), tcp_cam_m.copy()
-    weight_xy = np.linalg.inv(covariance_xy)
+    weight_xy = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
     for _ in range(iterations):
         points = (points_cam_m - tcp_cam_m) @ rotation.T + tcp
         rows, sides = equation_17(points, measured_xy)
-        rows = _about_tcp(rows, tcp)
-        # A row is the image error times the depth, so its covariance is depth squared times the image's.
-        weight = weight_xy / (points[:, 2] ** 2)[:, None, None]
-        weighted = np.einsum("nki,nkl->nli", rows, weight)
-        normal = np.einsum("nli,nlj->ij", weighted, rows)
-        covariance = _inverse(normal)
-        xi = covariance @ np.einsum("nli,nl->i", weighted, sides)
+        # A row is the image error times the depth: divided by it, it has the image's covariance.
+        rows, sides = _about_tcp(rows, tcp) / points[:, 2, None, None], sides / points[:, 2, None]
+        jacobian = rows.reshape(-1, 6)
+        weighted = weight_xy @ jacobian
+        covariance = _inverse(jacobian.T @ weighted)
+        xi = covariance @ (sides.ravel() @ weighted)
         tcp = tcp + xi[:3]
         rotation = exp_rotation(xi[3:]) @ rotation
     return Update(np.concatenate([tcp - tcp_cam_m, log_rotation(rotation)]), covariance)

@@ -211,26 +211,30 @@ class Monitor:
         cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
         taken = self._taken(measurement, self._settings.update_corners)
         if self._settings.measurement == "corners" and np.count_nonzero(taken) >= 3:
+            covariance_xy = measurement.corners.joint_covariance_xy(taken)
             try:
-                update = self._corner_update(measurement, measurement.jaw_opening_m)
+                update = self._corner_update(measurement, taken, covariance_xy, measurement.jaw_opening_m)
                 cam_T_grip = perturb(measurement.prediction.cam_T_grip, update.xi)
                 covariance = update.covariance
                 if self._gripper.has_jaw:
                     # The corners take the opening as known: what its uncertainty does to the motion comes on top.
                     jaw_sigma_m = float(np.sqrt(measurement.covariance[6, 6]))
-                    opened = self._corner_update(measurement, measurement.jaw_opening_m + jaw_sigma_m)
+                    opened_m = measurement.jaw_opening_m + jaw_sigma_m
+                    opened = self._corner_update(measurement, taken, covariance_xy, opened_m)
                     covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
             except DegenerateGeometry:
                 pass  # The corners that are left lie on a line: the edges still determine the motion.
         return cam_T_grip, covariance + self._floor
 
-    def _corner_update(self, measurement: Measurement, jaw_opening_m: float) -> Update:
-        """Equation (17) on the corners that the settings take, with the jaw at an opening."""
-        taken = self._taken(measurement, self._settings.update_corners)
+    @staticmethod
+    def _corner_update(
+        measurement: Measurement, taken: NDArray[np.bool_], covariance_xy: Array, jaw_opening_m: float
+    ) -> Update:
+        """Equation (17) on the corners ``taken`` (c,), with the jaw at an opening."""
         return differential_update(
             measurement.corners_at(jaw_opening_m)[taken],
             measurement.corners.xy[taken],
-            measurement.corners.covariance_xy[taken],
+            covariance_xy,
             measurement.prediction.cam_T_grip[:3, 3],
         )
 
@@ -282,11 +286,9 @@ class Monitor:
         """
         taken = self._taken(measurement, self._settings.recalibrate_corners)
         points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
-        covariance_xy = measurement.corners.covariance_xy
+        covariance_xy = measurement.corners.joint_covariance_xy(taken)
         try:
-            pnp = recalibrate(
-                points_grip_m[taken], measurement.corners.xy[taken], covariance_xy[taken], self._cam_T_grip
-            )
+            pnp = recalibrate(points_grip_m[taken], measurement.corners.xy[taken], covariance_xy, self._cam_T_grip)
         except RecalibrationRefused as refusal:
             return self._policy.not_recalibrated(str(refusal))
         new_T, new_covariance = self._average.cam_T_grip, self._average.claimed_covariance

@@ -85,7 +85,7 @@ def expect(
     monitor = Monitor(camera, gripper, settings, reference)
     cam_T_grip = from_record(reference.cam_T_grip)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
-    meter = _ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
+    meter = ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
     given = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
     covariance = monitor.update(given)[1]
     lever_m = _lever_m(given.prediction)
@@ -128,10 +128,11 @@ def _lever_m(prediction: Prediction) -> float:
     return float(np.sqrt((levers_m**2).sum(axis=1).mean()))
 
 
-class _ForeseeingMeter(FingertipMeter):
-    """Finds an edge point on every profile, where it was predicted."""
+class ForeseeingMeter(FingertipMeter):
+    """Looks at no image: finds an edge point on every profile, where it was predicted."""
 
     def foresee(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
+        """What the edge points alone give at a pose and an opening."""
         nothing = np.zeros((1, 1), np.uint8)
         here = Patience(when_doubtful=False, when_lost=False)
         return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)

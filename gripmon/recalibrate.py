@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 
 from gripmon.geometry import make_transform, perturb, perturbation_between, skew
 from gripmon.records import Array
@@ -47,15 +48,15 @@ def recalibrate(
 ) -> Recalibration:
     """Pose from n >= 4 coplanar or n >= 6 general corners.
 
-    ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates with ``covariance_xy`` (n, 2, 2).
-    ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals don't tell apart.  Raises
-    :class:`RecalibrationRefused` for too few or collinear corners.
+    ``points_grip_m`` (n, 3), ``measured_xy`` (n, 2) ideal coordinates, ``covariance_xy`` (n, 2, 2) of each corner or
+    (2n, 2n) of all together.  ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals
+    don't tell apart.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
     """
     why = refusal(points_grip_m)
     if why is not None:
         raise RecalibrationRefused(why)
     starts = _closed_forms(points_grip_m, measured_xy, coplanar(points_grip_m))
-    weight_xy: Array = np.linalg.inv(covariance_xy)
+    weight_xy: Array = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
     sound = [r for r in refined if r is not None]
     if not sound:
@@ -110,12 +111,12 @@ def _refine(
         d_xy = np.zeros((len(points), 2, 3))
         d_xy[:, 0, 0] = d_xy[:, 1, 1] = 1.0 / points[:, 2]
         d_xy[:, :, 2] = -xy / points[:, 2:]
-        jacobian = np.concatenate([d_xy, -d_xy @ skew(levers)], axis=2)
-        residual = measured_xy - xy
-        weighted = np.einsum("nki,nkl->nli", jacobian, weight_xy)
-        normal = np.einsum("nli,nlj->ij", weighted, jacobian)
+        jacobian = np.concatenate([d_xy, -d_xy @ skew(levers)], axis=2).reshape(-1, 6)
+        residual = (measured_xy - xy).ravel()
+        weighted = weight_xy @ jacobian
+        normal = jacobian.T @ weighted
         try:
-            step = np.linalg.solve(normal, np.einsum("nli,nl->i", weighted, residual))
+            step = np.linalg.solve(normal, residual @ weighted)
         except np.linalg.LinAlgError:
             return None
         cam_T_grip = perturb(cam_T_grip, step)
@@ -123,7 +124,7 @@ def _refine(
             return None
         if np.abs(step[:3]).max() < 1e-10 and np.abs(step[3:]).max() < 1e-9:
             break
-    error = float(np.einsum("nk,nkl,nl->", residual, weight_xy, residual))
+    error = float(residual @ weight_xy @ residual)
     return Recalibration(cam_T_grip, np.linalg.inv(normal), float(np.sqrt(error / residual.size)))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
+from sampled import INDEPENDENT, OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
 from watched import reference_of, watched
 
@@ -18,16 +18,9 @@ from gripmon.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.corners import MeasurementSettings
-from gripmon.corners.consensus import ConsensusSettings, Votes
-from gripmon.corners.prediction import Prediction
 from gripmon.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
-from gripmon.outlook import EDGE_POINT_SIGMA_PX, Outlook, _ForeseeingMeter, expect, weakest_direction
-from gripmon.records import Image
-
-# Floors out of the way: edge points have the assumed standard deviation and nothing beside.
-INDEPENDENT = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))
-OPENING_M = 0.034
+from gripmon.outlook import Outlook, expect, weakest_direction
 
 
 def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> Outlook:
@@ -43,28 +36,12 @@ def box_model() -> dict[str, Any]:
     return model
 
 
-class NoisyMeter(_ForeseeingMeter):
-    """Edge points with the assumed noise about the place where the nominal pose at the true opening puts them."""
-
-    rng = np.random.default_rng(1)
-
-    def _look(self, image: Image, prediction: Prediction) -> Votes:
-        votes = super()._look(image, prediction)
-        candidates = votes.candidates
-        to_truth = np.append(
-            difference(prediction.cam_T_grip, nominal_cam_T_grip()), OPENING_M - prediction.jaw_opening_m
-        )
-        offset_px = prediction.jacobian[candidates.sample] @ to_truth
-        offset_px += self.rng.normal(scale=EDGE_POINT_SIGMA_PX, size=len(offset_px))
-        return dataclasses.replace(votes, candidates=dataclasses.replace(candidates, offset_px=offset_px))
-
-
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
 @pytest.mark.parametrize("reported", [True, False], ids=["opening reported", "opening unknown"])
 def test_expected_sigmas_are_the_spread_of_sampled_measurements(lens: LensSettings, reported: bool):
     """A camera that stands, a robot that reports its jaws with the stated error or not at all."""
     rng, samples = np.random.default_rng(2), 250
-    sampled = NoisyMeter(make_camera(lens), box_gripper(), INDEPENDENT, JAW_SIGMA_M)
+    sampled = NoisyMeter(JAW_SIGMA_M, lens=lens)
     errors, seen_m = np.empty((samples, 6)), np.empty(samples)
     for k in range(samples):
         wrong_m = rng.normal(scale=JAW_SIGMA_M)

@@ -40,8 +40,9 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 @dataclass(frozen=True, slots=True)
 class Corners:
     """Measured corners, arrays over all corners of the gripper: ``xy`` (c, 2) ideal coordinates, ``covariance_xy``
-    (c, 2, 2), ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each, ``usable``
-    (c,) where there is none; NaN where a corner was not measured.
+    (c, 2, 2) of each by itself, ``uv_px`` (c, 2), ``sigma_px`` (c,) the larger axis, ``fault`` one reason or None each,
+    ``usable`` (c,) where there is none; NaN where a corner was not measured.  ``sides``: for each corner the edges on
+    which it rests, with their lines.
     """
 
     xy: Array
@@ -50,6 +51,29 @@ class Corners:
     sigma_px: Array
     fault: tuple[CornerFault | None, ...]
     usable: NDArray[np.bool_]
+    sides: tuple[list[tuple[_Spoke, _Line]], ...]
+
+    def joint_covariance_xy(self, taken: NDArray[np.bool_]) -> Array:
+        """(2k, 2k) covariance of the k usable corners ``taken`` (c,) together: x and y of the first, then of the next.
+
+        Corners at the two ends of an edge err together, since one line carries both.
+        """
+        count = int(np.count_nonzero(taken))
+        joint = np.zeros((count, 2, count, 2))
+        on_line: dict[int, list[tuple[int, float, Array]]] = {}
+        for k, corner in enumerate(np.flatnonzero(taken).tolist()):
+            joint[k, :, k] = self.covariance_xy[corner]
+            for spoke, line in self.sides[corner]:
+                # Moved by a unit there, the line shifts the corner by its weighted normal.
+                normal = np.array(line.normal(spoke)) / line.variance(spoke.along)
+                others = on_line.setdefault(spoke.slot, [])
+                pull = self.covariance_xy[corner] @ normal
+                for other, along, other_pull in others:
+                    block = line.covariance_between(spoke.along, along) * np.outer(pull, other_pull)
+                    joint[k, :, other] += block
+                    joint[other, :, k] += block.T
+                others.append((k, spoke.along, pull))
+        return joint.reshape(2 * count, 2 * count)
 
 
 class _Spoke(NamedTuple):
@@ -129,9 +153,10 @@ def intersect_edges(
     lines = _fit_lines(votes, line_weight)
     seen = consensus.edge_seen.tolist()
     agreed = [0, *np.cumsum(consensus.supported).tolist()]
+    sides = tuple(_seen_sides(lines, seen, spokes) for spokes in geometry.spokes)
     measured = [
-        fault or _intersect(lines, seen, agreed, spokes, lens, settings)
-        for fault, spokes, lens in zip(geometry.fault, geometry.spokes, geometry.lens, strict=True)
+        fault or _intersect(rests_on, agreed, lens, settings)
+        for fault, rests_on, lens in zip(geometry.fault, sides, geometry.lens, strict=True)
     ]
     faults = tuple(m if isinstance(m, CornerFault) else None for m in measured)
     numbers = np.array([_NOTHING if isinstance(m, CornerFault) else m for m in measured]).reshape(-1, 6)
@@ -143,17 +168,21 @@ def intersect_edges(
         sigma_px,
         faults,
         np.array([fault is None for fault in faults], dtype=bool),
+        sides,
     )
 
 
 _NOTHING = (math.nan,) * 6
 
 
+def _seen_sides(lines: list[_Line | None], seen: list[bool], spokes: tuple[_Spoke, ...]) -> list[tuple[_Spoke, _Line]]:
+    """The edges at a corner that were measured and count as seen."""
+    return [(spoke, line) for spoke in spokes if (line := lines[spoke.slot]) is not None and seen[spoke.edge]]
+
+
 def _intersect(
-    lines: list[_Line | None],
-    seen: list[bool],
+    sides: list[tuple[_Spoke, _Line]],
     agreed: list[int],
-    spokes: tuple[_Spoke, ...],
     lens: tuple[float, float, float, float],
     settings: CornerSettings,
 ) -> tuple[float, float, float, float, float, float] | CornerFault:
@@ -164,15 +193,11 @@ def _intersect(
     """
     beside, rows = 0, []
     ixx = ixy = iyy = bx = by = 0.0
-    for spoke in spokes:
-        line = lines[spoke.slot]
-        if line is None or not seen[spoke.edge]:
-            continue
+    for spoke, line in sides:
         beside += 2 * (agreed[spoke.end] - agreed[spoke.begin]) >= spoke.end - spoke.begin
-        x = -spoke.direction_y - line.slope * spoke.direction_x
-        y = spoke.direction_x - line.slope * spoke.direction_y
+        x, y = line.normal(spoke)
         along = spoke.along
-        weight = 1.0 / (line.var_offset + along * (2.0 * line.covariance + along * line.var_slope))
+        weight = 1.0 / line.variance(along)
         wanted = weight * (line.offset + line.slope * along)
         ixx, ixy, iyy = ixx + weight * x * x, ixy + weight * x * y, iyy + weight * y * y
         bx, by = bx + wanted * x, by + wanted * y
@@ -215,6 +240,19 @@ class _Line(NamedTuple):
     var_offset: float
     covariance: float
     var_slope: float
+
+    def normal(self, spoke: _Spoke) -> tuple[float, float]:
+        """By how much the line's place there changes for a shift of the corner: its normal, turned by the slope."""
+        x, y = spoke.direction_x, spoke.direction_y
+        return -y - self.slope * x, x - self.slope * y
+
+    def variance(self, along: float) -> float:
+        """Of the line's place at a point of it."""
+        return self.var_offset + along * (2.0 * self.covariance + along * self.var_slope)
+
+    def covariance_between(self, along: float, other: float) -> float:
+        """Of its places at two points."""
+        return self.var_offset + (along + other) * self.covariance + along * other * self.var_slope
 
 
 def _fit_lines(votes: Votes, line_weight: Array) -> list[_Line | None]:

@@ -175,7 +175,7 @@ class MeasuredPair:
             return None
         points_cam_m = self._model_cam_m()[taken]
         measured_xy = self.after.corners.xy[taken]
-        covariance_xy = (self.before.corners.covariance_xy + self.after.corners.covariance_xy)[taken]
+        covariance_xy = sum(m.corners.joint_covariance_xy(taken) for m in (self.before, self.after))
         try:
             if way == "U":
                 tcp_m = self.reference_T[:3, 3]

@@ -1,0 +1,117 @@
+"""Covariances by sampling: edge points with known noise, and one in a hundred anywhere, through the joint fit, the
+lines, the corners and equation (17).  Normalised squared errors (NEES) have the mean of their degrees of freedom.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from meters import FISHEYE_LENS, JAW_SIGMA_M, difference
+from sampled import OPENING_M, NoisyMeter
+from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+
+from gripmon.corners import Measurement
+from gripmon.differential import differential_update
+from gripmon.geometry import perturb
+from gripmon.gripper import load_gripper
+from gripmon.recalibrate import recalibrate
+
+SAMPLES = 300
+LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
+NAMES = ["paper", "brown_conrady", "fisheye"]
+ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
+
+
+def normalised(error: np.ndarray, covariance: np.ndarray) -> float:
+    return float(error @ np.linalg.solve(covariance, error))
+
+
+def measurements(meter: NoisyMeter, reported: bool = True) -> list[tuple[Measurement, float]]:
+    """Many, each with the opening that is told: wrong by the stated standard deviation."""
+    rng = np.random.default_rng(7)
+    told_m = OPENING_M + rng.normal(scale=JAW_SIGMA_M, size=SAMPLES)
+    return [(meter.foresee(nominal_cam_T_grip(), opening_m, reported), opening_m) for opening_m in told_m]
+
+
+@pytest.mark.parametrize("gross", [0.0, 0.01], ids=["normal", "1 % gross"])
+@pytest.mark.parametrize("reported", [True, False], ids=["reported", "unknown"])
+@pytest.mark.parametrize("lens", LENSES, ids=NAMES)
+def test_the_joint_fits_covariance_is_that_of_its_errors(lens: object, reported: bool, gross: float):
+    """Pose and opening together, seven unknowns; of the mean of chi-square 0.2 is chance."""
+    nees_7, nees_6 = [], []
+    for found, _ in measurements(NoisyMeter(JAW_SIGMA_M, lens=lens, gross=gross), reported):  # type: ignore[arg-type]
+        error = np.append(difference(found.cam_T_grip, nominal_cam_T_grip()), OPENING_M - found.jaw_opening_m)
+        nees_7.append(normalised(error, found.covariance))
+        nees_6.append(normalised(error[:6], found.covariance[:6, :6]))
+    assert np.mean(nees_6) == pytest.approx(6.0, rel=0.1)
+    assert np.mean(nees_7) == pytest.approx(7.0, rel=0.1)
+    # 99.9 % of chi-square with six degrees of freedom lie below this.
+    assert np.mean(np.array(nees_6) < 22.46) > 0.99
+
+
+def test_the_same_for_fingers_on_an_arc():
+    nees = []
+    for found, _ in measurements(NoisyMeter(JAW_SIGMA_M, gripper=ADAPTIVE, gross=0.01)):
+        error = np.append(difference(found.cam_T_grip, nominal_cam_T_grip()), OPENING_M - found.jaw_opening_m)
+        nees.append(normalised(error, found.covariance))
+    assert np.mean(nees) == pytest.approx(7.0, rel=0.1)
+
+
+@pytest.mark.parametrize("gross", [0.0, 0.01], ids=["normal", "1 % gross"])
+def test_the_corners_joint_covariance_is_that_of_their_errors(gross: float):
+    """Also between corners at two ends of an edge.  Weights about the joint fit, not about each line by itself, leave
+    the lines a little nearer to it than they claim: up to a quarter of the variance.
+    """
+    meter = NoisyMeter(JAW_SIGMA_M, gross=gross)
+    true_xy, errors, nees = None, [], []
+    for found, _ in measurements(meter):
+        usable = found.corners.usable
+        assert np.count_nonzero(usable) == 6
+        true_xy = found.corners_at(OPENING_M)[usable]
+        error = (found.corners.xy[usable] - true_xy[:, :2] / true_xy[:, 2:]).ravel()
+        joint = found.corners.joint_covariance_xy(usable)
+        errors.append(error)
+        nees.append(normalised(error, joint))
+        np.testing.assert_allclose(
+            joint.reshape(6, 2, 6, 2)[range(6), :, range(6)], found.corners.covariance_xy[usable], rtol=1e-12
+        )
+    assert 0.75 * 12.0 < np.mean(nees) < 1.1 * 12.0
+    scale = np.sqrt(joint.diagonal())
+    claimed = joint / np.outer(scale, scale)
+    assert np.abs(claimed - np.eye(12)).max() > 0.4, "corners do err together"
+    # A sampled correlation scatters by 1 / sqrt(n).
+    np.testing.assert_allclose(np.corrcoef(np.array(errors).T), claimed, atol=4.0 / np.sqrt(SAMPLES))
+
+
+@pytest.mark.parametrize("gross", [0.0, 0.01], ids=["normal", "1 % gross"])
+def test_updates_and_new_poses_from_corners_are_as_certain_as_they_say(gross: float):
+    nees_update, nees_pose = [], []
+    points_grip_m = None
+    for found, _ in measurements(NoisyMeter(JAW_SIGMA_M, gross=gross)):
+        corners, taken = found.corners, found.corners.usable
+        joint = corners.joint_covariance_xy(taken)
+        points_cam_m = found.corners_at(OPENING_M)[taken]
+        start = found.prediction.cam_T_grip
+        update = differential_update(points_cam_m, corners.xy[taken], joint, start[:3, 3])
+        error = difference(perturb(start, update.xi), nominal_cam_T_grip())
+        nees_update.append(normalised(error, update.covariance))
+        points_grip_m = (points_cam_m - start[:3, 3]) @ start[:3, :3]
+        pose = recalibrate(points_grip_m, corners.xy[taken], joint, nominal_cam_T_grip())
+        error = difference(pose.cam_T_grip, nominal_cam_T_grip())
+        nees_pose.append(normalised(error, pose.covariance))
+    for nees in (nees_update, nees_pose):
+        assert 0.75 * 6.0 < np.mean(nees) < 1.1 * 6.0
+
+
+def test_corners_taken_for_independent_would_claim_too_little_certainty():
+    """What the joint covariance is for."""
+    nees: dict[bool, list[float]] = {False: [], True: []}
+    for found, _ in measurements(NoisyMeter(JAW_SIGMA_M)):
+        corners, taken = found.corners, found.corners.usable
+        start, points_cam_m = found.prediction.cam_T_grip, found.corners_at(OPENING_M)[taken]
+        for joint in (False, True):
+            covariance_xy = corners.joint_covariance_xy(taken) if joint else corners.covariance_xy[taken]
+            update = differential_update(points_cam_m, corners.xy[taken], covariance_xy, start[:3, 3])
+            error = difference(perturb(start, update.xi), nominal_cam_T_grip())
+            nees[joint].append(normalised(error, update.covariance))
+    assert np.mean(nees[False]) < 0.85 * np.mean(nees[True])
