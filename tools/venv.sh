@@ -1,4 +1,4 @@
-# Sourced by tools/demo and tools/test: makes or reuses a virtual environment with this checkout installed in it.
+# Sourced by tools/demo, tools/test and tools/bench: makes or reuses a virtual environment with this checkout installed in it.
 # GRIPMON_VENV: where (default .venv in the checkout).  PYTHON: which interpreter (default: the first one that is new enough).
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)
@@ -25,13 +25,13 @@ find_python() {
     exit 2
 }
 
-# ensure_venv EXTRAS: install the package with "" or "[test]" unless that was done with this very pyproject.toml
+# ensure_venv EXTRAS: install the package with "", "[test]" or "[bench]" unless that was done with this very pyproject.toml
 ensure_venv() {
     local extras=$1 stamp want
     stamp=$venv/.installed$extras
     want=$(cat "$checkout/pyproject.toml" "$checkout/gripmon/__init__.py" | cksum)" $checkout"
     if "$venv/bin/python" -c '' 2>/dev/null && { [ "$(cat "$stamp" 2>/dev/null)" = "$want" ] ||
-        [ "$(cat "$venv/.installed[test]" 2>/dev/null)" = "$want" ]; }; then
+        { [ -z "$extras" ] && [ "$(cat "$venv/.installed[test]" 2>/dev/null)" = "$want" ]; }; }; then
         return
     fi
     find_python

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import multiprocessing
 import sys
 from collections.abc import Callable, Iterator
@@ -82,6 +83,11 @@ def run(arguments: argparse.Namespace) -> int:
         not arguments.only and not arguments.quick,
     )
     if arguments.out is not None:
+        if importlib.util.find_spec("matplotlib") is None:
+            print(
+                "accuracy: --out: matplotlib is not installed; tools/bench, or pip install '.[bench]'", file=sys.stderr
+            )
+            return 2
         try:
             (arguments.out / accuracy_report.PICTURES).mkdir(parents=True, exist_ok=True)
         except OSError as error:

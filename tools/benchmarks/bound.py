@@ -51,21 +51,32 @@ class Bound:
 
 def pose_bound(scene: Scene) -> Bound:
     """The bound of one frame of a standing scene.  Its scenario must have neither vignetting nor a moving mount."""
-    information = fisher_information(scene)
+    near = edge_pixels(scene)
+    return bound_of(fisher_information(slopes(scene, near), variance(scene, near)))
+
+
+def bound_of(information: Array) -> Bound:
+    """From F (7, 7): pose (m, rad), then jaw opening (m)."""
     known = np.linalg.inv(information[:6, :6])
     return Bound(np.sqrt(np.diag(known)), np.sqrt(np.diag(np.linalg.inv(information))[:6]))
 
 
-def fisher_information(scene: Scene) -> Array:
-    """F (7, 7) of one frame: pose (m, rad), then jaw opening (m)."""
-    simulator = scene.simulator
-    sensor = simulator.scenario.sensor
-    assert sensor.vignetting == 0.0 and not simulator.scenario.mount, "a standing scene without vignetting"
-    near = edge_pixels(scene)
-    light = simulator.light(0)[near].astype(float)
-    variance = sensor.read_noise_dn**2 + sensor.shot_noise_dn * light + 1.0 / 12.0
-    slopes = np.column_stack([_slope(scene, k)[near] for k in range(7)])
+def fisher_information(slopes: Array, variance: Array) -> Array:
+    """F (k, k) of pixels with slopes (p, k) and variances (p,)."""
     return np.asarray(np.einsum("pi,pj,p->ij", slopes, slopes, 1.0 / variance))
+
+
+def variance(scene: Scene, near: NDArray[np.bool_]) -> Array:
+    """Variance (p,) of the masked pixels, DN²."""
+    simulator, sensor = scene.simulator, scene.simulator.scenario.sensor
+    assert sensor.vignetting == 0.0 and not simulator.scenario.mount, "a standing scene without vignetting"
+    light = simulator.light(0)[near].astype(float)
+    return np.asarray(sensor.read_noise_dn**2 + sensor.shot_noise_dn * light + 1.0 / 12.0)
+
+
+def slopes(scene: Scene, near: NDArray[np.bool_]) -> Array:
+    """∂I/∂ξ (p, 7) of the masked pixels, DN per m or rad."""
+    return np.column_stack([_slope(scene, k)[near] for k in range(7)])
 
 
 def edge_pixels(scene: Scene) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
-_PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "eclipse-zenoh", "rerun-sdk", "msgspec")
+_PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless", "eclipse-zenoh", "rerun-sdk", "msgspec", "pyapriltags")
 
 
 def description() -> dict[str, Any]:

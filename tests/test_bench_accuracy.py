@@ -1,0 +1,220 @@
+"""``tools/bench accuracy``: its scenes, what it makes of errors and covariances, and a whole run in small."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gripmon.geometry import exp_rotation, make_transform, perturb, to_record
+from gripmon.records import Frame, FrameRecord, Origin, ReferenceRecord, State, Verdict, unmeasured_record
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+TRUTH = make_transform(exp_rotation(np.array([0.5, 0.1, -0.2])), np.array([0.001, -0.002, 0.11]))
+FRAME = Frame(3, 0, np.zeros((4, 4), np.uint8), 0.03)
+REFERENCE = ReferenceRecord("first", 1, 0, "configuration", to_record(TRUTH), tuple(np.eye(6).ravel().tolist()))
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Also in the processes that the benchmark starts."""
+    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+
+
+def record(error: np.ndarray, covariance: np.ndarray, source: Origin = Origin.UPDATE) -> FrameRecord:
+    """A published transform of which the truth is ``perturb(transform, error)``."""
+    import msgspec
+
+    estimate = TRUTH.copy()
+    estimate[:3, 3] -= error[:3]
+    estimate[:3, :3] = exp_rotation(-error[3:]) @ TRUTH[:3, :3]
+    assert np.allclose(perturb(estimate, error), TRUTH, atol=1e-12)
+    blank = unmeasured_record(FRAME, REFERENCE, None, verdict=Verdict.VALID, state=State.TRACKING)
+    flat = tuple(covariance.ravel().tolist())
+    return msgspec.structs.replace(blank, cam_T_grip=to_record(estimate), covariance=flat, source=source)
+
+
+def test_errors_and_their_squared_norm_follow_the_published_convention():
+    """t_true = t + rho, R_true = exp(omega) R, and chi-square of six degrees of freedom for sampled errors."""
+    from benchmarks.accuracy_runs import judge
+    from benchmarks.scenes import Shot
+
+    rng = np.random.default_rng(1)
+    mixing = rng.normal(0.0, 1.0, (6, 6)) * np.array([1e-5] * 3 + [1e-4] * 3)[:, None]
+    covariance = mixing @ mixing.T
+    shot = Shot(FRAME, TRUTH, 0.03, True)
+    nees = []
+    for _ in range(400):
+        error = mixing @ rng.normal(0.0, 1.0, 6)
+        row = judge(record(error, covariance), shot, 0, 3, 1.0)
+        assert np.allclose(row.error, error, atol=1e-10)
+        nees.append(row.nees)
+    assert np.mean(nees) == pytest.approx(6.0, abs=5.0 * np.sqrt(12.0 / 400))
+    held = judge(record(np.full(6, 1e-3), covariance, Origin.HELD), shot, 0, 3, 1.0)
+    assert np.isnan(held.error).all() and held.far == pytest.approx(np.sqrt(3.0) * 1e-3)
+
+
+def track(error_um: np.ndarray, **changes: Any) -> Any:
+    from benchmarks.accuracy_runs import Track
+
+    n = len(error_um)
+    error = np.column_stack([1e-6 * error_um, np.zeros((n, 3))])
+    columns: dict[str, Any] = {
+        "scene": np.arange(n) // 10,
+        "frame": np.arange(n) % 10,
+        "judged": np.ones(n, bool),
+        "valid": np.ones(n, bool),
+        "error": error,
+        "smoothed": error[:, :3],
+        "nees": np.full(n, 6.0),
+        "far": np.linalg.norm(error[:, :3], axis=1),
+        "time_ms": np.linspace(1.0, 2.0, n),
+    }
+    return Track(**{**columns, **changes})
+
+
+def test_figures_of_known_errors():
+    from benchmarks.accuracy_stats import figures
+
+    error_um = np.zeros((100, 3))
+    error_um[:, 0] = np.tile([1.0, -3.0], 50)
+    error_um[:, 2] = np.arange(100.0)
+    out = figures(track(error_um), 30.0, (2.0, 5.0, 25.0), always_seen=True, standing=False)
+    assert out["mean_um"] == pytest.approx([2.0, 0.0, 49.5])
+    assert out["p95_um"] == pytest.approx([3.0, 0.0, 94.05])
+    assert out["max_um"] == pytest.approx([3.0, 0.0, 99.0])
+    assert (out["frames"], out["scenes"], out["measured"], out["valid"], out["wrong"]) == (100, 10, 1.0, 1.0, 0.0)
+    assert out["median_ms"] == pytest.approx(1.5)
+    assert out["verdict"] == "2.0 x the limit"
+
+
+@pytest.mark.parametrize(
+    ("change", "verdict"),
+    [
+        ({}, "met"),
+        ({"error": np.full((20, 6), np.nan)}, "lost 100.0 %"),
+        ({"far": np.array([0.0] * 19 + [3e-4])}, "lies 5.0 %"),
+        ({"nees": np.full(20, 8.0)}, "covariance too small"),
+        ({"nees": np.full(20, 1.0)}, "covariance too large"),
+        ({"nees": np.array([5.0] * 19 + [40.0])}, "covariance too small"),
+    ],
+)
+def test_verdicts(change: dict[str, Any], verdict: str):
+    from benchmarks.accuracy_stats import figures
+
+    out = figures(track(np.ones((20, 3)), **change), 30.0, (2.0, 2.0, 2.0), always_seen=True, standing=False)
+    assert out["verdict"] == verdict
+
+
+def test_a_valid_transform_that_is_wrong_counts_also_where_errors_do_not():
+    from benchmarks.accuracy_stats import figures
+
+    far = np.zeros(20)
+    far[4] = 5e-4
+    unjudged = track(np.ones((20, 3)), judged=np.arange(20) > 10, far=far)
+    out = figures(unjudged, 30.0, None, always_seen=True, standing=False)
+    assert out["wrong"] == pytest.approx(0.05) and out["wrong_frames"] == [[0, 4]] and out["verdict"] is None
+    assert figures(track(np.ones((20, 3)), far=far, valid=far == 0.0), 30.0, None, always_seen=True, standing=False)[
+        "wrong"
+    ] == pytest.approx(0.0)
+
+
+def test_against_the_best_peer_and_the_detector():
+    from benchmarks.accuracy_stats import against_peers
+
+    ours = {"mean_um": [1.0, 2.0, 3.0], "median_ms": 0.5}
+    peers = {
+        "cornerSubPix": {"mean_um": [10.0, 4.0, 100.0], "median_ms": 1.0},
+        "rapid": {"mean_um": None, "median_ms": 9.0},
+        "aruco": {"mean_um": [0.1, 0.1, 0.1], "median_ms": 10.0},
+    }
+    assert against_peers(ours, peers) == pytest.approx({"of_best_peer": 0.5, "times_faster": 20.0})
+    assert against_peers(ours, {}) == {"of_best_peer": None, "times_faster": None}
+
+
+def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
+    from benchmarks.conditions import CONDITIONS, FPS
+    from benchmarks.scenes import make_scene
+
+    assert len({condition.name for condition in CONDITIONS}) == len(CONDITIONS)
+    for condition in CONDITIONS:
+        unjudged = max(1, int(np.ceil(condition.judged_s * FPS)))
+        assert condition.scenes * (condition.frames - unjudged) >= 200, condition.name
+        for number in range(3):
+            scene = make_scene(condition, 1, number, condition.frames)
+            first, last = scene.simulator.truth(0), scene.simulator.truth(condition.frames - 1)
+            visible = [why for why in first.hidden if why not in (None, "self", "carrier")]
+            assert not visible or condition.missing_finger, condition.name
+            assert np.isfinite(last.corner_uv_px).all()
+            start_error_m = scene.start_cam_T_grip[:3, 3] - first.cam_T_grip[:3, 3]
+            assert 0.0 < np.linalg.norm(start_error_m) < 5e-4
+
+
+def test_scenes_differ_and_come_back_the_same():
+    from benchmarks.conditions import CONDITIONS
+    from benchmarks.scenes import make_scene
+
+    clutter = next(c for c in CONDITIONS if c.name == "clutter printed")
+
+    def picture(seed: int, number: int) -> np.ndarray:
+        return make_scene(clutter, seed, number, 2).simulator.render(1)
+
+    first = picture(1, 0)
+    assert np.array_equal(first, picture(1, 0))
+    assert not np.array_equal(first, picture(2, 0))
+    poses = [make_scene(clutter, 1, number, 2).simulator.truth(0) for number in range(6)]
+    assert len({pose.jaw_opening_m for pose in poses}) == 6
+    assert len({make_scene(clutter, 1, number, 2).gripper.name for number in range(6)}) == 3
+
+
+def test_sequences_that_are_not_there_are_skipped_by_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    from benchmarks import accuracy_table, rendered, rows
+
+    monkeypatch.setattr(rendered, "FOLDER", tmp_path)
+    figures, tracks = rows.measure_row("rendered jaw_cycle", scenes=None, frames=None, seed=1, peers=False)
+    assert str(tmp_path) in figures["skipped"] and not tracks
+    assert "rendered jaw_cycle" in accuracy_table._row("rendered jaw_cycle", figures)[0]
+
+
+def test_a_whole_run_in_small_leaves_a_report(tmp_path: Path):
+    from benchmarks import accuracy, accuracy_report, accuracy_table
+
+    plan = accuracy.Plan(only=("clean", "jaw exact"), scenes=2, frames=4, jobs=1, peers=True, series=False)
+    results, tracks = accuracy.measure(plan)
+    ours = results["rows"]["clean"]["ours"]["edges"]
+    assert ours["frames"] == 6 and ours["scenes"] == 2 and ours["measured"] == 1.0
+    assert max(ours["mean_um"]) < 20.0
+    text = accuracy_table.as_text(results)
+    for word in ("clean", "by corners", "cornerSubPix", "rapid", "aruco", "0.5 / 1.5 / 2.5"):
+        assert word in text
+    (tmp_path / accuracy_report.PICTURES).mkdir()
+    pytest.importorskip("matplotlib")
+    accuracy_report.write(results, tracks, tmp_path)
+    report = (tmp_path / "accuracy.md").read_text()
+    assert results["machine"]["commit"] in report and "| jaw exact |" in report
+    for picture in ("errors_simulated", "peers", "honesty"):
+        assert f"(accuracy/{picture}.png)" in report
+        assert (tmp_path / "accuracy" / f"{picture}.png").stat().st_size > 5000
+    assert json.loads((tmp_path / "accuracy.json").read_text())["rows"]["clean"]["ours"]["edges"]["frames"] == 6
+
+
+@pytest.mark.parametrize("only", [["nothing like this"], ["clean", "Clean"]])
+def test_unknown_rows_are_one_line(only: list[str], capsys: pytest.CaptureFixture[str]):
+    import argparse
+
+    from benchmarks import accuracy
+
+    parser = argparse.ArgumentParser()
+    accuracy.add_parser(parser.add_subparsers())
+    assert accuracy.run(parser.parse_args(["accuracy", "--only", *only])) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "there is no such row" in error
