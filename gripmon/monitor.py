@@ -20,6 +20,7 @@ from gripmon.corners import (
     Measurement,
     MeasurementSettings,
     Patience,
+    TaughtEdges,
     agreeing_fingers,
     finger_shares,
     trace_of,
@@ -109,9 +110,17 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 class Monitor:
     """Watches one camera on one gripper, starting from a reference calibration."""
 
-    def __init__(self, camera: Camera, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+        taught: TaughtEdges | None = None,
+    ):
         self._camera, self._gripper, self._settings = camera, gripper, settings
-        self._meter = FingertipMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
+        # What was taught belongs to the gripper's edges: a new reference doesn't change it.
+        self._meter = FingertipMeter(camera, gripper, settings.corners, settings.jaw_sigma_m, taught)
         reference_sigma = np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal())
         self._policy = Policy(settings.policy, reference_sigma)
         self._average = PoseAverage(settings.smoothing)

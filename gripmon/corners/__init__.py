@@ -1,6 +1,7 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
 from gripmon.corners.measure import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.corners.taught import TaughtEdges, TaughtModel
 from gripmon.corners.views import agreeing_fingers, finger_shares, trace_of
 
 __all__ = [
@@ -9,6 +10,8 @@ __all__ = [
     "Measurement",
     "MeasurementSettings",
     "Patience",
+    "TaughtEdges",
+    "TaughtModel",
     "agreeing_fingers",
     "finger_shares",
     "trace_of",

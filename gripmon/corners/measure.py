@@ -40,6 +40,7 @@ from gripmon.corners.profiles import (
     read_profiles,
 )
 from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.corners.taught import TaughtEdges
 from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.gripper import Gripper
@@ -169,8 +170,18 @@ class FingertipMeter:
     images.
     """
 
-    def __init__(self, camera: Camera, gripper: Gripper, settings: MeasurementSettings, jaw_sigma_m: float):
-        self._camera, self._gripper, self._settings = camera, gripper, settings
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        settings: MeasurementSettings,
+        jaw_sigma_m: float,
+        taught: TaughtEdges | None = None,
+    ):
+        self._camera, self._gripper, self._settings, self._taught = camera, gripper, settings, taught
+        # What the gripper file says of an edge's polarity counts; teaching fills in the rest.
+        known = gripper.edge_polarity
+        self._polarity = known if taught is None else np.where(known, known, taught.polarity)
         self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
         self._zoom = 1
         self._prior_reported = prior_information(jaw_sigma_m if gripper.has_jaw else None)
@@ -351,7 +362,7 @@ class FingertipMeter:
             sampling = self._settings.sampling
             margin_px = self._zoom * sampling.end_margin_px
             sampling = msgspec.structs.replace(sampling, reach_px=self._reach_px, end_margin_px=margin_px)
-            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, sampling)
+            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, sampling, self._taught)
             self._laid_out = layout, self._corner_pixels(expected)
         self._prediction = self._predict(self._laid_out[0], expected)
         self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
@@ -367,6 +378,7 @@ class FingertipMeter:
             expected.jaw_opening_m,
             self._zoom * self._offsets_px,
             jaw_unknown,
+            self._taught,
         )
 
     def _layout_moved_px(self, expected: _Expected) -> float:
@@ -386,11 +398,10 @@ class FingertipMeter:
         return self._votes(candidates, prediction)
 
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
-        settings, gripper = self._settings.consensus, self._gripper
-        weights = base_weights(candidates, prediction, gripper.edge_polarity, settings)
-        # A bevel moves its edge by anything up to its width.
-        bevel_px = gripper.edge_bevel_m * (prediction.pixels_per_m / math.sqrt(12.0))
-        return Votes(candidates, prediction, weights, np.hypot(settings.edge_floor_px, bevel_px))
+        settings = self._settings.consensus
+        weights = base_weights(candidates, prediction, self._polarity, settings)
+        spread_px = prediction.edge_spread_m * prediction.pixels_per_m
+        return Votes(candidates, prediction, weights, np.hypot(settings.edge_floor_px, spread_px))
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         return assess(votes, consensus, self._prior)

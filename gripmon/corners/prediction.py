@@ -6,9 +6,10 @@ fraction of a pixel: in a standing scene they are computed once.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import numpy as np
@@ -19,6 +20,9 @@ from gripmon.camera import Camera
 from gripmon.geometry import invert
 from gripmon.gripper import Gripper
 from gripmon.records import Array
+
+if TYPE_CHECKING:
+    from gripmon.corners.taught import TaughtEdges
 
 
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -36,7 +40,10 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             description="part of an edge at each end that is left out: the neighbour edge shows there (px)",
         ),
     ] = 4.0
-    creases: Annotated[bool, Meta(description="use edges between two visible faces too; bevels shift them")] = False
+    creases: Annotated[
+        bool,
+        Meta(description="use edges between two visible faces too; bevels shift them (taught ones are used anyway)"),
+    ] = False
 
 
 STRETCH = 10
@@ -103,6 +110,10 @@ class Prediction:
     coordinate along the edge's line, and ideal distance from the line for each px of offset along the normal.
     ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
     in the image.
+
+    With a taught model ``uv_px`` lies where the edge was taught to show, everything else is the sharp model's: what is
+    measured from there is the model's own motion.  ``edge_spread_m`` (e,): standard deviation of what a
+    bevel moves an edge by, or of what teaching left of that.
     """
 
     cam_T_grip: Array
@@ -119,6 +130,7 @@ class Prediction:
     map_x: NDArray[np.float32]
     map_y: NDArray[np.float32]
     corners: PredictedCorners
+    edge_spread_m: Array
 
     @cached_property
     def pixels_per_m(self) -> float:
@@ -161,16 +173,27 @@ class Prediction:
 
 
 def lay_out(
-    camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float, settings: SamplingSettings
+    camera: Camera,
+    gripper: Gripper,
+    cam_T_grip: Array,
+    jaw_opening_m: float,
+    settings: SamplingSettings,
+    taught: TaughtEdges | None = None,
 ) -> EdgeLayout:
     """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its
     length.
+
+    With a taught model only its edges are used, and those only while they show as they were taught, as an outline or
+    as a crease: like is compared with like.
     """
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     start, end = points_cam_m[gripper.edge_points[:, 0]], points_cam_m[gripper.edge_points[:, 1]]
-    wanted = view.visible & (settings.creases | ~view.crease)
+    if taught is None:
+        wanted = view.visible & (settings.creases | ~view.crease)
+    else:
+        wanted = view.visible & taught.known & (view.crease == taught.crease)
     coarse = np.linspace(0.0, 1.0, 65)
     uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(
         -1, 65, 2
@@ -234,6 +257,7 @@ def predict(
     jaw_opening_m: float,
     offsets_px: Array,
     jaw_unknown: bool = False,
+    taught: TaughtEdges | None = None,
 ) -> Prediction:
     """Project the sample points of ``layout`` and set up the maps for ``offsets_px`` (s,) along the normals.
 
@@ -260,6 +284,12 @@ def predict(
     if jaw_unknown:
         rate = gripper.point_motion(jaw_opening_m) @ rotation.T
         jacobian[:, 6] = np.einsum("ni,ni->n", gradient, rate[gripper.edge_points[edge, 0]])
+    # A bevel moves its edge by anything up to its width.
+    edge_spread_m: Array = gripper.edge_bevel_m / math.sqrt(12.0)
+    if taught is not None:
+        shift_px = np.einsum("ni,ni->n", gradient, taught.shift_at_m(edge, layout.fraction) @ rotation.T)
+        uv = uv + shift_px[:, None] * normal
+        edge_spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
     along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
@@ -280,6 +310,7 @@ def predict(
         map_x=uv32[:, 0:1] + normal32[:, 0:1] * offsets,
         map_y=uv32[:, 1:2] + normal32[:, 1:2] * offsets,
         corners=corners,
+        edge_spread_m=edge_spread_m,
     )
 
 

@@ -1,0 +1,259 @@
+"""The taught model: how each edge of this gripper really shows to this camera, against the sharp edges of its model.
+
+Bevels, roundings, shading and the blur of the lens put an edge beside the line that the gripper file draws, by the
+same amount in every image.  Measured once, in images at the reference calibration, and taken into the prediction,
+like is compared with like and the bias cancels; the method's own reference corners, measured in the reference image,
+do the same ("Corners" of the self-viewing method).
+
+An edge's offset is a length across the line of sight, off the plane through the camera's centre and the model's edge
+(m), linear along the edge; positive to the right of somebody who walks along the edge in the image.  The reference
+calibration is by definition the gripper's pose in the teaching images, so that what it is off by is in the offsets,
+too.  In the gripper frame an offset stays the same when the camera or the jaws move.  What it is along the line of
+sight (``depth_m``, positive away from the camera) images at one pose can't show; it follows from the shape of a bevel,
+with a wide standard deviation, and counts as much as the line of sight has turned since.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera, LensSettings
+from gripmon.corners.profiles import EdgeSettings
+from gripmon.geometry import from_record, invert, rotation_angle, to_record
+from gripmon.gripper import Gripper
+from gripmon.records import Array, Transform
+
+LARGEST_OFFSET_M = 0.02
+SAME_POSE = 1e-6
+"""Poses are the same if no element of their matrices (m, no unit) differs by more: files hold rounded numbers."""
+
+Length = Annotated[float, Meta(ge=-LARGEST_OFFSET_M, le=LARGEST_OFFSET_M, description="across the line of sight (m)")]
+Deviation = Annotated[float, Meta(ge=0.0, le=LARGEST_OFFSET_M, description="standard deviation (m)")]
+Share = Annotated[float, Meta(ge=0.0, le=1.0, description="part of the way from the edge's `from` to its `to`")]
+Digest = Annotated[str, Meta(pattern="^[0-9a-f]{64}$", description="SHA-256, 64 hexadecimal digits")]
+
+
+class TaughtImage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An image that was taught from."""
+
+    file: str
+    sha256: Digest
+    jaw_opening_m: Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening in this image (m)")] | None = None
+
+
+class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where a taught model comes from."""
+
+    gripmon: str
+    time: str
+    command: str
+    images: Annotated[tuple[TaughtImage, ...], Meta(min_length=1)]
+
+
+class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    name: str
+    sha256: Digest
+
+
+class TaughtReference(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    id: str
+    cam_T_grip: Transform
+
+
+class Look(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Grey level of the finger beside an edge over the median of all edges (no unit), and its robust spread along
+    the edge.
+    """
+
+    level: Annotated[float, Meta(ge=0.0)]
+    spread: Annotated[float, Meta(ge=0.0)]
+
+
+class TaughtEdge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """One edge: ``offset_m`` and ``sigma_m`` at the two ends ``share`` of the part that was seen, linear between, and
+    how much deeper than the model's edge it lies.
+    """
+
+    share: tuple[Share, Share]
+    offset_m: tuple[Length, Length]
+    sigma_m: tuple[Deviation, Deviation]
+    depth_m: Length = 0.0
+    depth_sigma_m: Deviation = 0.0
+    crease: bool
+    brighter: Literal["left", "right", "any"] = "any"
+    rms_px: Annotated[float, Meta(ge=0.0, description="of the edge points about the taught line (px)")] = 0.0
+    seen: Annotated[float, Meta(ge=0.0, le=1.0, description="part of its profiles that showed it")] = 1.0
+    left: Look | None = None
+    right: Look | None = None
+
+
+class TaughtCorner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where the taught edges meet at the reference and the first image's jaw opening."""
+
+    uv_px: tuple[float, float]
+    sigma_px: Annotated[float, Meta(ge=0.0)]
+
+
+class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A file of ``gripmon teach`` as it is written."""
+
+    provenance: Provenance
+    camera: LensSettings
+    gripper: TaughtGripper
+    reference: TaughtReference
+    edge_settings: EdgeSettings
+    edges: Annotated[dict[str, TaughtEdge], Meta(min_length=1)]
+    corners: dict[str, TaughtCorner] = {}
+
+
+class Mismatch(NamedTuple):
+    """Why a taught model doesn't belong to what it is to be used with."""
+
+    key: str
+    wrong: str
+    right: str
+
+
+def gripper_digest(gripper: Gripper) -> str:
+    """SHA-256 of everything that a gripper file says; comments, order and spelling of numbers don't count."""
+    return hashlib.sha256(msgspec.json.encode(gripper.model, order="sorted")).hexdigest()
+
+
+def identity(
+    camera: Camera, gripper: Gripper, reference_id: str, cam_T_grip: Array
+) -> tuple[LensSettings, TaughtGripper, TaughtReference]:
+    """What a taught model is bound to."""
+    return (
+        camera.settings,
+        TaughtGripper(name=gripper.name, sha256=gripper_digest(gripper)),
+        TaughtReference(id=reference_id, cam_T_grip=to_record(cam_T_grip)),
+    )
+
+
+def mismatch(
+    model: TaughtModel, camera: Camera, gripper: Gripper, cam_T_grip: Array, edge_settings: EdgeSettings
+) -> Mismatch | None:
+    """What of a taught model contradicts the configuration that it is to be used with; None if nothing does."""
+    again = "teach again (gripmon teach), or use what it was taught with"
+    taught_kind, kind = (type(lens).__struct_config__.tag for lens in (model.camera, camera.settings))
+    if taught_kind != kind:
+        return Mismatch("camera.model", f"taught with {taught_kind}, the configuration has {kind}", again)
+    for field in camera.settings.__struct_fields__:
+        taught, now = getattr(model.camera, field), getattr(camera.settings, field)
+        if taught != now:
+            return Mismatch(f"camera.{field}", f"taught with {taught}, the configuration has {now}", again)
+    if model.gripper.sha256 != gripper_digest(gripper):
+        same = " with other contents" if model.gripper.name == gripper.name else ""
+        wrong = f"taught with {model.gripper.name}{same}, the configuration has {gripper.name}"
+        return Mismatch("gripper", wrong, again)
+    taught_T = taught_pose(model)
+    if np.abs(taught_T - cam_T_grip).max() > SAME_POSE:
+        away_mm = 1e3 * float(np.linalg.norm(taught_T[:3, 3] - cam_T_grip[:3, 3]))
+        turned = np.degrees(rotation_angle(taught_T[:3, :3].T @ cam_T_grip[:3, :3]))
+        wrong = f"taught at {model.reference.id}, {away_mm:.3f} mm and {turned:.3f}° from the configured reference"
+        return Mismatch("reference.cam_T_grip", wrong, again)
+    for field in edge_settings.__struct_fields__:
+        taught, now = getattr(model.edge_settings, field), getattr(edge_settings, field)
+        if taught != now:
+            wrong = f"taught with {taught}, the configuration has {now} in monitor.corners.edges"
+            return Mismatch(f"edge_settings.{field}", wrong, again)
+    for section, known in (("edges", gripper.edge_ids), ("corners", gripper.corner_ids)):
+        for name in getattr(model, section):
+            if name not in known:
+                return Mismatch(f"{section}.{name}", "the gripper has no such", f"one of {', '.join(known)}")
+    for name, edge in model.edges.items():
+        if not edge.share[1] - edge.share[0] > 1e-3:
+            return Mismatch(f"edges.{name}.share", f"is {list(edge.share)}", "two shares, ascending")
+    return None
+
+
+def taught_pose(model: TaughtModel) -> Array:
+    """The reference calibration (4, 4) that the model was taught at."""
+    return from_record(model.reference.cam_T_grip)
+
+
+@dataclass(frozen=True, slots=True)
+class TaughtEdges:
+    """A taught model in arrays over all edges of the gripper.
+
+    ``known`` (e,) the edge was taught; ``crease`` (e,) as a line between two visible faces; ``share`` (e, 2) two places
+    on it, ``shift_grip_m`` (e, 2, 3) the line's shift off the model's edge there, gripper frame; ``sigma_m`` (e,) its
+    standard deviation across the line of sight, ``depth_grip`` (e, 3) the direction that was the line of sight, across
+    the edge, and ``depth_sigma_m`` (e,) the standard deviation along it; ``polarity`` (e,) int8 as in the gripper (1:
+    brighter to the right).  Where an edge is not known the numbers are those of no shift.
+    """
+
+    known: NDArray[np.bool_]
+    crease: NDArray[np.bool_]
+    share: Array
+    shift_grip_m: Array
+    sigma_m: Array
+    depth_grip: Array
+    depth_sigma_m: Array
+    polarity: NDArray[np.int8]
+
+    @classmethod
+    def of(
+        cls, edges: Mapping[str, TaughtEdge], gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None
+    ) -> TaughtEdges:
+        """Arrays of edges that were taught at a pose and a jaw opening."""
+        listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
+        across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
+        offset_m = np.array([e.offset_m for e in listed])
+        depth_m = np.array([e.depth_m for e in listed])
+        return cls(
+            np.array([name in edges for name in gripper.edge_ids], dtype=bool),
+            np.array([e.crease for e in listed], dtype=bool),
+            np.array([e.share for e in listed]),
+            offset_m[:, :, None] * across[:, None] + (depth_m[:, None] * depth)[:, None],
+            np.sqrt(np.square([e.sigma_m for e in listed]).mean(axis=1)),
+            depth,
+            np.array([e.depth_sigma_m for e in listed]),
+            np.array([_POLARITY[e.brighter] for e in listed], dtype=np.int8),
+        )
+
+    @classmethod
+    def of_model(cls, model: TaughtModel, gripper: Gripper) -> TaughtEdges:
+        """Arrays of a file that :func:`mismatch` has nothing against."""
+        openings = [i.jaw_opening_m for i in model.provenance.images if i.jaw_opening_m is not None]
+        return cls.of(model.edges, gripper, taught_pose(model), float(np.mean(openings)) if openings else None)
+
+    def shift_at_m(self, edge: NDArray[np.intp], fraction: Array) -> Array:
+        """Shift (n, 3), gripper frame, of points on edges (n,) at fractions (n,) between their two ends."""
+        share, shift_m = self.share[edge], self.shift_grip_m[edge]
+        way = (fraction - share[:, 0]) / (share[:, 1] - share[:, 0])
+        return shift_m[:, 0] + way[:, None] * (shift_m[:, 1] - shift_m[:, 0])
+
+    def spread_m(self, gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> Array:
+        """(e,) standard deviation of each taught edge's offset seen from here, m.
+
+        Of its depth as much counts as the line of sight has turned.
+        """
+        across, _ = sight_axes(gripper, points_grip_m, cam_T_grip)
+        return np.hypot(self.sigma_m, np.einsum("ei,ei->e", across, self.depth_grip) * self.depth_sigma_m)
+
+
+def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tuple[Array, Array]:
+    """Two unit vectors (e, 3) for every edge, gripper frame: off the plane through the camera's centre and the edge, to
+    the right of somebody who walks along it in the image; and in that plane, across the edge, away from the camera.
+    """
+    ends = points_grip_m[gripper.edge_points]
+    sight = ends[:, 0] - invert(cam_T_grip)[:3, 3]
+    along = ends[:, 1] - ends[:, 0]
+    across = np.cross(sight, along)
+    across /= np.sqrt(np.einsum("ei,ei->e", across, across))[:, None]
+    depth = np.cross(along, across)
+    depth /= np.sqrt(np.einsum("ei,ei->e", depth, depth))[:, None]
+    return across, depth
+
+
+_UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)
+_POLARITY = {"any": 0, "right": 1, "left": -1}

@@ -1,0 +1,97 @@
+"""Images that can't be taught from: each check raises :class:`TeachingRefused`, with numbers and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.smoothing import GATE
+from gripmon.teaching.estimate import SHAPE_M, EdgeLines, motion_off
+from gripmon.teaching.views import TeachingRefused, View, Viewer
+
+REFERENCE_SIGMAS = 3.0
+"""So many standard deviations of the reference and of the reported opening are allowed on top."""
+
+JAW_SIGMAS = 5.0
+"""So many standard deviations the seen opening may be from the reported one, as in the monitor."""
+
+TAUGHT_SHARE = 0.6
+"""Part of the outlines in view, by profiles, that must be taught: with fewer, something hides the gripper."""
+
+AGREEING_PX = 0.5
+"""So far an edge may lie from its mean over the images: more, and the camera or the jaws have moved between them."""
+
+
+def check_enough(views: Sequence[View], crease: NDArray[np.bool_], lines: Mapping[int, EdgeLines]) -> None:
+    profiles = np.sum([view.measurement.prediction.profiles for view in views], axis=0)
+    outlines = np.flatnonzero((profiles > 0) & ~crease)
+    taught = sum(profiles[edge] for edge in outlines if edge in lines)
+    share = taught / max(profiles[outlines].sum(), 1)
+    if share < TAUGHT_SHARE:
+        raise TeachingRefused(
+            f"only {100.0 * share:.0f} % of the outlines in view are seen as lines; at least "
+            f"{100.0 * TAUGHT_SHARE:.0f} %: images in focus, the fingers free, nothing in front of them"
+        )
+
+
+def check_standing(views: Sequence[View], edges: int) -> None:
+    """Refuse images between which the gripper has moved, by where the sharp model fits in each."""
+    places_px = np.full((len(views), edges), np.nan)
+    for number, view in enumerate(views):
+        layout = view.measurement.prediction.layout
+        for edge in layout.edges:
+            mine = layout.edge == edge
+            places_px[number, edge] = np.mean(view.expected_m[mine] * view.per_m[mine])
+    shared = np.isfinite(places_px).all(axis=0)
+    if not shared.any():
+        return
+    off_px = np.median(np.abs(places_px - np.median(places_px, axis=0))[:, shared], axis=1)
+    worst = int(off_px.argmax())
+    if off_px[worst] > AGREEING_PX:
+        raise TeachingRefused(
+            f"{views[worst].image.name}: the gripper shows {off_px[worst]:.1f} px from where it is in the other "
+            f"images; at most {AGREEING_PX:g} px: images without motion of the camera, each with its own jaw opening"
+        )
+
+
+def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> None:
+    """Refuse a gripper that stands elsewhere, or opens its jaw otherwise, than the stated deviations allow.
+
+    Each is tried with the other one taken as stated, since together they can hardly be told apart; what leaves less of
+    their own to the edges is named.
+    """
+    stated = viewer.prior_covariance
+    free_pose, free_jaw = stated.copy(), stated.copy()
+    free_pose[:6, :6] = np.diag(np.square([0.01] * 3 + [0.1] * 3))
+    free_jaw[6, 6] = 0.01**2
+    moved, opened = (motion_off(viewer, lines, prior) for prior in (free_pose, free_jaw))
+    pose = moved.common[:6]
+    pose_square = pose @ np.linalg.solve((moved.common_covariance[:7, :7] + stated)[:6, :6], pose)
+    jaw_m, jaw_sigma_m = float(opened.common[6]), float(np.sqrt(opened.common_covariance[6, 6] + stated[6, 6]))
+    if pose_square <= GATE and abs(jaw_m) <= JAW_SIGMAS * jaw_sigma_m:
+        return
+    if viewer.gripper.has_jaw and opened.usual_own_m[0] < moved.usual_own_m[0]:
+        raise TeachingRefused(
+            f"{name}: the jaw shows an opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m "
+            f"is reported; at most {1e3 * JAW_SIGMAS * jaw_sigma_m:.3f} mm off: the opening corrected (timestamps.csv, "
+            "--jaw-opening), or a larger monitor.jaw_sigma_m"
+        )
+    raise TeachingRefused(
+        f"{name}: the gripper is off the reference, {viewer.distance(pose)}, {np.sqrt(pose_square / GATE):.1f} times "
+        f"what position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose)}"
+    )
+
+
+def check_edges(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
+    """Refuse edges that lie farther from the reference than a bevel and the stated deviations explain."""
+    for index, edge in lines.items():
+        allowed_px = viewer.allowed_px(views[edge.images[0]], index, SHAPE_M, REFERENCE_SIGMAS)
+        away_px = float(np.abs(edge.mean_px).max())
+        if away_px > allowed_px:
+            raise TeachingRefused(
+                f"edge {viewer.gripper.edge_ids[index]} shows {away_px:.1f} px "
+                f"({1e3 * away_px / edge.sampled.per_m:.2f} mm) from the reference; at most {allowed_px:.1f} px, which "
+                "a bevel and the standard deviations of reference and jaw explain: correct the gripper file"
+            )

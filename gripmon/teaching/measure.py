@@ -1,0 +1,191 @@
+"""What a gripper's edges look like in images at the reference calibration: the measuring half of ``gripmon teach``.
+
+By definition the gripper stands in the teaching images where the reference says, its jaws open as reported.  So the
+taught offsets hold everything by which the images differ from the sharp model there: bevels, shading and blur, but
+also what the reference and the reported opening are off by.  All of it cancels later, as it does for the method's own
+reference corners, which are measured in the reference image.  A reference or an opening that is off by more than its
+stated deviation and a plausible bevel allow is refused: it would be carried along, and the offsets' part along the
+line of sight, which can't be seen, would grow with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.corners import Measurement, MeasurementSettings
+from gripmon.corners.taught import TaughtCorner, TaughtEdge, TaughtEdges
+from gripmon.geometry import perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.records import ReferenceRecord
+from gripmon.smoothing import GATE
+from gripmon.teaching.checks import check_edges, check_enough, check_reference, check_standing
+from gripmon.teaching.estimate import SHAPE_M, EdgeLines, estimate_edges
+from gripmon.teaching.lines import find_line, of_image, settle_line
+from gripmon.teaching.looks import edge_looks
+from gripmon.teaching.views import TeachingImage, TeachingRefused, View, Viewer, sampled
+
+SEEN_SHARE = 0.6
+"""Part of an edge's profiles that must show its line, in at least half of the images."""
+
+CLOSED_PX = 0.3
+"""So far the gripper may show from the reference when the images are measured again with what was taught; farther only
+if that measurement is as uncertain."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """What was learnt.  ``untaught``: for each other edge in view why not; ``notes``: what a person should know.
+
+    ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most;
+    ``found``: the sharp model fitted to the first image.
+    """
+
+    edges: dict[str, TaughtEdge]
+    corners: dict[str, TaughtCorner]
+    untaught: dict[str, str]
+    notes: tuple[str, ...]
+    closure_px: float
+    found: Measurement
+
+
+def teach(
+    camera: Camera,
+    gripper: Gripper,
+    settings: MeasurementSettings,
+    jaw_sigma_m: float,
+    reference: ReferenceRecord,
+    images: Sequence[TeachingImage],
+) -> Taught:
+    """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
+
+    Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
+    image alone a straight line of the background beside an outline can't be told from it.
+    """
+    assert images, "nothing to teach from"
+    viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, images)
+    crease = viewer.crease
+    found = [viewer.found(image) for image in images]
+    views = [viewer.view(image, fit) for image, fit in zip(images, found, strict=True)]
+    check_standing(views, len(gripper.edge_ids))
+    lines, untaught = _lines(views, gripper, search=True)
+    check_enough(views, crease, lines)
+    check_reference(viewer, images[0].name, lines)
+    check_edges(viewer, views, lines)
+    notes = _notes(lines, gripper, crease, len(images))
+    edges = estimate_edges(viewer, lines, None)
+    arrays = viewer.arrays(edges)
+    # Once more from where the edges really are: the profiles then lie even to both sides of them.
+    views = [viewer.view_taught(image, arrays) for image in images]
+    lines, lost = _lines(views, gripper, search=False)
+    looks = {gripper.edge_ids[index]: look for index, look in edge_looks(viewer, views, lines).items()}
+    edges = estimate_edges(viewer, lines, edges)
+    edges = {name: msgspec.structs.replace(edge, **looks[name]._asdict()) for name, edge in edges.items()}
+    arrays = viewer.arrays(edges)
+    return Taught(
+        edges,
+        _corners(viewer, arrays, images[0].jaw_opening_m),
+        {**untaught, **lost},
+        notes,
+        _closure_px(viewer, images, arrays),
+        found[0],
+    )
+
+
+def _lines(views: Sequence[View], gripper: Gripper, search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:
+    """Lines of all edges that some image samples, and why others have none."""
+    lines, untaught = {}, {}
+    for edge in sorted({e for view in views for e in view.measurement.prediction.layout.edges.tolist()}):
+        found = _lines_of(views, edge, search)
+        if isinstance(found, str):
+            untaught[gripper.edge_ids[edge]] = found
+        else:
+            lines[edge] = found
+    return lines, untaught
+
+
+def _lines_of(views: Sequence[View], edge: int, search: bool) -> EdgeLines | str:
+    """An edge's line in all images together and in each, or why there is none."""
+    seen = sampled(views, edge)
+    if seen is None:
+        return "out of view"
+    points, expected_px = seen.points, seen.expected_px
+    line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)
+    if line is None:
+        return "no line is seen"
+    shown = {}
+    for number in range(len(views)):
+        own = settle_line(of_image(points, number), line.ends_px)
+        if own is not None and own.seen >= SEEN_SHARE:
+            shown[number] = own
+    if 2 * len(shown) < len(views):
+        return f"its line shows along {100.0 * line.seen:.0f} % of it"
+    ends_px = np.array([own.ends_px for own in shown.values()])
+    within_px2 = np.mean([own.covariance_px2.diagonal() for own in shown.values()], axis=0)
+    return EdgeLines(seen, line, tuple(shown), ends_px, within_px2)
+
+
+def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
+    """How far the gripper shows from the reference in images that are measured with what they taught, px at most."""
+    worst_px = 0.0
+    for image in images:
+        found = viewer.measured(image, arrays)
+        xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
+        away_px = found.prediction.moved_px(xi)
+        explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE
+        if not found.trusted or (away_px > CLOSED_PX and not explained):
+            shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"
+            raise TeachingRefused(
+                f"{image.name}: measured with what was taught the gripper {shows}; at most {CLOSED_PX:g} px: images in "
+                "focus, without motion, the fingers free"
+            )
+        worst_px = max(worst_px, away_px)
+    return worst_px
+
+
+def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[str, TaughtCorner]:
+    """Where taught edges meet in the image: least squares of their offsets at the corner, weighted."""
+    gripper, camera = viewer.gripper, viewer.camera
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    points_cam_m = points_grip_m @ viewer.ref_cam_T_grip[:3, :3].T + viewer.ref_cam_T_grip[:3, 3]
+    uv_px, d_uv = camera.project_with_jacobian(points_cam_m)
+    corners = {}
+    for number, point in enumerate(gripper.corner_points.tolist()):
+        edges = gripper.edges_at_corner(number)
+        edges = edges[arrays.known[edges]]
+        if len(edges) < 2:
+            continue
+        ends = gripper.edge_points[edges]
+        gradient = d_uv[point] @ viewer.ref_cam_T_grip[:3, :3]
+        tangent = (points_grip_m[ends[:, 1]] - points_grip_m[ends[:, 0]]) @ gradient.T
+        normal = np.column_stack([-tangent[:, 1], tangent[:, 0]]) / np.linalg.norm(tangent, axis=1)[:, None]
+        per_m = np.linalg.norm(normal @ gradient, axis=1)
+        shift_m = arrays.shift_at_m(edges, (ends[:, 1] == point).astype(float))
+        offset_px = np.einsum("ei,ei->e", normal @ gradient, shift_m)
+        weighted = normal.T / np.square(per_m * arrays.sigma_m[edges])
+        if np.linalg.cond(weighted @ normal) > _LARGEST_CONDITION:
+            continue
+        covariance = np.linalg.inv(weighted @ normal)
+        u, v = (uv_px[point] + covariance @ weighted @ offset_px).tolist()
+        corners[gripper.corner_ids[number]] = TaughtCorner(
+            uv_px=(u, v), sigma_px=float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+        )
+    return corners
+
+
+_LARGEST_CONDITION = 100.0  # edges that meet at less than some 10° make no corner
+
+
+def _notes(lines: Mapping[int, EdgeLines], gripper: Gripper, crease: NDArray[np.bool_], images: int) -> tuple[str, ...]:
+    """What can be doubted about what was taught."""
+    notes = []
+    rivals = {i: e.line.rival_px for i, e in lines.items() if e.line.rival_px is not None and not crease[i]}
+    if rivals and images == 1:
+        named = ", ".join(f"{gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())
+        notes.append(f"another line runs beside {named}: teach from several images with different backgrounds")
+    return tuple(notes)

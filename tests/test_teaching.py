@@ -1,0 +1,272 @@
+"""Teaching against independent truth: the renderer's bevelled solids, whose edges the taught model has never seen."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+from meters import box_gripper, moved
+from simulated import nominal_cam_T_grip
+from taught_scenes import (
+    CAMERA,
+    OPENING_M,
+    arrays,
+    bevelled,
+    error,
+    image_of,
+    measured,
+    reference,
+    scene,
+    taught_from,
+)
+
+from gripmon.corners.taught import sight_axes
+from gripmon.geometry import invert
+from gripmon.simulator.solids import finger_solids
+from gripmon.teaching import TeachingRefused
+
+POSE = nominal_cam_T_grip()
+PX_PER_M = 8000.0  # at the gripper, to a tenth
+BEVEL_M = 3e-4
+OUTLINES = tuple(
+    f"{finger}_{edge}" for finger in "LR" for edge in ("tip_in", "tip_near", "in_far_along", "out_near_along")
+)
+CREASES = ("L_in_near_along", "R_in_near_along")
+
+
+def other_views(count: int, levels: tuple[float, ...], seed: int = 3) -> list[tuple[np.ndarray, float, np.ndarray]]:
+    """Poses some 1 mm and 0.5 degrees away, openings some millimetres, and the images of bevelled fingers there."""
+    rng = np.random.default_rng(seed)
+    views = []
+    for k in range(count):
+        pose = moved(POSE, np.concatenate([rng.normal(0.0, 6e-4, 3), np.radians(rng.normal(0.0, 0.3, 3))]))
+        opening_m = OPENING_M + rng.uniform(-0.005, 0.005)
+        views.append((pose, opening_m, image_of(BEVEL_M, scene(levels[k % len(levels)], opening_m), pose)))
+    return views
+
+
+def test_sharp_edges_are_taught_no_offset():
+    """At the true pose of a clean image: less than two hundredths of a pixel, at every edge in view."""
+    taught = taught_from(image_of(0.0))
+    assert set(taught.edges) == {*OUTLINES, *CREASES} and not taught.untaught and not taught.notes
+    offsets_px = PX_PER_M * np.array([edge.offset_m for edge in taught.edges.values()])
+    assert np.abs(offsets_px).max() < 0.02
+    assert np.abs(PX_PER_M * np.array([edge.depth_m for edge in taught.edges.values()])).max() < 0.15
+    assert {name for name, edge in taught.edges.items() if edge.crease} == set(CREASES)
+    assert taught.closure_px < 0.02
+
+
+def test_taught_corners_are_where_the_truth_says():
+    taught, gripper = taught_from(image_of(0.0)), box_gripper()
+    points = gripper.points_grip_m(OPENING_M)[gripper.corner_points] @ POSE[:3, :3].T + POSE[:3, 3]
+    truth_px = dict(zip(gripper.corner_ids, CAMERA.project(points), strict=True))
+    assert len(taught.corners) == 6
+    for name, corner in taught.corners.items():
+        assert np.linalg.norm(np.subtract(corner.uv_px, truth_px[name])) < 0.05
+        assert 0.0 < corner.sigma_px < 0.3
+
+
+def silhouette_offsets_m(width_m: float) -> dict[str, tuple[float, float]]:
+    """Where the silhouette of the bevelled solid lies beside each outline of the sharp model, across the line of sight,
+    and how much deeper: of all vertices of the solid next to the edge the outermost.
+    """
+    gripper, solids = box_gripper(), finger_solids(bevelled(width_m))
+    points = gripper.points_grip_m(None)
+    across, depth = sight_axes(gripper, points, POSE)
+    eye = invert(POSE)[:3, 3]
+    out = {}
+    for name in OUTLINES:
+        edge = gripper.edge_ids.index(name)
+        start, end = points[gripper.edge_points[edge]]
+        vertices = solids[gripper.edge_finger[edge]].vertices_m
+        along = (end - start) / np.linalg.norm(end - start)
+        beside = np.linalg.norm(np.cross(vertices - start, along), axis=1) < 2.0 * width_m
+        side = np.sign((vertices.mean(axis=0) - eye) @ across[edge])
+        offsets_m = (vertices[beside] - eye) @ across[edge]
+        rim = int(np.argmin(side * offsets_m))
+        out[name] = float(offsets_m[rim]), float((vertices[beside][rim] - start) @ depth[edge])
+    return out
+
+
+def test_taught_offsets_are_those_of_the_bevelled_solid():
+    """The silhouette by the solid's vertices, which only the renderer knows.  Beside two outlines the bevel itself
+    shows: they are seen between its two sides.
+    """
+    taught, truth = taught_from(image_of(BEVEL_M)), silhouette_offsets_m(BEVEL_M)
+    assert max(abs(offset_m) for offset_m, _ in truth.values()) > 8e-5
+    for name, (offset_m, depth_m) in truth.items():
+        edge = taught.edges[name]
+        beside = name in ("L_out_near_along", "R_out_near_along")
+        assert np.mean(edge.offset_m) == pytest.approx(offset_m, abs=8e-5 if beside else 6e-6), name
+        assert abs(edge.depth_m - depth_m) < 2.0 * edge.depth_sigma_m, name
+
+
+def test_a_taught_image_gives_the_reference_back():
+    image = image_of(BEVEL_M)
+    taught = taught_from(image)
+    again, before = error(measured(image, arrays(taught), POSE), POSE), error(measured(image, None, POSE), POSE)
+    assert np.linalg.norm(before[:3]) > 5e-4, "a bevel of 0.3 mm is half a millimetre in depth to the sharp model"
+    assert np.linalg.norm(again[:3]) < 4e-6
+    assert taught.closure_px < 0.05
+
+
+def test_the_bias_of_bevels_cancels_when_the_camera_and_the_jaws_move():
+    """One image to learn from: in others the error falls to less than a twentieth, on the same table."""
+    known = arrays(taught_from(image_of(BEVEL_M)))
+    before, after = [], []
+    for pose, opening_m, image in other_views(6, (180.0,)):
+        before.append(error(measured(image, None, pose, opening_m), pose))
+        found = measured(image, known, pose, opening_m)
+        after.append(error(found, pose))
+        assert found.trusted
+        assert after[-1] @ np.linalg.solve(found.covariance[:6, :6], after[-1]) < 22.5
+    rms = [np.sqrt(np.square(e)[:, :3].sum(axis=1).mean()) for e in (np.array(before), np.array(after))]
+    assert rms[0] > 5e-4
+    assert rms[1] < rms[0] / 20.0
+
+
+def test_several_backgrounds_are_averaged_and_their_scatter_is_the_uncertainty():
+    """A table darker and brighter than the fingers moves outlines beside which a bevel shows, and those alone."""
+    taught = taught_from(*(image_of(BEVEL_M, scene(level)) for level in (60.0, 120.0, 180.0, 230.0)))
+    sigma_m = {name: np.mean(edge.sigma_m) for name, edge in taught.edges.items()}
+    loose = {"L_out_near_along", "R_out_near_along"}
+    assert min(sigma_m[name] for name in loose) > 3.0 * max(s for name, s in sigma_m.items() if name not in loose)
+    known, ratios, nees = arrays(taught), [], []
+    for pose, opening_m, image in other_views(6, (60.0, 120.0, 180.0, 230.0), seed=4):
+        found = measured(image, known, pose, opening_m)
+        after, before = error(found, pose), error(measured(image, None, pose, opening_m), pose)
+        ratios.append(np.linalg.norm(after[:3]) / np.linalg.norm(before[:3]))
+        nees.append(after @ np.linalg.solve(found.covariance[:6, :6], after))
+    assert np.median(ratios) < 0.15
+    assert max(nees) < 22.5
+
+
+def test_from_one_background_the_uncertainty_covers_others():
+    known = arrays(taught_from(image_of(BEVEL_M, scene(180.0))))
+    nees = []
+    for pose, opening_m, image in other_views(4, (60.0, 230.0), seed=5):
+        found = measured(image, known, pose, opening_m)
+        after = error(found, pose)
+        nees.append(after @ np.linalg.solve(found.covariance[:6, :6], after))
+    assert max(nees) < 22.5
+
+
+def test_creases_have_a_polarity_and_outlines_before_one_background_have_none():
+    taught = taught_from(image_of(0.0))
+    assert {taught.edges[name].brighter for name in OUTLINES} == {"any"}
+    # The face towards the camera, which the lamp is nearer to, is on the outer side of both fingers.
+    assert taught.edges["L_in_near_along"].brighter == "right" and taught.edges["R_in_near_along"].brighter == "left"
+
+
+def test_an_outline_before_three_bright_backgrounds_has_a_polarity():
+    """Fingers of 25 to 85 grey levels before tables of 150 to 240: the finger is the darker side on any of them."""
+    taught = taught_from(*(image_of(0.0, scene(level)) for level in (180.0, 210.0, 235.0)))
+    inside_right = {"L_tip_in", "L_tip_near", "L_in_far_along", "R_out_near_along"}
+    told = {name: taught.edges[name].brighter for name in OUTLINES}
+    assert told == {name: "left" if name in inside_right else "right" for name in OUTLINES}
+    mixed = taught_from(*(image_of(0.0, scene(level)) for level in (20.0, 180.0, 235.0)))
+    assert {mixed.edges[name].brighter for name in ("L_tip_near", "R_tip_near")} == {"any"}
+
+
+def test_looks_are_the_levels_of_the_faces():
+    """Read from the middle of each face in the image: sides that look at each other differ as their faces do."""
+    image, taught = image_of(0.0).astype(float), taught_from(image_of(0.0))
+    points = box_gripper().points_grip_m(None) @ POSE[:3, :3].T + POSE[:3, 3]
+    grey = {}
+    for finger, side in itertools.product("LR", ("in", "near")):
+        loop = [n for n in box_gripper().point_ids if n.startswith(finger) and side in n.split("_")]
+        u, v = CAMERA.project(points[[box_gripper().point_ids.index(n) for n in loop]]).mean(axis=0)
+        grey[finger, side] = image[round(min(v, 570.0)), round(u)]
+    told = {
+        ("L", "in"): taught.edges["L_in_near_along"].left,
+        ("L", "near"): taught.edges["L_in_near_along"].right,
+        ("R", "in"): taught.edges["R_in_near_along"].right,
+        ("R", "near"): taught.edges["R_out_near_along"].right,
+    }
+    assert taught.edges["L_tip_near"].left is None and taught.edges["R_out_near_along"].left is None
+    for face, look in told.items():
+        assert look is not None and look.spread < 0.1
+        against = told["L", "near"]
+        assert against is not None
+        assert look.level / against.level == pytest.approx(grey[face] / grey["L", "near"], rel=0.03), face
+
+
+# --- refused ---
+
+
+def test_an_image_without_the_gripper_is_refused():
+    empty = np.full((576, 768), 128, np.uint8)
+    empty[::7] += 20
+    with pytest.raises(
+        TeachingRefused, match=r"^0\.png: the gripper isn't found: \d+ % of its outlines agree; an image"
+    ):
+        taught_from(empty)
+
+
+@pytest.mark.parametrize("shift_mm", [(0.5, 0.0, 0.0), (0.0, -3.0, 2.0)])
+def test_a_reference_that_is_off_is_refused_and_the_measured_pose_is_named(shift_mm: tuple[float, float, float]):
+    """It stands in the text ready to be copied, and is the truth to some micrometres."""
+    off = moved(POSE, np.array([*(1e-3 * np.array(shift_mm)), 0.0, 0.0, 0.0]))
+    with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
+        taught_from(image_of(0.0), using=reference(off, 2e-5, 2e-4))
+    named = re.search(r"translation_m: \[(.*?)\]", str(refused.value))
+    assert named is not None
+    np.testing.assert_allclose([float(v) for v in named[1].split(",")], POSE[:3, 3], atol=1e-5)
+
+
+def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
+    """A third of a millimetre: then it is by definition where the gripper stands."""
+    off = moved(POSE, np.array([2e-4, -2e-4, 0.0, 0.0, 0.0, 0.0]))
+    taught = taught_from(image_of(0.0), using=reference(off))
+    found = measured(image_of(0.0), arrays(taught, off), off)
+    assert np.linalg.norm(error(found, off)[:3]) < 5e-6
+
+
+def test_an_opening_that_the_image_contradicts_is_refused():
+    with pytest.raises(TeachingRefused, match=r"shows an opening of 0\.0340\d\d m, 0\.034600 m is reported"):
+        taught_from(image_of(0.0), using=reference(None, 2e-5, 2e-4), opening_m=0.0346)
+
+
+def test_images_between_which_the_camera_moved_are_refused():
+    shifted = image_of(0.0, None, moved(POSE, np.array([2e-4, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    with pytest.raises(
+        TeachingRefused, match=r"\d\.png: the gripper shows 0\.\d px from where it is in the other images"
+    ):
+        taught_from(image_of(0.0), shifted, using=reference(None, 1e-3, 1e-2))
+
+
+def test_a_half_hidden_gripper_is_refused():
+    image = image_of(0.0).copy()
+    image[:, :430] = 128
+    with pytest.raises(TeachingRefused, match=r"the outlines|isn't found"):
+        taught_from(image)
+
+
+def test_an_edge_that_something_hides_is_not_taught_and_why_is_said():
+    image = image_of(0.0).copy()
+    u, v = CAMERA.project(box_gripper().points_grip_m(None)[[0, 1]] @ POSE[:3, :3].T + POSE[:3, 3])[:2].mean(axis=0)
+    image[int(v) - 45 : int(v) + 45, int(u) - 12 : int(u) + 60] = 128
+    taught = taught_from(image)
+    assert set(taught.untaught) == {"L_tip_in"} and "L_tip_in" not in taught.edges
+    assert re.search("no line|shows along", taught.untaught["L_tip_in"])
+    found = measured(image_of(0.0), arrays(taught), POSE)
+    assert box_gripper().edge_ids.index("L_tip_in") not in found.prediction.layout.edges
+
+
+def test_a_line_beside_an_outline_in_a_single_image_is_said():
+    """A stripe on the table that runs along a finger, three pixels off."""
+    image = image_of(0.0).copy()
+    gripper = box_gripper()
+    ends = gripper.points_grip_m(None)[gripper.edge_points[gripper.edge_ids.index("R_out_near_along")]]
+    uv = CAMERA.project(
+        (ends[0] + np.linspace(0.0, 1.0, 400)[:, None] * (ends[1] - ends[0])) @ POSE[:3, :3].T + POSE[:3, 3]
+    )
+    for u, v in uv[np.isfinite(uv).all(axis=1)]:
+        if 0 < v < 575:
+            image[round(v), round(u) + 4 : round(u) + 40] = 40
+    taught = taught_from(image)
+    assert (
+        len(taught.notes) == 1 and "R_out_near_along" in taught.notes[0] and "different backgrounds" in taught.notes[0]
+    )
