@@ -56,7 +56,7 @@ from gripmon.records import (
 )
 from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
 
-USUAL_SHARE = 0.9
+USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before anything is known about this gripper."""
 
 USUAL_RATES = (0.02, 0.1)

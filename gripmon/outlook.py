@@ -142,7 +142,8 @@ class ForeseeingMeter(FingertipMeter):
         polarity = self._gripper.edge_polarity
         step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
         sigma_px, width_px = np.full(len(sample), EDGE_POINT_SIGMA_PX), np.ones(len(sample))
-        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, width_px, _NOISE, _FULL_SCALE)
+        whole = np.zeros(len(sample))
+        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, width_px, whole, _NOISE, _FULL_SCALE)
         return self._votes(candidates, prediction)
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:

@@ -53,6 +53,7 @@ def candidates(sample: np.ndarray, offset_px: np.ndarray, sigma_px: float = 0.1,
         np.full(len(sample), step),
         np.full(len(sample), sigma_px),
         np.full(len(sample), 1.0),
+        np.zeros(len(sample)),
         1.0,
         255.0,
     )

@@ -39,7 +39,8 @@ class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         Meta(
             ge=0.0,
             le=1.0,
-            description="standard deviation of a whole edge's position that averaging along it does not remove (px)",
+            description="standard deviation of a whole sharp edge's position that averaging along it does not remove; "
+            "grows with the edges' width (px)",
         ),
     ] = 0.02
     support_sigmas: Annotated[

@@ -39,6 +39,7 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
+from gripmon.corners.saturation import SPREAD as SATURATION_SPREAD
 from gripmon.corners.search import SearchSettings, search_starts
 from gripmon.corners.taught import TaughtEdges
 from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
@@ -72,7 +73,7 @@ FEWEST_WIDTHS = 20
 SATISFIED = 0.65
 """Part of the usual share below which the gripper may be elsewhere."""
 
-TRUSTED = 0.5
+TRUSTED = 0.4
 """Part of the usual share below which a fit is not believed, whatever the settings allow."""
 
 CLEARLY_BETTER = 1.3
@@ -398,10 +399,24 @@ class FingertipMeter:
         return self._votes(candidates, prediction)
 
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
-        settings = self._settings.consensus
-        weights = base_weights(candidates, prediction, self._polarity, settings)
+        weights = base_weights(candidates, prediction, self._polarity, self._settings.consensus)
+        return Votes(candidates, prediction, weights, self._edge_spread_px(candidates, prediction))
+
+    def _edge_spread_px(self, candidates: Candidates, prediction: Prediction) -> Array:
+        """(e,) standard deviation of each whole edge's position, px: a share of the edges' width, more where their
+        bright side is cut off, and what the model doesn't say of a bevel.
+        """
+        width_px = max(float(np.median(candidates.width_px)), 1.0) if len(candidates.sample) else 1.0
         spread_px = prediction.edge_spread_m * prediction.pixels_per_m
-        return Votes(candidates, prediction, weights, np.hypot(settings.edge_floor_px, spread_px))
+        spread_px = np.hypot(spread_px, self._settings.consensus.edge_floor_px * width_px)
+        if candidates.cut_off.any():
+            edge = prediction.layout.edge[candidates.sample]
+            # High steps are the outline's, low ones texture beside it.
+            energy = candidates.step**2
+            total = np.bincount(edge, energy, len(spread_px))
+            share = np.bincount(edge, energy * candidates.cut_off, len(spread_px)) / np.maximum(total, 1e-12)
+            spread_px = np.hypot(spread_px, SATURATION_SPREAD * width_px * share)
+        return spread_px
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         return assess(votes, consensus, self._prior)

@@ -18,6 +18,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.corners.prediction import STEP_PX
+from gripmon.corners.saturation import doubt
 from gripmon.records import Array, Image
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
@@ -47,8 +48,9 @@ class Candidates:
     """Edge candidates of one image: ``sample`` (k,) index of the profile, ``offset_px`` (k,) along its normal,
     ``step`` (k,) signed height of the grey-level step (positive: brighter to the right of the edge), ``sigma_px``
     (k,) standard deviation from the noise and texture around it, ``width_px`` (k,) of the edge's response as a
-    Gaussian.  ``zoom``: factor on the lengths of the profiles that were read.  ``noise`` is the image noise in grey
-    levels, ``full_scale`` the largest grey level of the image's type.
+    Gaussian, ``cut_off`` (k,) from 0 to 1 how sure it is that its bright side is.  ``zoom``: factor on the lengths of
+    the profiles that were read.  ``noise`` is the image noise in grey levels, ``full_scale`` the largest grey level of
+    the image's type.
     """
 
     sample: NDArray[np.intp]
@@ -56,6 +58,7 @@ class Candidates:
     step: Array
     sigma_px: Array
     width_px: Array
+    cut_off: Array
     noise: float
     full_scale: float
     zoom: int = 1
@@ -156,13 +159,19 @@ def find_candidates(
     # A flat top would round to a curvature of zero in single precision.
     left, centre, right = (values[at + k].astype(np.float64) for k in (-1, 0, 1))
     curvature = 2.0 * centre - left - right
-    offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + 0.5 * (right - left) / curvature)
+    shift = 0.5 * (right - left) / curvature
+    offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
     step = response.ravel()[at].astype(np.float64)
     sigma_px = np.maximum(
         (noise * kernel.curvature_noise_px) / centre, STEP_PX * _unrest(response, sample, column + 1) / curvature
     )
-    width_px = STEP_PX * np.sqrt(centre / curvature)
-    return Candidates(sample, zoom * offset_px, step, zoom * sigma_px, zoom * width_px, noise, grey_range, zoom)
+    width = np.sqrt(centre / curvature)
+    margin = (profiles.shape[1] - response.shape[1]) // 2
+    bright = np.where(step > 0.0, 1, -1)
+    cut_off = doubt(profiles, sample, margin + column + 1.0 + shift, bright, width, grey_range)
+    return Candidates(
+        sample, zoom * offset_px, step, zoom * sigma_px, zoom * STEP_PX * width, cut_off, noise, grey_range, zoom
+    )
 
 
 def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
