@@ -84,7 +84,7 @@ def votes_for(
     edge_spread_px: np.ndarray | None = None,
 ) -> Votes:
     spread_px = np.full(EDGES, settings.edge_floor_px) if edge_spread_px is None else edge_spread_px
-    return Votes(found, PREDICTION, base_weights(found, PREDICTION, polarity, settings), spread_px)
+    return Votes(found, PREDICTION, base_weights(found, PREDICTION, polarity, settings), spread_px, np.zeros(EDGES))
 
 
 def fit(found: Candidates, settings: ConsensusSettings = SETTINGS, start: np.ndarray | None = None) -> Consensus:

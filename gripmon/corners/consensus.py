@@ -83,12 +83,16 @@ _CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard dev
 class Votes:
     """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
     ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
+
+    ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
+    prefer other edges.
     """
 
     candidates: Candidates
     prediction: Prediction
     weight: Array
     edge_spread_px: Array
+    cut_off_px: Array
 
 
 @dataclass(frozen=True, slots=True)

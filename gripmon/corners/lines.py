@@ -275,7 +275,8 @@ def _fit_lines(votes: Votes, line_weight: Array) -> list[_Line | None]:
     bounds = np.append(np.searchsorted(sample, first), len(inlier))
     sums = np.cumsum(terms, axis=1)[:, bounds]
     # What an edge's points share moves the whole line.
-    shared = (votes.edge_spread_px[layout.edges] * prediction.gain[first]) ** 2
+    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)[layout.edges]
+    shared = (spread_px * prediction.gain[first]) ** 2
     lines: list[_Line | None] = []
     for count, common, s0, s1, s2, t0, t1 in zip(
         np.diff(bounds).tolist(), shared.tolist(), *np.diff(sums, axis=1).tolist(), strict=True

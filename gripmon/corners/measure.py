@@ -32,6 +32,7 @@ from gripmon.corners.prediction import EdgeLayout, Prediction, SamplingSettings,
 from gripmon.corners.profiles import (
     Candidates,
     EdgeSettings,
+    cut_off_spread,
     estimate_noise,
     find_candidates,
     full_scale,
@@ -39,7 +40,6 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.corners.saturation import SPREAD as SATURATION_SPREAD
 from gripmon.corners.search import SearchSettings, search_starts
 from gripmon.corners.taught import TaughtEdges
 from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
@@ -400,23 +400,11 @@ class FingertipMeter:
 
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
         weights = base_weights(candidates, prediction, self._polarity, self._settings.consensus)
-        return Votes(candidates, prediction, weights, self._edge_spread_px(candidates, prediction))
-
-    def _edge_spread_px(self, candidates: Candidates, prediction: Prediction) -> Array:
-        """(e,) standard deviation of each whole edge's position, px: a share of the edges' width, more where their
-        bright side is cut off, and what the model doesn't say of a bevel.
-        """
+        # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
         width_px = max(float(np.median(candidates.width_px)), 1.0) if len(candidates.sample) else 1.0
-        spread_px = prediction.edge_spread_m * prediction.pixels_per_m
-        spread_px = np.hypot(spread_px, self._settings.consensus.edge_floor_px * width_px)
-        if candidates.cut_off.any():
-            edge = prediction.layout.edge[candidates.sample]
-            # High steps are the outline's, low ones texture beside it.
-            energy = candidates.step**2
-            total = np.bincount(edge, energy, len(spread_px))
-            share = np.bincount(edge, energy * candidates.cut_off, len(spread_px)) / np.maximum(total, 1e-12)
-            spread_px = np.hypot(spread_px, SATURATION_SPREAD * width_px * share)
-        return spread_px
+        bevel_px = prediction.edge_spread_m * prediction.pixels_per_m
+        spread_px = np.hypot(bevel_px, self._settings.consensus.edge_floor_px * width_px)
+        return Votes(candidates, prediction, weights, spread_px, width_px * cut_off_spread(candidates, prediction))
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         return assess(votes, consensus, self._prior)

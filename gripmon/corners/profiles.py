@@ -17,8 +17,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import STEP_PX
-from gripmon.corners.saturation import doubt
+from gripmon.corners.prediction import STEP_PX, Prediction
+from gripmon.corners.saturation import SPREAD, doubt
 from gripmon.records import Array, Image
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
@@ -193,6 +193,18 @@ def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDA
     total = (b - a) + (d - c)
     count = (ends[1] - ends[0]) + (ends[3] - ends[2])
     return np.sqrt(np.maximum(total, 0.0) / np.maximum(count, 1))
+
+
+def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
+    """(e,) standard deviation of each edge's position, in widths of the edge, where its bright side is cut off."""
+    edges = len(prediction.line_origin)
+    if not candidates.cut_off.any():
+        return np.zeros(edges)
+    edge = prediction.layout.edge[candidates.sample]
+    # High steps are the outline's, low ones texture beside it.
+    energy = candidates.step**2
+    total = np.bincount(edge, energy, edges)
+    return SPREAD * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
 
 
 def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:

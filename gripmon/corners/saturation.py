@@ -2,7 +2,7 @@
 
 Overexposure cuts the upper part of a blurred step off; what is left is steepest nearer to the dark side, by up to most
 of the edge's width.  By how much can't be told from the rest of the profile without knowing the lens's blur exactly,
-so that such edges only get a larger standard deviation: others, where they are seen, then decide.
+so that such edges only get a larger standard deviation.
 """
 
 from __future__ import annotations

@@ -61,8 +61,7 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     sample, weight = votes.candidates.sample[inlier], consensus.weight[inlier]
     edge, stretch = prediction.layout.edge[sample], prediction.layout.stretch[sample]
     # The weights were limited for what an edge's points share; this undoes it.
-    spread = votes.edge_spread_px
-    worth = 1.0 - spread**2 * np.bincount(edge, weight, len(spread))
+    worth = 1.0 - votes.edge_spread_px**2 * np.bincount(edge, weight, len(votes.edge_spread_px))
     alone = weight / worth[edge]
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     total = np.add.reduceat(alone, first)
@@ -74,9 +73,10 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     jacobian = prediction.jacobian_by_unknown[:, sample]
     pulls = np.add.reduceat(jacobian * weight, first, axis=1)
     middle = scatter * ((jacobian * (weight * worth[edge])) @ jacobian.T) + shared * (pulls @ pulls.T)
+    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)
     of_stretch = edge[first]
     begin = np.flatnonzero(np.diff(of_stretch, prepend=-1))
-    pulls = np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread[of_stretch[begin]])
+    pulls = np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[of_stretch[begin]])
     middle += pulls @ pulls.T
     middle.flat[:: len(middle) + 1] += prior_information
     covariance = inverse @ middle @ inverse
