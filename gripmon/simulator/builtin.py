@@ -114,12 +114,16 @@ def _lighting(t: float, fps: float) -> Scenario:
 
 
 def _series(name: str, tcp_shift_m: tuple[float, float], sigma_m: float) -> Scenario:
+    """As in the paper the gripper is parked on the calibration plate, in both images of a pair."""
+    plate = Background(
+        kind="discs", distance_m=0.0, level_dn=180.0, contrast=0.7, boxes=0, cables=0, motion="still", defocus_px=0.0
+    )
     return Scenario(
         name=name,
         duration_s=2 * _PAIRS / _PAIR_FPS,
         fps=_PAIR_FPS,
         pairs=Pairs(tcp_shift_m=tcp_shift_m, tcp_shift_sigma_m=sigma_m),
-        background=Background(kind="speckle"),
+        background=plate,
     )
 
 

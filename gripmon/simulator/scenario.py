@@ -137,10 +137,10 @@ class Cover(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class Background(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A table below the gripper with things on it; the robot moves over it, the gripper stands still in the image."""
 
-    kind: Literal["plain", "chequer", "printed", "stripes", "speckle", "blobs"] = "blobs"
-    distance_m: Annotated[float, Meta(ge=0.02, le=5.0, description="from the TCP to the table along gripper z (m)")] = (
-        0.16
-    )
+    kind: Literal["plain", "chequer", "printed", "stripes", "speckle", "blobs", "discs"] = "blobs"
+    distance_m: Annotated[
+        float, Meta(ge=0.0, le=5.0, description="from the TCP to the table along gripper z; 0: they touch (m)")
+    ] = 0.16
     level_dn: Annotated[float, Meta(ge=0.0, le=255.0, description="mean grey value of the table (DN)")] = 130.0
     contrast: Annotated[Fraction, Meta(description="of the table's pattern (0 to 1)")] = 0.6
     boxes: Annotated[

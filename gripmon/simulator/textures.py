@@ -89,6 +89,7 @@ def table(rng: Rng, settings: Background, size_px: int, px_per_m: float) -> Grey
         "stripes": _stripes,
         "speckle": lambda r, n, s: _threshold(r, n, 0.9e-3 * s),
         "blobs": _blobs,
+        "discs": _discs,
     }
     pattern = painters[settings.kind](rng, size_px, px_per_m)
     pattern = pattern + 0.06 * _tile_noise(rng, size_px, 0.8) + 0.08 * _tile_noise(rng, size_px, 12e-3 * px_per_m)
@@ -128,6 +129,16 @@ def _chequer(rng: Rng, size_px: int, px_per_m: float) -> Factor:
     board = (index[:, None] + index[None, :]) % 2
     wear = _tile_noise(rng, size_px, 8e-3 * px_per_m)
     return cv2.GaussianBlur((board * 1.3 - 0.65).astype(np.float32), (0, 0), 0.6) + 0.1 * wear
+
+
+def _discs(rng: Rng, size_px: int, px_per_m: float) -> Factor:
+    """A calibration plate: dark discs of 4 mm, 8 mm apart, on white."""
+    count = max(round(size_px / px_per_m / 8e-3), 1)
+    pitch_px = size_px / count
+    ticks = (np.arange(size_px) + rng.uniform(0.0, pitch_px)) % pitch_px - 0.5 * pitch_px
+    distance_px = np.hypot(ticks[:, None], ticks[None, :])
+    disc = np.clip(0.5 + 2e-3 * px_per_m - distance_px, 0.0, 1.0)
+    return (0.2 - 1.1 * disc).astype(np.float32)
 
 
 def _stripes(rng: Rng, size_px: int, px_per_m: float) -> Factor:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,11 +20,13 @@ from gripmon.gripper import Gripper
 from gripmon.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.records import Array, Image
 from gripmon.simulator import Simulator, make_scenario
+from gripmon.simulator.scenario import Background
 
 _RENDERED = "rendered series2, true jaw"
 _ITERATIONS = 5
 """Linearisations of an update from the reference, some degrees away: as many as change anything."""
 
+CLUTTER = Background(kind="speckle")
 _EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 _USUAL_SHARE = 0.9
 _NEEDED = {"3P": 3, "4P": 4, "5P": 5, "all": 3}
@@ -109,19 +112,24 @@ class RenderedSeries:
 
 
 def all_series(seed: int) -> list[Series]:
-    """The paper's two series from the simulator, and the rendered second one if it is there."""
+    """The paper's two series from the simulator, on the plate and in the air, and the rendered second one if it is
+    there.
+    """
     config = load_config(builtin_config("demo.yaml"), check_source=False)
     nominal = from_record(config.reference.cam_T_grip)
-    simulated = [
-        SimulatedSeries(
-            name,
-            f"`gripmon simulate {name}`, seed {seed}",
-            Simulator(config.camera, config.gripper, nominal, make_scenario(name), seed),
-        )
-        for name in ("series1", "series2")
-    ]
-    other = [RenderedSeries("series2", "independent renderer", s) for s in rendered.sequences(_RENDERED)]
-    return [*simulated, *other]
+
+    def simulated(name: str, scene: str, **changes: object) -> SimulatedSeries:
+        scenario = msgspec.structs.replace(make_scenario(name), **changes)
+        return SimulatedSeries(name, scene, Simulator(config.camera, config.gripper, nominal, scenario, seed))
+
+    out: list[Series] = []
+    for name in ("series1", "series2"):
+        out += [
+            simulated(name, f"`gripmon simulate {name} --seed {seed}`: parked on the plate, as in the paper"),
+            simulated(name, "the same poses in the air, moving clutter behind", background=CLUTTER),
+        ]
+    out += [RenderedSeries("series2", "independent renderer, moving clutter", s) for s in rendered.sequences(_RENDERED)]
+    return out
 
 
 def measure(
@@ -175,7 +183,8 @@ class MeasuredPair:
             return None
         points_cam_m = self._model_cam_m()[taken]
         measured_xy = self.after.corners.xy[taken]
-        covariance_xy = sum(m.corners.joint_covariance_xy(taken) for m in (self.before, self.after))
+        before_xy, after_xy = (m.corners.joint_covariance_xy(taken) for m in (self.before, self.after))
+        covariance_xy = before_xy + after_xy
         try:
             if way == "U":
                 tcp_m = self.reference_T[:3, 3]
