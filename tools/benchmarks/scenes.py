@@ -35,8 +35,8 @@ CAMERA = PaperLens(
 START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
 """By how much a scene's reference is wrong, each axis; the monitor is told."""
 _BORDER_PX = 14.0
-_MOMENTS, _MOVES_M = 5, 1e-5
-"""Moments of an exposure at which tags are printed, where they move further than this within it."""
+_MOVES_M = 1e-5
+"""Tags that move further than this within the exposure are printed smeared."""
 _KINDS = ("blobs", "speckle", "stripes", "printed")
 
 
@@ -103,17 +103,12 @@ class Scene(Sequence):
         return simulator.expose(total, index)
 
     def _moments(self, truth: FrameTruth) -> list[tuple[FrameTruth, float]]:
-        """Moments of the exposure and their shares (trapezoids); one if nothing moves in the meantime."""
-        half_ms = 500.0 * self.simulator.scenario.sensor.exposure_time_s
-        whole_ms = np.unique(np.round(np.linspace(-half_ms, half_ms, _MOMENTS)))
-        around = [self._by_ms.truth(max(round(1e3 * truth.time_s + ms), 0)) for ms in whole_ms.tolist()]
+        """Moments of the exposure and their shares: the middles of its thirds; one if nothing moves meanwhile."""
+        third_ms = 1e3 / 3.0 * self.simulator.scenario.sensor.exposure_time_s
+        around = [self._by_ms.truth(max(round(1e3 * truth.time_s + k * third_ms), 0)) for k in (-1, 0, 1)]
         ways_m = [np.abs(m.cam_T_grip[:3, 3] - truth.cam_T_grip[:3, 3]).max() for m in around]
         ways_m += [abs(m.jaw_opening_m - truth.jaw_opening_m) for m in around]
-        if len(around) < 2 or max(ways_m) < _MOVES_M:
-            return [(truth, 1.0)]
-        weights = np.gradient(whole_ms)
-        weights[[0, -1]] *= 0.5
-        return list(zip(around, (weights / weights.sum()).tolist(), strict=True))
+        return [(truth, 1.0)] if max(ways_m) < _MOVES_M else [(moment, 1.0 / 3.0) for moment in around]
 
     @cached_property
     def _tags(self) -> FingerTags:

@@ -224,23 +224,25 @@ def _print(size: tuple[int, int], camera: Camera, outer_cam_m: Array, number: in
     plane = np.linalg.inv(np.column_stack([right, down, outer_cam_m[0]]))
     along = np.column_stack([xy, np.ones(len(xy))]) @ plane.T
     a, b = (np.reshape(along[:, k] / along[:, 2], (rows * _FINE, columns * _FINE)) for k in (0, 1))
-    tables = (_integral(np.ones((cells, cells))), _print_integral(number))
-    covered, paper = (_through_lens(_area_mean(table, a, b), psf_px) for table in tables)
-    return _Print((slice(low[1], high[1]), slice(low[0], high[0])), covered, paper)
-
-
-def _area_mean(table: Array, a: Array, b: Array) -> Array:
-    """Mean of cells over the area that each point stands for, from their integral; the cells' axes as its sides."""
+    # Each point stands for an area; the cells' axes are taken for its sides.
     half_a = 0.5 * np.hypot(np.gradient(a, axis=0), np.gradient(a, axis=1))
     half_b = 0.5 * np.hypot(np.gradient(b, axis=0), np.gradient(b, axis=1))
-    total = _bilinear(table, a + half_a, b + half_b) - _bilinear(table, a - half_a, b + half_b)
-    total += _bilinear(table, a - half_a, b - half_b) - _bilinear(table, a + half_a, b - half_b)
-    return np.asarray(total / (4.0 * half_a * half_b))
+    ends = [np.clip(end, 0.0, cells) for end in (a - half_a, a + half_a, b - half_b, b + half_b)]
+    area = 4.0 * half_a * half_b
+    covered = (ends[1] - ends[0]) * (ends[3] - ends[2]) / area
+    paper = _sum_between(_print_integral(number), *ends) / area
+    window = slice(low[1], high[1]), slice(low[0], high[0])
+    return _Print(window, _through_lens(covered, psf_px), _through_lens(paper, psf_px))
+
+
+def _sum_between(table: Array, a_low: Array, a_high: Array, b_low: Array, b_high: Array) -> Array:
+    """Sum of cells over rectangles, from their integral."""
+    total = _bilinear(table, a_high, b_high) - _bilinear(table, a_low, b_high)
+    return np.asarray(total + _bilinear(table, a_low, b_low) - _bilinear(table, a_high, b_low))
 
 
 def _bilinear(table: Array, a: Array, b: Array) -> Array:
     last = table.shape[0] - 1
-    a, b = np.clip(a, 0.0, last), np.clip(b, 0.0, last)
     i, j = np.minimum(a, last - 1).astype(np.intp), np.minimum(b, last - 1).astype(np.intp)
     s, t = a - i, b - j
     upper = (1.0 - s) * table[j, i] + s * table[j, i + 1]
