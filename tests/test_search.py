@@ -5,23 +5,33 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from meters import EVERYWHERE, NARROW, box_gripper, difference, measure, meter, moved, picture, simulated
+from meters import (
+    EVERYWHERE,
+    NARROW,
+    box_gripper,
+    corners_px,
+    difference,
+    measure,
+    meter,
+    moved,
+    picture,
+    simulated,
+)
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
-from test_prediction import predicted
 
 from gripmon.camera import make_camera
 from gripmon.corners import Effort, Measurement
-from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.corners.search import SearchSettings, search_poses
 from gripmon.simulator import make_scenario
 
 SETTINGS = SearchSettings()
 
 
 def jumps(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Shifts of the TCP by up to 10 mm along every axis, turns by up to 4 degrees about the optical axis."""
+    """Shifts of the TCP by up to 10 mm along every axis, turns by up to 4 degrees about every axis."""
     xi = np.zeros((count, 6))
     xi[:, :3] = rng.uniform(-0.01, 0.01, (count, 3))
-    xi[:, 5] = np.deg2rad(rng.uniform(-4.0, 4.0, count))
+    xi[:, 3:] = np.deg2rad(rng.uniform(-4.0, 4.0, (count, 3)))
     return xi
 
 
@@ -30,9 +40,9 @@ def is_true(found: Measurement, cam_T_grip: np.ndarray) -> bool:
     return bool(np.abs(error[:2]).max() < 1.5e-4 and abs(error[2]) < 6e-4)
 
 
-@pytest.mark.parametrize(("scene", "least"), [("static", 28), ("bump", 28), ("clutter", 17)])
+@pytest.mark.parametrize(("scene", "least"), [("static", 29), ("bump", 29), ("clutter", 27)])
 def test_random_jumps_are_found_and_never_a_wrong_place_is_trusted(scene: str, least: int):
-    """Of 30 jumps; the third scene, full of straight edges in motion, may need several frames."""
+    """Of 30 jumps, in one frame; the third scene is full of straight edges."""
     rng, true = np.random.default_rng(11), nominal_cam_T_grip()
     found = 0
     for seed in (3, 4, 5):
@@ -78,47 +88,50 @@ def test_nothing_is_found_where_no_gripper_is():
         assert not measure(image, patience=EVERYWHERE).trusted
 
 
-def test_a_start_puts_the_gripper_where_it_is():
-    """On even ground one of the starts must lie within what the fit can bridge: a few pixels of the reduced image."""
-    image, true, camera = picture(plain_scenario()), nominal_cam_T_grip(), make_camera(PAPER_LENS)
-    points = box_gripper().points_grip_m(0.034)[box_gripper().corner_points]
-    rng = np.random.default_rng(14)
-    for xi in jumps(rng, 12):
-        expected = moved(true, xi)
-        starts = search_starts(image, predicted(cam_T_grip=expected), SETTINGS)
-        assert 0 < len(starts) <= SETTINGS.starts
-        misses = []
-        for start in starts:
-            pose = moved(expected, start[:6])
-            uv, goal = (camera.project(points @ p[:3, :3].T + p[:3, 3]) for p in (pose, true))
-            misses.append(np.abs(uv - goal).max())
-        assert min(misses) < 4.0 * image.shape[1] / SETTINGS.coarse_columns
+def searched(image: np.ndarray, expected: np.ndarray, settings: SearchSettings = SETTINGS) -> np.ndarray:
+    return search_poses(image, make_camera(PAPER_LENS), box_gripper(), expected, 0.034, settings)
 
 
-def test_no_start_lies_beyond_the_reach():
-    image = picture(make_scenario("clutter"), 0, 3)
-    starts = search_starts(image, predicted(), SearchSettings(reach_m=0.004, turn_rad=0.03, starts=8))
-    assert len(starts) == 8
-    assert np.abs(starts[:, 5]).max() <= 0.03 + 1e-9
-    assert np.abs(starts[:, 2]).max() <= 0.004 * 1.15
-    # A shift of the image by the reach, a turn and a scale about the middle of the fingers.
-    assert np.abs(starts[:, :2]).max() <= 0.004 + 0.03 * 0.03 + 0.035 * 0.03 + 0.001
-    assert not starts[:, 3:5].any() and not starts[:, 6:].any()
+def outline_misses_px(pose: np.ndarray, true: np.ndarray) -> float:
+    """Largest way of a visible corner between two poses, px."""
+    uv, goal = (corners_px(make_camera(PAPER_LENS), box_gripper(), p) for p in (pose, true))
+    facing = ["far" not in name or "in" in name for name in box_gripper().corner_ids]
+    return float(np.linalg.norm((uv - goal)[facing], axis=1).max())
+
+
+def test_a_proposed_pose_puts_the_gripper_where_it_is():
+    """On even ground one of the best must lie within what the fit can bridge, tilts included."""
+    image, true = picture(plain_scenario()), nominal_cam_T_grip()
+    for xi in jumps(np.random.default_rng(14), 12):
+        poses = searched(image, moved(true, xi))
+        assert 0 < len(poses) <= SETTINGS.starts
+        assert min(outline_misses_px(pose, true) for pose in poses[:3]) < 7.0
+
+
+def test_no_proposed_pose_lies_far_beyond_the_reach():
+    image, expected = picture(make_scenario("clutter"), 0, 3), nominal_cam_T_grip()
+    settings = SearchSettings(reach_m=0.004, turn_rad=0.03, tilt_rad=0.02, starts=8)
+    poses = searched(image, expected, settings)
+    assert len(poses) == 8
+    xi = np.array([difference(expected, pose) for pose in poses])
+    # Turns act about the middle of what is seen of the fingers, 25 mm from the TCP; polishing may go half as far again.
+    assert np.abs(xi[:, :3]).max() <= 1.5 * (0.004 + 0.05 * 0.03)
+    assert np.abs(xi[:, 3:]).max() <= 2.5 * 0.03
 
 
 def test_nothing_is_searched_for_when_nothing_can_be_seen():
     pose = moved(nominal_cam_T_grip(), np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0]))
     image = picture(plain_scenario())
-    assert search_starts(image, predicted(cam_T_grip=pose), SETTINGS).shape == (0, 7)
+    assert searched(image, pose).shape == (0, 4, 4)
     assert not measure(image, pose, patience=EVERYWHERE).trusted
 
 
 def test_a_search_in_a_meter_leaves_nothing_behind():
     image, true, used = picture(make_scenario("static"), 0, 3), nominal_cam_T_grip(), meter()
-    first = measure(image, using=used)
+    first = measure(image, using=used)  # its profiles lie a little elsewhere than those after a search
     measure(image, moved(true, np.array([0.008, -0.006, 0.0, 0.0, 0.0, 0.05])), using=used, patience=EVERYWHERE)
     again = difference(first.cam_T_grip, measure(image, using=used).cam_T_grip)
-    assert (np.abs(again) < 0.3 * np.sqrt(np.diag(first.covariance)[:6])).all()
+    assert (np.abs(again) < 0.6 * np.sqrt(np.diag(first.covariance)[:6])).all()
 
 
 @pytest.mark.parametrize("kind", ["colour", "uint16", "float32"])

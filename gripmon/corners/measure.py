@@ -40,7 +40,7 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.corners.search import SearchSettings, search_starts
+from gripmon.corners.search import SearchSettings, search_poses
 from gripmon.corners.taught import TaughtEdges
 from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
 from gripmon.geometry import perturb, perturbation_between
@@ -58,7 +58,7 @@ JAW_UNREPORTED_SIGMA_M = 0.02
 FOUND_EDGES = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""
 
-SETTLED_STARTS = 3
+SETTLED_STARTS = 2
 """Starts of a wide search that are followed to the end."""
 
 ZOOMS = (1, 2, 4)
@@ -330,20 +330,16 @@ class FingertipMeter:
         return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
 
     def _search(self, image: Image, expected: _Expected) -> Measurement:
-        """Starts from the reduced image: all are tried roughly, with the edges sampled as before; the most promising
-        are settled.
-        """
-        prediction, here = self._predicted(expected)
-        settings = self._settings
+        """The places that a search in a reduced image proposes, all tried roughly; the most promising are settled."""
         tried = []
-        for start in search_starts(image, prediction, settings.search):
-            there = self._moved(prediction, here + start, expected)
-            seen = self._predict(prediction.layout, there)
+        search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
+        for cam_T_grip in search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search):
+            there = replace(expected, cam_T_grip=cam_T_grip)
+            seen = self._predict(self._lay_out(there), there)
             if not seen.ok.any():
                 continue
-            starts = grid_of_starts(seen, self._reach_px, settings.consensus.start_width_px)
             prior = self._prior_about(seen, there)
-            fit = agree_from_grid(self._look(image, seen), prior, starts, settings.consensus, refine=3)
+            fit = agree(self._look(image, seen), prior, np.zeros(len(self._prior)), self._settings.consensus)
             tried.append((fit.share, self._moved(seen, fit.xi, there)))
         tried.sort(key=lambda item: -item[0])
         found = [self._settle(image, there) for _, there in tried[:SETTLED_STARTS]]
@@ -358,16 +354,18 @@ class FingertipMeter:
             start = self._from_prediction(kept, expected)
             if kept.moved_px(start) <= self._settings.relinearise_px:
                 return kept, start
-        cam_T_grip, jaw_opening_m = expected.cam_T_grip, expected.jaw_opening_m
         if self._laid_out is None or self._layout_moved_px(expected) > RELAYOUT_PX:
-            sampling = self._settings.sampling
-            margin_px = self._zoom * sampling.end_margin_px
-            sampling = msgspec.structs.replace(sampling, reach_px=self._reach_px, end_margin_px=margin_px)
-            layout = lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, sampling, self._taught)
-            self._laid_out = layout, self._corner_pixels(expected)
+            self._laid_out = self._lay_out(expected), self._corner_pixels(expected)
         self._prediction = self._predict(self._laid_out[0], expected)
         self._geometry = CornerGeometry.of(self._gripper, self._prediction, self._settings.corners)
         return self._prediction, np.zeros(len(self._prior))
+
+    def _lay_out(self, expected: _Expected) -> EdgeLayout:
+        sampling = self._settings.sampling
+        margin_px = self._zoom * sampling.end_margin_px
+        sampling = msgspec.structs.replace(sampling, reach_px=self._reach_px, end_margin_px=margin_px)
+        cam_T_grip, jaw_opening_m = expected.cam_T_grip, expected.jaw_opening_m
+        return lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m, sampling, self._taught)
 
     def _predict(self, layout: EdgeLayout, expected: _Expected) -> Prediction:
         jaw_unknown = len(self._prior) == 7

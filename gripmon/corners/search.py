@@ -1,32 +1,60 @@
 """Finding the gripper again after a jump that is wider than the profiles reach.
 
-In an image reduced to some 160 columns, every predicted edge point asks for a gradient across its edge.  The answers,
-limited so that strong texture counts no more than a clear edge, are added up over shifts, turns about the optical
-axis and scales; the best places become starts for the joint fit on the full image.
+In a reduced image (``reduced``) the points on the predicted outlines vote for shifts, turns about the optical axis and
+scales.  The best places are shaken in all six directions, tilts included, then polished on an image of twice the
+resolution (``hypotheses``); what is left are a few starts for the joint fit on the full image, which decides.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Annotated
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import Prediction
-from gripmon.corners.profiles import GREY_BGR
+from gripmon.camera import Camera
+from gripmon.corners.hypotheses import (
+    MapScore,
+    OutlinePoints,
+    Poses,
+    ProfileScore,
+    apart,
+    orientation_of,
+    outline_points,
+    project,
+    rotations,
+)
+from gripmon.corners.reduced import Floats, Window, evidence_maps, rectify, window_about
+from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
 
-_ORIENTATIONS = 16
+POINTS, FINE_POINTS = 80, 120
+"""Points on the outlines that are looked at in the reduced image, and in the finer one."""
 
-POINTS = 80
-"""Edge points that vote; more cost more and tell little."""
+TICK = 3.0
+"""Step of turn and scale: so many cells of motion at the farthest outline point."""
 
-TICK = 2.0
-"""Step of turn and scale: so many coarse pixels of motion at the farthest edge point."""
+PLACES = 64
+"""Best places of the votes that are followed."""
+
+POLISHED = 24
+"""Of these, how many are polished."""
+
+SHAKES = ((24, 2.5, 1.0), (12, 1.25, 0.5))
+"""Rounds of perturbations: how many of each place, by how many cells, and by which part of the searched tilt."""
+
+FINER = 2
+"""Resolution of the image for polishing over that for voting."""
+
+POLISH_REACH, POLISH_ROUNDS = 4, 4
+"""Cells beside the outlines that are looked at when polishing, at first; steps."""
+
+APART = 2.0
+"""Poses whose outlines differ by less than so many (finer) cells are one."""
 
 
 class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -41,7 +69,13 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     turn_rad: Annotated[
         float, Meta(ge=0.0, le=0.5, description="turn about the optical axis that is searched (rad)")
     ] = 0.08
-    coarse_columns: Annotated[int, Meta(ge=64, le=1024, description="width of the reduced image (columns)")] = 160
+    tilt_rad: Annotated[
+        float, Meta(ge=0.0, le=0.5, description="turn about the axes across the optical axis that is searched (rad)")
+    ] = 0.08
+    coarse_columns: Annotated[
+        int,
+        Meta(ge=64, le=1024, description="width of the reduced image, as far as the gripper can be in it (columns)"),
+    ] = 160
     starts: Annotated[int, Meta(ge=1, le=64, description="places that are tried on the full image")] = 12
     eager_frames: Annotated[
         int, Meta(ge=1, le=1000, description="so many frames may look further one after the other")
@@ -54,38 +88,97 @@ class SearchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 15
 
 
-def search_starts(image: Image, prediction: Prediction, settings: SearchSettings) -> Array:
-    """Starts (s, m) for the joint fit, best first: perturbations of the prediction's pose.  Empty when nothing is
-    predicted.
+def search_poses(
+    image: Image,
+    camera: Camera,
+    gripper: Gripper,
+    cam_T_grip: Array,
+    jaw_opening_m: float,
+    settings: SearchSettings,
+) -> Array:
+    """Poses (s, 4, 4) about an expected one from which a joint fit may find the gripper, best first.
 
-    The pose's tilt isn't searched: within some degrees it shows as a shift, and the fit finds the rest.
+    Empty when none of its outlines can be in the image.
     """
-    unknowns = prediction.jacobian.shape[1]
-    usable = np.flatnonzero(prediction.ok)
-    if len(usable) < 8:
-        return np.zeros((0, unknowns))
-    points = usable[:: max(1, len(usable) // POINTS)]
-    factor = max(1.0, image.shape[1] / settings.coarse_columns)
-    depth = float(prediction.corners.cam_m[:, 2].mean())
-    reach = math.ceil(settings.reach_m * prediction.pixels_per_m / factor)
-    padded = np.pad(_edge_answers(image, factor), ((0, 0), (reach, reach), (reach, reach)))
-    centre = prediction.uv_px[points].mean(axis=0)
-    spread_px = float(np.abs(prediction.uv_px[points] - centre).max())
-    turns = _ticks(settings.turn_rad, TICK * factor / spread_px)
-    scales = _ticks(settings.reach_m / depth, TICK * factor / spread_px)
-    found: list[tuple[float, Array]] = []
-    for turn in turns:
-        for scale in scales:
-            votes = _votes(padded, prediction, points, centre, turn, scale, factor, reach)
-            for score, dx, dy in _peaks(votes, 2):
-                start = np.zeros(unknowns)
-                # A scale s about the camera's axis is a depth z / s; shift and turn act at that depth.
-                start[2] = depth / (1.0 + scale) - depth
-                start[5] = turn
-                start[:2] = _shift_of_tcp(prediction, centre, (dx * factor, dy * factor), turn, scale)
-                found.append((score, start))
-    found.sort(key=lambda item: -item[0])
-    return np.array([start for _, start in found[: settings.starts]])
+    depth_m = float(cam_T_grip[2, 3])
+    if not depth_m > 0.0:
+        return np.zeros((0, 4, 4))
+    margin_px = settings.reach_m / depth_m * camera.fx_px
+    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, POINTS)
+    if not len(points):
+        return np.zeros((0, 4, 4))
+    place = _Place(cam_T_grip, points, settings)
+    window = window_about(camera, place.xy, place.reach_m / place.depth_m, settings.coarse_columns)
+    if min(window.columns, window.rows) < 8:
+        return np.zeros((0, 4, 4))
+    maps = evidence_maps(*rectify(image, camera, window))
+    poses = place.voted(maps, window)
+    score = MapScore(points, window, maps)
+    for count, cells, part in SHAKES:
+        poses, scores = score.shaken(poses, place.shakes(count, cells * window.pitch, part), place.middle_m)
+    poses = poses.take(np.array(apart(poses, points, window, scores, 0.5 * APART / FINER, POLISHED)))
+    finer = window.finer(FINER)
+    points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS)
+    profiles = ProfileScore(points, finer, *rectify(image, camera, finer))
+    poses = profiles.polished(poses, POLISH_REACH, POLISH_ROUNDS, place.sigma)
+    best = apart(poses, points, finer, profiles.score(poses), APART, settings.starts)
+    return poses.take(np.array(best)).matrices()
+
+
+class _Place:
+    """Where the gripper is expected, and how far from there it may be."""
+
+    def __init__(self, cam_T_grip: Array, points: OutlinePoints, settings: SearchSettings) -> None:
+        self._settings, self._points = settings, points
+        self._expected = Poses(cam_T_grip[None, :3, :3], cam_T_grip[None, :3, 3])
+        self.middle_m = np.asarray(points.points_m.mean(axis=1), dtype=float)
+        middle_cam_m = cam_T_grip[:3, :3] @ self.middle_m + cam_T_grip[:3, 3]
+        self.depth_m = max(float(middle_cam_m[2]), 1e-3)
+        seen_m = cam_T_grip[:3, :3] @ points.points_m + cam_T_grip[:3, 3:4]
+        self.xy: Array = (seen_m[:2] / np.maximum(seen_m[2], 1e-3)).T
+        self._spread = float(np.abs(self.xy - self.xy.mean(axis=0)).max())
+        # A turn about the TCP shifts what is seen of the fingers.
+        self.reach_m = settings.reach_m + settings.tilt_rad * float(np.linalg.norm(self.middle_m))
+        turns = [settings.tilt_rad, settings.tilt_rad, settings.turn_rad]
+        self.sigma = np.array([0.5 * settings.reach_m] * 3 + [0.6 * turn for turn in turns]) + 1e-6
+
+    def shakes(self, count: int, shift: float, part: float) -> Array:
+        """(count, 6) perturbations: by up to ``shift`` (ideal) in the image, and a part of the searched tilt."""
+        across, turn = shift * self.depth_m, min(shift / self._spread, 1.0)
+        tilt = part * self._settings.tilt_rad
+        return _spread_evenly(count) * np.array([across, across, turn * self.depth_m, tilt, tilt, turn])
+
+    def voted(self, maps: Floats, window: Window) -> Poses:
+        """The places with most votes over shifts, turns about the optical axis, and scales."""
+        settings, points = self._settings, self._points
+        seen = project(points, self._expected, window)
+        places = np.column_stack([seen.column[0], seen.row[0]]).astype(float)
+        centre = places.mean(axis=0)
+        orientation = orientation_of(seen)[0] * (math.pi / 16)
+        reach = math.ceil(self.reach_m / self.depth_m / window.pitch)
+        padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
+        tick = TICK * window.pitch / self._spread
+        found: list[tuple[float, float, float, Array]] = []
+        for turn in _ticks(settings.turn_rad, tick):
+            c, s = math.cos(turn), math.sin(turn)
+            turned = (places - centre) @ np.array([[c, s], [-s, c]])
+            index = np.rint((orientation + turn) * (16 / math.pi)).astype(int) % 16
+            for scale in _ticks(self.reach_m / self.depth_m, tick):
+                column, row = np.rint((1.0 + scale) * turned + centre).astype(int).T
+                votes = _votes(padded, index, column, row, reach)
+                found += [(score, turn, scale, shift) for score, shift in _peaks(votes, 2)]
+        found.sort(key=lambda item: -item[0])
+        return self._poses(found[:PLACES], window)
+
+    def _poses(self, found: list[tuple[float, float, float, Array]], window: Window) -> Poses:
+        turns, scales = np.array([item[1] for item in found]), np.array([item[2] for item in found])
+        shifts = np.array([item[3] for item in found]) * window.pitch
+        turned = rotations(np.column_stack([np.zeros((len(turns), 2)), turns])) @ self._expected.rotation
+        # What was seen at the middle of the fingers is now elsewhere, and nearer by the scale.
+        xy = self.xy.mean(axis=0) + shifts
+        z = self.depth_m / (1.0 + scales)
+        middle = np.column_stack([xy * z[:, None], z])
+        return Poses(turned, middle - turned @ self.middle_m)
 
 
 def _ticks(reach: float, step: float) -> list[float]:
@@ -93,87 +186,42 @@ def _ticks(reach: float, step: float) -> list[float]:
     return [reach * k / count for k in range(-count, count + 1)] if count else [0.0]
 
 
-def _shift_of_tcp(
-    prediction: Prediction, centre: Array, shift_px: tuple[float, float], turn: float, scale: float
-) -> Array:
-    """Translation (2,) of the TCP, m, that moves the point seen at ``centre`` by ``shift_px`` when the gripper also
-    turns and comes nearer.
-    """
-    tcp = prediction.cam_T_grip[:3, 3]
-    lens = prediction.corners.d_uv_d_xy.mean(axis=0)
-    tcp_uv = prediction.corners.uv_px.mean(axis=0) + lens @ (tcp[:2] / tcp[2] - prediction.corners.xy.mean(axis=0))
-    arm = tcp_uv - centre
-    turned = (1.0 + scale) * np.array(
-        [math.cos(turn) * arm[0] - math.sin(turn) * arm[1], math.sin(turn) * arm[0] + math.cos(turn) * arm[1]]
-    )
-    move_xy = np.linalg.solve(lens, np.asarray(shift_px) + turned - arm)
-    return (tcp[:2] / tcp[2] + move_xy) * (tcp[2] / (1.0 + scale)) - tcp[:2]
-
-
-def _edge_answers(image: Image, factor: float) -> NDArray[np.float32]:
-    """(o, h, w) for each orientation of the normal in [0, pi): squared cosine to the gradient, times a limited
-    strength.
-    """
-    size = (max(16, round(image.shape[1] / factor)), max(16, round(image.shape[0] / factor)))
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    if small.ndim == 3:
-        small = small @ GREY_BGR
-    if not np.isfinite(small).all():
-        # Dead pixels of a float camera: the usual level makes no edge that would outshine all others.
-        small[~np.isfinite(small)] = np.nanmedian(small)
-    gx = cv2.Scharr(small, cv2.CV_32F, 1, 0)
-    gy = cv2.Scharr(small, cv2.CV_32F, 0, 1)
-    energy = gx * gx + gy * gy
-    usual = float(np.median(energy)) + 1e-12
-    limited = 1.0 / (energy + 2.0 * usual)
-    out = np.empty((_ORIENTATIONS, *small.shape), dtype=np.float32)
-    for k in range(_ORIENTATIONS):
-        angle = math.pi * k / _ORIENTATIONS
-        across = math.cos(angle) * gx + math.sin(angle) * gy
-        out[k] = across * across * limited
-    return out
-
-
 def _votes(
-    padded: NDArray[np.float32],
-    prediction: Prediction,
-    points: NDArray[np.intp],
-    centre: Array,
-    turn: float,
-    scale: float,
-    factor: float,
-    reach: int,
-) -> NDArray[np.float32]:
-    """(2 reach + 1, 2 reach + 1) summed answers over shifts in coarse pixels; rows are shifts along v.
+    padded: Floats, index: NDArray[np.intp], column: NDArray[np.intp], row: NDArray[np.intp], reach: int
+) -> Floats:
+    """(2 reach + 1, 2 reach + 1) summed evidence over shifts in cells; rows are shifts along v.
 
-    ``padded`` are the answers with ``reach`` more pixels all around; points that fall outside even so have no vote.
+    ``padded`` are the maps with ``reach`` more cells all around; points that fall outside even so have no vote.
     """
-    c, s = math.cos(turn), math.sin(turn)
-    arms = prediction.uv_px[points] - centre
-    rotation = np.array([[c, -s], [s, c]])
-    # Pixel centres are integers in both images.
-    places = ((1.0 + scale) * arms @ rotation.T + centre + 0.5) / factor - 0.5
-    normals = prediction.normal[points] @ rotation.T
-    orientation = (
-        np.round(np.arctan2(normals[:, 1], normals[:, 0]) / math.pi * _ORIENTATIONS).astype(int) % _ORIENTATIONS
-    )
-    column, row = np.round(places).astype(int).T
     height, width = padded.shape[1] - 2 * reach, padded.shape[2] - 2 * reach
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     size = 2 * reach + 1
     votes = np.zeros((size, size), dtype=np.float32)
-    for k, u, v in np.column_stack([orientation, column, row])[inside].tolist():
+    for k, u, v in np.column_stack([index, column, row])[inside].tolist():
         votes += padded[k, v : v + size, u : u + size]
     return votes
 
 
-def _peaks(votes: NDArray[np.float32], count: int) -> list[tuple[float, int, int]]:
-    """The highest separate peaks: (score, dx, dy) in coarse pixels."""
+def _peaks(votes: Floats, count: int) -> list[tuple[float, Array]]:
+    """The highest separate peaks: score and shift (2,) in cells."""
     left = votes.copy()
     reach = votes.shape[0] // 2
     out = []
     for _ in range(count):
         row, column = divmod(int(left.argmax()), votes.shape[1])
-        out.append((float(votes[row, column]), column - reach, row - reach))
-        left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = 0.0
+        out.append((float(votes[row, column]), np.array([column - reach, row - reach], dtype=float)))
+        left[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3] = -np.inf
     return out
+
+
+@lru_cache(maxsize=8)
+def _spread_evenly(count: int) -> Array:
+    """(count, 6) in [-1, 1): zero, then a sequence without gaps or clusters (additive recurrence of the generalised
+    golden ratio: Roberts 2018, "The unreasonable effectiveness of quasirandom sequences").
+    """
+    ratio = 1.1127756842787055  # the root of x**7 = x + 1
+    steps = ratio ** -np.arange(1.0, 7.0)
+    places = 2.0 * ((0.5 + np.arange(count)[:, None] * steps) % 1.0) - 1.0
+    places[0] = 0.0
+    places.flags.writeable = False
+    return places

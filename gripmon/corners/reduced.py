@@ -1,0 +1,165 @@
+"""The reduced image that a search looks at: a window about the gripper, without the lens, and what its pixels say for
+an edge.
+
+Its coordinates are cells: ideal coordinates from the window's first cell, in steps of its pitch.  Edge strengths say
+little by themselves, since what is strong differs from scene to scene and from place to place.  So a strength is
+divided by the mean about it, and counts by how rare it is in this image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.corners.profiles import GREY_BGR
+from gripmon.records import Array, Image
+
+Floats = NDArray[np.float32]
+
+ORIENTATIONS = 16
+"""Of edges, in [0, pi)."""
+
+HALF_LENGTH = 4
+"""Cells to both sides over which strengths are averaged along an edge: texture cancels, straight edges don't."""
+
+HIDDEN = 0.3
+"""Probability that an edge of the gripper doesn't show at a place: hidden, or of too little contrast."""
+
+RARITY = 0.35
+"""Exponent of the distribution of an edge's rank where it shows: median at the strongest 14 % of all places."""
+
+SMALLEST_RANK = 0.004
+"""Strengths rarer than this count alike."""
+
+_NODE = 8  # cells between places at which the lens is reckoned
+_LEVELS = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """``low_xy`` (2,) ideal coordinates of the first cell, ``pitch`` of the cells (no unit), and their number."""
+
+    low_xy: Array
+    pitch: float
+    columns: int
+    rows: int
+
+    def finer(self, factor: int) -> Window:
+        """The same part of the view in cells of a fraction of the size."""
+        return Window(self.low_xy, self.pitch / factor, self.columns * factor, self.rows * factor)
+
+
+def window_about(camera: Camera, xy: Array, margin: float, columns: int) -> Window:
+    """A window that holds ideal points (n, 2) with a margin (ideal), as far as the image goes; ``columns`` wide, but
+    its cells no smaller than pixels.
+    """
+    u, v = np.linspace(0.0, camera.width_px - 1.0, 17), np.linspace(0.0, camera.height_px - 1.0, 17)
+    view = camera.undistort(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+    low = np.maximum(xy.min(axis=0) - margin, np.nanmin(view, axis=0))
+    high = np.minimum(xy.max(axis=0) + margin, np.nanmax(view, axis=0))
+    size = np.maximum(high - low, 0.0)
+    pitch = max(float(size[0]) / columns, 1.0 / camera.fx_px)
+    count = np.ceil(size / pitch).astype(int) + 1
+    return Window(low, pitch, int(count[0]), int(count[1]))
+
+
+def rectify(image: Image, camera: Camera, window: Window) -> tuple[Floats, NDArray[np.bool_]]:
+    """Grey levels (rows, columns) in the window, and which cells the image shows."""
+    # Averaged first, so that cells far apart leave no pixel out.
+    factor = max(1.0, window.pitch * camera.fx_px)
+    size = (max(16, round(image.shape[1] / factor)), max(16, round(image.shape[0] / factor)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    if small.ndim == 3:
+        small = small @ GREY_BGR
+    if not np.isfinite(small).all():
+        # Dead pixels of a float camera: the usual level makes no edge that would outshine all others.
+        small[~np.isfinite(small)] = np.nanmedian(small)
+    x, y = (
+        low + window.pitch * _NODE * np.arange(math.ceil(count / _NODE) + 2)
+        for low, count in zip(window.low_xy, (window.columns, window.rows), strict=True)
+    )
+    nodes_px = camera.distort(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)).reshape(len(y), len(x), 2)
+    scale = np.array([image.shape[1] / size[0], image.shape[0] / size[1]])
+    nodes = ((nodes_px + 0.5) / scale - 0.5).astype(np.float32)
+    steps = np.array([[1.0 / _NODE, 0.0, 0.0], [0.0, 1.0 / _NODE, 0.0]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    places = cv2.warpAffine(nodes, steps, (window.columns, window.rows), flags=flags)
+    with np.errstate(invalid="ignore"):
+        inside = (places >= 0.0) & (places <= np.array(size, dtype=np.float32) - 1.0)
+    seen: NDArray[np.bool_] = np.all(inside, axis=2)
+    places[~seen] = 0.0
+    columns, rows = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    grey = cv2.remap(small, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    # Beside the image's border there is no telling an edge.
+    inner = cv2.erode(
+        np.asarray(seen, np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    return np.asarray(grey, dtype=np.float32), inner.astype(bool)
+
+
+def gradients(grey: Floats) -> tuple[Floats, Floats]:
+    """By Scharr, grey levels a cell."""
+    gx, gy = (cv2.Scharr(grey, cv2.CV_32F, *order, scale=1.0 / 32.0) for order in ((1, 0), (0, 1)))
+    return np.asarray(gx, dtype=np.float32), np.asarray(gy, dtype=np.float32)
+
+
+def against_surroundings(strength: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """Factor (rows, columns) that makes a strength one of its surroundings; with a floor, half the image's mean."""
+    shown = strength * seen
+    mean = float(shown.sum()) / max(int(np.count_nonzero(seen)), 1)
+    side = 2 * HALF_LENGTH + 1
+    level = cv2.blur(shown, (side, side)) + (0.5 * mean + 1e-12)
+    return np.asarray(seen / level, dtype=np.float32)
+
+
+def evidence_table(counts: Array) -> Floats:
+    """From how often each level of strength occurs (l,) to what it says for an edge of the gripper: log of its
+    probability on such an edge over that anywhere, with mean zero.
+
+    The rank of a place's strength, the share of the image that is stronger, is uniform anywhere; on an edge that
+    shows it is distributed as Beta(``RARITY``, 1), on one that doesn't as anywhere.
+    """
+    total = max(float(counts.sum()), 1.0)
+    rank = np.maximum((np.cumsum(counts[::-1])[::-1] - 0.5 * counts) / total, SMALLEST_RANK)
+    table = np.log(HIDDEN + (1.0 - HIDDEN) * RARITY * rank ** (RARITY - 1.0))
+    return np.asarray(table - (table @ counts) / total, dtype=np.float32)
+
+
+def evidence_maps(grey: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """(o, rows, columns) what each cell says for an edge through it or its neighbours, by the orientation of the edge's
+    normal; zero where the image doesn't reach.
+    """
+    gx, gy = gradients(grey)
+    maps = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
+    block = np.ones((3, 3), np.uint8)
+    for k in range(ORIENTATIONS):
+        angle = math.pi * k / ORIENTATIONS
+        across = cv2.filter2D(math.cos(angle) * gx + math.sin(angle) * gy, -1, _line_kernel(angle))
+        maps[k] = cv2.dilate(np.abs(across), block)
+    maps *= against_surroundings(maps.mean(axis=0), seen)
+    shown = np.count_nonzero(seen)
+    if not shown:
+        return np.zeros_like(maps)
+    top = float(np.quantile(maps[:, ::3, ::3], 0.998)) + 1e-12
+    levels = np.minimum(maps * ((_LEVELS - 1) / top), _LEVELS - 1).astype(np.uint8)
+    mask = seen.astype(np.uint8)
+    for k in range(ORIENTATIONS):
+        counts = cv2.calcHist([levels[k]], [0], mask, [_LEVELS], [0, _LEVELS]).ravel().astype(float)
+        cv2.LUT(levels[k], evidence_table(counts), dst=maps[k])
+    maps *= seen
+    return maps
+
+
+@lru_cache(maxsize=ORIENTATIONS)
+def _line_kernel(angle: float) -> Floats:
+    """Mean along a line whose normal has this angle."""
+    kernel = np.zeros((2 * HALF_LENGTH + 1, 2 * HALF_LENGTH + 1), np.float32)
+    for way in np.linspace(-HALF_LENGTH, HALF_LENGTH, 4 * HALF_LENGTH + 1).tolist():
+        kernel[round(HALF_LENGTH + way * math.cos(angle)), round(HALF_LENGTH - way * math.sin(angle))] += 1.0
+    return np.asarray(kernel / kernel.sum(), dtype=np.float32)
