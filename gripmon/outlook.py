@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.camera import Camera
-from gripmon.corners import FingertipMeter, Measurement, Patience
+from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
@@ -79,13 +79,18 @@ class Outlook:
 
 
 def expect(
-    camera: Camera, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord, jaw_opening_m: float | None
+    camera: Camera,
+    gripper: Gripper,
+    settings: MonitorSettings,
+    reference: ReferenceRecord,
+    jaw_opening_m: float | None,
+    taught: TaughtEdges | None = None,
 ) -> Outlook:
     """What a frame at the reference's pose and an opening (nominal if None) may tell."""
-    monitor = Monitor(camera, gripper, settings, reference)
+    monitor = Monitor(camera, gripper, settings, reference, taught)
     cam_T_grip = from_record(reference.cam_T_grip)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
-    meter = ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m)
+    meter = ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m, taught)
     given = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
     covariance = monitor.update(given)[1]
     lever_m = _lever_m(given.prediction)
@@ -139,7 +144,7 @@ class ForeseeingMeter(FingertipMeter):
 
     def _look(self, image: Image, prediction: Prediction) -> Votes:
         sample = np.flatnonzero(prediction.ok)
-        polarity = self._gripper.edge_polarity
+        polarity = self._polarity
         step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
         sigma_px, width_px = np.full(len(sample), EDGE_POINT_SIGMA_PX), np.ones(len(sample))
         whole = np.zeros(len(sample))

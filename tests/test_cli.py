@@ -26,7 +26,7 @@ from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Origin, Severi
 from gripmon.simulator import FrameTruth
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("demo", "run", "replay", "simulate", "check")
+COMMANDS = ("demo", "run", "replay", "simulate", "check", "teach")
 GRIPMON = (sys.executable, "-m", "gripmon")
 
 

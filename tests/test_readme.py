@@ -48,7 +48,7 @@ def test_commands_and_their_options_exist():
     assert {command for command, _ in used} == set(subcommands)
     for command, rest in used:
         known = {option for action in subcommands[command]._actions for option in action.option_strings}
-        assert set(re.findall(r"--[a-z]+", rest.split("#")[0])) <= known, command
+        assert set(re.findall(r"--[a-z-]+", rest.split("#")[0])) <= known, command
 
 
 def test_files_that_are_named_exist():

@@ -207,13 +207,14 @@ def test_an_image_without_the_gripper_is_refused():
 
 @pytest.mark.parametrize("shift_mm", [(0.5, 0.0, 0.0), (0.0, -3.0, 2.0)])
 def test_a_reference_that_is_off_is_refused_and_the_measured_pose_is_named(shift_mm: tuple[float, float, float]):
-    """It stands in the text ready to be copied, and is the truth to some micrometres."""
+    """It stands in the text ready to be copied, and is the truth to some micrometres, some tens along the axis."""
     off = moved(POSE, np.array([*(1e-3 * np.array(shift_mm)), 0.0, 0.0, 0.0]))
     with pytest.raises(TeachingRefused, match="off the reference, by") as refused:
         taught_from(image_of(0.0), using=reference(off, 2e-5, 2e-4))
     named = re.search(r"translation_m: \[(.*?)\]", str(refused.value))
     assert named is not None
-    np.testing.assert_allclose([float(v) for v in named[1].split(",")], POSE[:3, 3], atol=1e-5)
+    away_m = np.abs(np.subtract([float(v) for v in named[1].split(",")], POSE[:3, 3]))
+    assert away_m[:2].max() < 1e-5 and away_m[2] < 4e-5
 
 
 def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
@@ -225,7 +226,7 @@ def test_a_wide_enough_standard_deviation_lets_the_reference_be_off():
 
 
 def test_an_opening_that_the_image_contradicts_is_refused():
-    with pytest.raises(TeachingRefused, match=r"shows an opening of 0\.0340\d\d m, 0\.034600 m is reported"):
+    with pytest.raises(TeachingRefused, match=r"shows an opening of 0\.0340\d\d m, 0\.034600 m is reported, at most"):
         taught_from(image_of(0.0), using=reference(None, 2e-5, 2e-4), opening_m=0.0346)
 
 

@@ -70,6 +70,7 @@ def expectation(config: Config) -> dict[str, Any]:
             "jaw_m": [gripper.jaw_min_m, gripper.jaw_max_m] if gripper.has_jaw else None,
         },
         "reference": _reference_values(config),
+        "taught": _taught_values(config),
         "jaw": {"source": settings.jaw.source, "opening_m": config.jaw_opening_m},
         "corners": _corner_values(gripper.corner_ids, view),
         "edges": [
@@ -109,6 +110,26 @@ def _reference_values(config: Config) -> dict[str, Any]:
         "distance_m": float(np.linalg.norm(cam_T_grip[:3, 3])),
         "turn_rad": rotation_angle(cam_T_grip[:3, :3]),
         "metres_per_px": float(cam_T_grip[2, 3]) / config.camera.fx_px,
+    }
+
+
+def _taught_values(config: Config) -> dict[str, Any] | None:
+    """What was taught; the largest offset is that of the edge that lies farthest from the sharp model."""
+    taught = config.taught
+    if taught is None:
+        return None
+    farthest = max(taught.edges, key=lambda name: max(map(abs, taught.edges[name].offset_m)))
+    offset_m = max(taught.edges[farthest].offset_m, key=abs)
+    return {
+        "file": str(config.taught_path),
+        "time": taught.provenance.time,
+        "images": len(taught.provenance.images),
+        "edges": list(taught.edges),
+        "largest": {
+            "edge": farthest,
+            "offset_m": offset_m,
+            "offset_px": offset_m * config.camera.fx_px / float(config.cam_T_grip[2, 3]),
+        },
     }
 
 
@@ -195,6 +216,7 @@ def _as_text(report: dict[str, Any]) -> str:
         "camera": _camera_line(report["camera"]),
         "gripper": _gripper_line(report["gripper"], report["jaw"]),
         "reference": _reference_line(report["reference"]),
+        "taught": _taught_line(report["taught"], edges),
         "edges": f"{len(edges)} of {len(report['edges'])} visible: {', '.join(edges)}",
         "corners": f"{seen} of {len(report['corners'])} visible:",
     }
@@ -233,6 +255,16 @@ def _reference_line(reference: dict[str, Any]) -> str:
     place = f"{reference['id']}: TCP at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the camera frame"
     turn = f"{math.degrees(reference['turn_rad']):.1f}° between camera and gripper"
     return f"{place}, {turn}, 1 px is {1e3 * reference['metres_per_px']:.3f} mm at the TCP"
+
+
+def _taught_line(taught: dict[str, Any] | None, visible: list[str]) -> str:
+    if taught is None:
+        return "nothing; `gripmon teach` takes out what bevels, rounded edges and shading shift the edges by"
+    largest, images = taught["largest"], "1 image" if taught["images"] == 1 else f"{taught['images']} images"
+    count = f"{len(taught['edges'])} edges from {images} ({taught['file']}, {taught['time']})"
+    farthest = f"farthest off {largest['edge']}, {1e6 * largest['offset_m']:+.0f} µm ({largest['offset_px']:+.2f} px)"
+    missing = [name for name in visible if name not in taught["edges"]]
+    return f"{count}; {farthest}" + (f"; visible, but not taught and not used: {', '.join(missing)}" if missing else "")
 
 
 def _corner_line(corner: dict[str, Any]) -> str:

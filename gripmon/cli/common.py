@@ -68,12 +68,12 @@ def seed(text: str) -> int:
     return int(text)
 
 
-def load(path: str, *, check_source: bool = True) -> Config:
+def load(path: str, *, check_source: bool = True, with_taught: bool = True) -> Config:
     """The checked configuration in a file; a fault ends the command with exit code 2."""
     from gripmon.config import ConfigError, load_config
 
     try:
-        return load_config(Path(path), check_source=check_source)
+        return load_config(Path(path), check_source=check_source, with_taught=with_taught)
     except ConfigError as error:
         raise CommandFailedError(str(error), EXIT_USAGE) from None
 

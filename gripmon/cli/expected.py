@@ -22,7 +22,9 @@ def accuracy(config: Config) -> dict[str, Any]:
     from gripmon.outlook import EDGE_POINT_SIGMA_PX, FEWEST_EDGES, expect
 
     settings = config.settings.monitor
-    outlook = expect(config.camera, config.gripper, settings, config.reference, config.jaw_opening_m)
+    outlook = expect(
+        config.camera, config.gripper, settings, config.reference, config.jaw_opening_m, config.taught_edges
+    )
     out: dict[str, Any] = {
         "measurement": settings.measurement,
         "edges": outlook.edges,

@@ -101,7 +101,7 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
     from gripmon.monitor import Monitor
     from gripmon.records import Frame, to_json, unmeasured_record
 
-    monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
+    monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges)
     with_jaw = _jaw_of(config)
     revision = monitor.reference.revision
     while (frame := source.read()) is not None:

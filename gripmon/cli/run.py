@@ -82,7 +82,7 @@ def run_daemon(
         common.check_file(estimates)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
-    monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
+    monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges)
     with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
         publisher, jaw = _open_publisher(config)
         opened.callback(publisher.close)

@@ -6,7 +6,7 @@ Everything that can be wrong is found here, before anything starts, and said in 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,8 @@ from gripmon.config.errors import ConfigError
 from gripmon.config.settings import JawSettings, Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
+from gripmon.corners import TaughtEdges, TaughtModel
+from gripmon.corners.taught import mismatch
 from gripmon.geometry import from_record, to_record
 from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
 from gripmon.records import Array, ReferenceRecord, to_json
@@ -38,6 +40,17 @@ class Config:
     gripper: Gripper
     gripper_path: Path
     reference: ReferenceRecord
+    taught: TaughtModel | None = None
+
+    @property
+    def taught_edges(self) -> TaughtEdges | None:
+        """What was taught, as the monitor takes it; None without a taught model."""
+        return None if self.taught is None else TaughtEdges.of_model(self.taught, self.gripper)
+
+    @property
+    def taught_path(self) -> Path | None:
+        """The file with the taught model, whether it is there or not."""
+        return None if self.settings.taught is None else self.directory / self.settings.taught
 
     @property
     def directory(self) -> Path:
@@ -66,10 +79,11 @@ class Config:
         return predict_view(self.camera, self.gripper, self.cam_T_grip, self.jaw_opening_m)
 
 
-def load_config(path: Path, *, check_source: bool = True) -> Config:
+def load_config(path: Path, *, check_source: bool = True, with_taught: bool = True) -> Config:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
-    ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input.
+    ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
+    ``with_taught=False`` leaves out the taught model, for those who teach anew.
     """
     try:
         settings = to_settings(read_yaml(path), Settings)
@@ -91,7 +105,7 @@ def load_config(path: Path, *, check_source: bool = True) -> Config:
             load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
         raise _error(path, fault)
-    return config
+    return replace(config, taught=_taught(config)) if with_taught else config
 
 
 def builtin_config(name: str) -> Path:
@@ -143,6 +157,25 @@ def _reference(path: Path, settings: Settings) -> ReferenceRecord:
     transform = to_record(cam_T_grip)
     name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
     return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)
+
+
+def _taught(config: Config) -> TaughtModel | None:
+    """The taught model that the configuration names; refused unless it was taught with the very same things."""
+    path = config.taught_path
+    if path is None:
+        return None
+    if not path.is_file():
+        right = "a file of gripmon teach, its path relative to this file"
+        raise ConfigError(config.path, "taught", f"there is no file {path}", right)
+    try:
+        model = to_settings(read_yaml(path), TaughtModel)
+    except SettingsError as error:
+        raise _error(path, error.fault) from None
+    edges = config.settings.monitor.corners.edges
+    fault = mismatch(model, config.camera, config.gripper, config.cam_T_grip, edges)
+    if fault is not None:
+        raise ConfigError(path, *fault)
+    return model
 
 
 def _jaw_fault(jaw: JawSettings, gripper: Gripper, settings: Settings) -> Fault | None:

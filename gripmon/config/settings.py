@@ -84,6 +84,13 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     camera: LensSettings
     gripper: Annotated[str, Meta(min_length=1, description="path of the gripper file, relative to this file")]
     reference: ReferenceSettings
+    taught: (
+        Annotated[
+            str,
+            Meta(min_length=1, description="file written by gripmon teach, its path relative to this file"),
+        ]
+        | None
+    ) = None
     source: SourceSettings
     jaw: JawSettings = JawSettings()
     monitor: MonitorSettings = MonitorSettings()

@@ -50,12 +50,15 @@ class TaughtImage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class Provenance(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Where a taught model comes from."""
+    """Where a taught model comes from; ``closure_px``: how far its images, measured with it, show the gripper from the
+    reference, at most.
+    """
 
     gripmon: str
     time: str
     command: str
     images: Annotated[tuple[TaughtImage, ...], Meta(min_length=1)]
+    closure_px: Annotated[float, Meta(ge=0.0)]
 
 
 class TaughtGripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -38,7 +38,9 @@ class FolderSettings(
 
 
 @dataclass(frozen=True, slots=True)
-class _Row:
+class TableRow:
+    """What a table of time stamps says of an image."""
+
     stamp_ns: int
     jaw_opening_m: float | None
 
@@ -66,14 +68,14 @@ class FolderSource:
         )
         table = self._folder / TIMESTAMPS_NAME if settings.timestamps is None else relative_to / settings.timestamps
         if settings.timestamps is not None or table.exists():
-            rows = _read_table(table)
+            rows = read_table(table)
             unnamed = sorted(set(names) - rows.keys(), key=natural_key)
             if unnamed:
                 raise SourceError(f"{table}: no row for {unnamed[0]}; a row for each image ({len(unnamed)} have none)")
             names = sorted(rows, key=natural_key)
             _check_order(table, names, rows)
         else:
-            rows = {name: _Row(round(i * _NS / settings.fps), None) for i, name in enumerate(names)}
+            rows = {name: TableRow(round(i * _NS / settings.fps), None) for i, name in enumerate(names)}
         if not names:
             raise SourceError(f"path: no image in {self._folder}; files such as *.png, *.jpg, *.tif, *.pgm")
         self._names, self._rows = names, rows
@@ -87,7 +89,7 @@ class FolderSource:
             return None
         name = self._names[self._seq]
         row = self._rows[name]
-        image, fault = _read_image(self._folder / name)
+        image, fault = read_image(self._folder / name)
         frame = Frame(self._seq, row.stamp_ns, image, row.jaw_opening_m, name, fault)
         self._seq += 1
         return frame
@@ -102,7 +104,7 @@ def natural_key(name: str) -> tuple[list[Any], str]:
     return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
 
 
-def _read_image(path: Path) -> tuple[Image | None, str | None]:
+def read_image(path: Path) -> tuple[Image | None, str | None]:
     """The image, or why there is none."""
     import cv2
     import numpy as np
@@ -129,7 +131,8 @@ def _read_image(path: Path) -> tuple[Image | None, str | None]:
     return image, None
 
 
-def _read_table(path: Path) -> dict[str, _Row]:
+def read_table(path: Path) -> dict[str, TableRow]:
+    """A table ``file,stamp_ns[,jaw_opening_m]`` by file name.  Raises :class:`SourceError`."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
@@ -140,7 +143,7 @@ def _read_table(path: Path) -> dict[str, _Row]:
     header = tuple(cell.strip() for cell in next(lines, []))
     if header not in (_COLUMNS[:2], _COLUMNS):
         raise SourceError(f"{path}: line 1 is '{','.join(header)}'; file,stamp_ns or file,stamp_ns,jaw_opening_m")
-    rows: dict[str, _Row] = {}
+    rows: dict[str, TableRow] = {}
     for cells in lines:
         if not cells:
             continue
@@ -152,7 +155,7 @@ def _read_table(path: Path) -> dict[str, _Row]:
             raise SourceError(f"{where}: '{name}' is no file name; the plain name of a file in the folder")
         if name in rows:
             raise SourceError(f"{where}: {name} is there twice; one row for each file")
-        rows[name] = _Row(_stamp(cells[1], where), _opening(cells[2], where) if len(cells) == 3 else None)
+        rows[name] = TableRow(_stamp(cells[1], where), _opening(cells[2], where) if len(cells) == 3 else None)
     return rows
 
 
@@ -180,7 +183,7 @@ def _opening(cell: str, where: str) -> float | None:
     return opening_m
 
 
-def _check_order(path: Path, names: list[str], rows: dict[str, _Row]) -> None:
+def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> None:
     for earlier, later in itertools.pairwise(names):
         if rows[later].stamp_ns <= rows[earlier].stamp_ns:
             raise SourceError(

@@ -19,6 +19,9 @@ from gripmon.teaching.views import Sampled, Viewer
 SHAPE_M = 5e-4
 """So far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""
 
+INSET_SIGMA_M = 0.5 * SHAPE_M
+"""Of what bevels shift all outlines by alike, to the finger's side (standard deviation)."""
+
 SINGLE_SIGMA_PX = 0.03
 """By so much the background and the pixel grid move a whole edge in one image (standard deviation)."""
 
@@ -89,21 +92,31 @@ class _Measured:
 
     def pooled(self, motion_covariance: Array) -> Pooled:
         """All edges together, with a prior (7, 7) of pose and opening."""
+        prior = block_diag(motion_covariance, INSET_SIGMA_M**2)
         return pool(
-            np.array([ends.mean(axis=0) for ends in self.ends_m]),
-            self.noise_m2[:, :, None] * np.eye(2),
-            self.rows,
-            (~self.outline).astype(np.intp),
-            block_diag(motion_covariance, (0.5 * SHAPE_M) ** 2),
+            self.means_m, self.noise_m2[:, :, None] * np.eye(2), self.rows, (~self.outline).astype(np.intp), prior
         )
+
+    @property
+    def means_m(self) -> Array:
+        """(e, 2) over the images."""
+        return np.array([ends_m.mean(axis=0) for ends_m in self.ends_m])
 
 
 def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
-    """What reference and opening are off by (``common``, the first 7), from a prior (7, 7) about zero.
+    """What reference and opening are off by (``common``, the first 7) to the outlines, from a prior (7, 7) about zero.
 
-    Bevels of all outlines alike and each edge's own offset are allowed for.
+    Bevels of all outlines alike and each outline's own offset are allowed for; creases have more of their own.
     """
-    return _Measured.of(viewer, lines, None).pooled(prior_covariance)
+    measured = _Measured.of(viewer, lines, None)
+    which = np.flatnonzero(measured.outline)
+    return pool(
+        measured.means_m[which],
+        measured.noise_m2[which][:, :, None] * np.eye(2),
+        measured.rows[which],
+        np.zeros(len(which), dtype=np.intp),
+        block_diag(prior_covariance, INSET_SIGMA_M**2),
+    )
 
 
 def estimate_edges(
@@ -119,21 +132,39 @@ def estimate_edges(
     shape_m = pooled.own_m + pooled.common[-1] * measured.rows[:, :, -1]
     depth_m, depth_sigma_m = _depths(viewer, measured, pooled.ends_m.mean(axis=1), shape_m.mean(axis=1))
     sigma_m = np.sqrt(np.einsum("eii->ei", pooled.covariance_m2))
-    alone = measured.outline & np.array([len(edge.images) == 1 for edge in measured.edges])
-    sigma_m = np.hypot(sigma_m, BACKGROUND_SHARE * np.abs(shape_m) * alone[:, None])
+    sigma_m = np.hypot(sigma_m, _changing_m(measured, shape_m))
     return {
         viewer.gripper.edge_ids[index]: TaughtEdge(
-            share=edge.sampled.share,
-            offset_m=(float(pooled.ends_m[i, 0]), float(pooled.ends_m[i, 1])),
-            sigma_m=(float(sigma_m[i, 0]), float(sigma_m[i, 1])),
-            depth_m=float(depth_m[i]),
-            depth_sigma_m=float(depth_sigma_m[i]),
+            share=(round(edge.sampled.share[0], 6), round(edge.sampled.share[1], 6)),
+            offset_m=_nanometres(pooled.ends_m[i]),
+            sigma_m=_nanometres(sigma_m[i]),
+            depth_m=round(float(depth_m[i]), 9),
+            depth_sigma_m=round(float(depth_sigma_m[i]), 9),
             crease=not measured.outline[i],
-            rms_px=edge.line.rms_px,
-            seen=edge.line.seen,
+            rms_px=round(edge.line.rms_px, 4),
+            seen=round(edge.line.seen, 4),
         )
         for i, (index, edge) in enumerate(zip(measured.indices, measured.edges, strict=True))
     }
+
+
+def _nanometres(ends_m: Array) -> tuple[float, float]:
+    """Rounded, so that people can read the file."""
+    return round(float(ends_m[0]), 9), round(float(ends_m[1]), 9)
+
+
+def _changing_m(measured: _Measured, shape_m: Array) -> Array:
+    """(e, 2) standard deviation of what an offset has more or less in one image than in another, beyond the scatter of
+    its points: no average makes that less for a single frame.
+    """
+    out = np.zeros_like(shape_m)
+    for i, (edge, ends_m) in enumerate(zip(measured.edges, measured.ends_m, strict=True)):
+        if len(ends_m) > 1:
+            beyond_m2 = ends_m.var(axis=0, ddof=1) - edge.within_px2 / edge.sampled.per_m**2
+            out[i] = np.sqrt(np.maximum(beyond_m2, 0.0))
+        elif measured.outline[i]:
+            out[i] = BACKGROUND_SHARE * np.abs(shape_m[i])
+    return out
 
 
 def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array:

@@ -114,7 +114,8 @@ def _look(relative: Array) -> Look | None:
     if not len(relative):
         return None
     level = float(np.median(relative))
-    return Look(level=max(level, 0.0), spread=1.4826 * float(np.median(np.abs(relative - level))))
+    spread = 1.4826 * float(np.median(np.abs(relative - level)))
+    return Look(level=round(max(level, 0.0), 4), spread=round(spread, 4))
 
 
 def _brighter(step: Array) -> Side:

@@ -75,9 +75,9 @@ def teach(
     check_standing(views, len(gripper.edge_ids))
     lines, untaught = _lines(views, gripper, search=True)
     check_enough(views, crease, lines)
-    check_reference(viewer, images[0].name, lines)
+    doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
-    notes = _notes(lines, gripper, crease, len(images))
+    notes = _notes(lines, gripper, crease, len(images), doubt)
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
     # Once more from where the edges really are: the profiles then lie even to both sides of them.
@@ -92,7 +92,7 @@ def teach(
         _corners(viewer, arrays, images[0].jaw_opening_m),
         {**untaught, **lost},
         notes,
-        _closure_px(viewer, images, arrays),
+        round(_closure_px(viewer, images, arrays), 4),
         found[0],
     )
 
@@ -173,7 +173,8 @@ def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[
         covariance = np.linalg.inv(weighted @ normal)
         u, v = (uv_px[point] + covariance @ weighted @ offset_px).tolist()
         corners[gripper.corner_ids[number]] = TaughtCorner(
-            uv_px=(u, v), sigma_px=float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+            uv_px=(round(u, 4), round(v, 4)),
+            sigma_px=round(float(np.sqrt(np.linalg.eigvalsh(covariance)[-1])), 4),
         )
     return corners
 
@@ -181,9 +182,11 @@ def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[
 _LARGEST_CONDITION = 100.0  # edges that meet at less than some 10° make no corner
 
 
-def _notes(lines: Mapping[int, EdgeLines], gripper: Gripper, crease: NDArray[np.bool_], images: int) -> tuple[str, ...]:
+def _notes(
+    lines: Mapping[int, EdgeLines], gripper: Gripper, crease: NDArray[np.bool_], images: int, doubt: str | None
+) -> tuple[str, ...]:
     """What can be doubted about what was taught."""
-    notes = []
+    notes = [] if doubt is None else [doubt]
     rivals = {i: e.line.rival_px for i, e in lines.items() if e.line.rival_px is not None and not crease[i]}
     if rivals and images == 1:
         named = ", ".join(f"{gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())

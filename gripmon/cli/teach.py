@@ -1,0 +1,268 @@
+"""``gripmon teach``: what the gripper's edges look like, from images at the reference calibration."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import math
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon import __version__
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.corners import TaughtModel
+    from gripmon.corners.taught import TaughtEdge
+    from gripmon.records import Image
+    from gripmon.teaching import Taught
+
+_DESCRIPTION = """\
+Measure where each edge of the gripper really shows, in images taken at the reference calibration,
+and write it as a taught model.  Named in the configuration (`taught: taught.yaml`), it makes the
+monitor compare like with like: what bevels, rounded edges, shading and blur shift the edges by
+cancels.  The reference is by definition the gripper's pose in these images.
+
+Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
+in use, each before another background, some with the jaws opened otherwise."""
+
+_EXAMPLES = """\
+  gripmon teach first/*.png --config mine/arm1.yaml
+  gripmon teach now.png --config mine/arm1.yaml --jaw-opening 0.034 --picture taught.png
+  gripmon check mine/arm1.yaml
+
+exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
+from, and why: nothing is written then"""
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands, "teach", run, "learn how the gripper's edges look at the reference", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument("images", nargs="+", metavar="IMAGE", help="image file at the reference calibration")
+    parser.add_argument(
+        "--config", required=True, metavar="CONFIG", help="configuration (YAML); its source section is not used"
+    )
+    parser.add_argument(
+        "--out",
+        metavar="FILE",
+        help="file to write (default: what the configuration names under taught, else taught.yaml beside it)",
+    )
+    parser.add_argument(
+        "--jaw-opening",
+        type=common.positive_number,
+        metavar="M",
+        help="jaw opening in all images (m); default: the configuration's with jaw.source fixed, else from a "
+        "timestamps.csv beside each image",
+    )
+    parser.add_argument(
+        "--picture", metavar="FILE.png", help="also draw the first image with what was taught, offsets enlarged"
+    )
+    parser.add_argument("--force", action="store_true", help="replace the file if there is one")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon teach``."""
+    import cv2
+
+    from gripmon.teaching import TeachingImage, TeachingRefused, teach
+
+    config = common.load(arguments.config, check_source=False, with_taught=False)
+    cv2.setNumThreads(1)
+    out = _out(arguments, config)
+    inputs = [_read(Path(name), config, arguments.jaw_opening) for name in arguments.images]
+    _check_different(inputs)
+    settings = config.settings.monitor
+    images = [
+        TeachingImage(
+            i.image, config.gripper.jaw_nominal_m if i.jaw_opening_m is None else i.jaw_opening_m, str(i.path)
+        )
+        for i in inputs
+    ]
+    try:
+        taught = teach(config.camera, config.gripper, settings.corners, settings.jaw_sigma_m, config.reference, images)
+    except TeachingRefused as refused:
+        raise common.CommandFailedError(f"teach: {refused}") from None
+    model = _model(config, taught, inputs, arguments)
+    _write(model, out)
+    print(_summary(config, taught, out))
+    if arguments.picture is not None:
+        _draw(config, model, images[0], Path(arguments.picture))
+    return common.EXIT_DONE
+
+
+@dataclass(frozen=True)
+class _Input:
+    path: Path
+    image: Image
+    sha256: str
+    jaw_opening_m: float | None
+
+
+def _out(arguments: argparse.Namespace, config: Config) -> Path:
+    """Where to write; refused before any work if that can't be."""
+    named = config.taught_path or config.directory / "taught.yaml"
+    out = named if arguments.out is None else Path(arguments.out)
+    for path, option in ((out, "--out"), (arguments.picture and Path(arguments.picture), "--picture")):
+        if path:
+            common.make_directory(path.parent, option)
+            if path.is_dir():
+                raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+    if out.exists() and not arguments.force:
+        raise common.CommandFailedError(
+            f"--out {out}: is there already; another file, or --force to replace it", common.EXIT_USAGE
+        )
+    if arguments.picture is not None and Path(arguments.picture).suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise common.CommandFailedError(
+            f"--picture {arguments.picture}: has no known ending; .png or .jpg", common.EXIT_USAGE
+        )
+    return out
+
+
+def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
+    """An image that fits the camera, with its jaw opening; anything else ends the command with exit code 2."""
+    from gripmon.inspection import inspect
+    from gripmon.records import Frame
+    from gripmon.sources.folder import read_image
+
+    if path.is_dir():
+        raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)
+    image, fault = read_image(path)
+    if image is None:
+        raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+    refused = inspect(Frame(0, 0, image, None, str(path)), config.camera, config.gripper)
+    if refused is not None:
+        raise common.CommandFailedError(f"{path}: {refused[0]}: {refused[1]}", common.EXIT_USAGE)
+    opening_m = _opening(path, config, jaw_opening_m)
+    return _Input(path, image, hashlib.sha256(path.read_bytes()).hexdigest(), opening_m)
+
+
+def _opening(path: Path, config: Config, given_m: float | None) -> float | None:
+    """The jaw opening in an image; None for a gripper without jaw."""
+    from gripmon.sources import SourceError
+    from gripmon.sources.folder import TIMESTAMPS_NAME, read_table
+
+    gripper, opening_m = config.gripper, given_m
+    if not gripper.has_jaw:
+        if given_m is not None:
+            raise common.CommandFailedError("--jaw-opening: the gripper has no jaw; leave it out", common.EXIT_USAGE)
+        return None
+    if opening_m is None and config.settings.jaw.source == "fixed":
+        opening_m = config.jaw_opening_m
+    table = path.parent / TIMESTAMPS_NAME
+    if opening_m is None and table.exists():
+        try:
+            row = read_table(table).get(path.name)
+        except SourceError as error:
+            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+        opening_m = None if row is None else row.jaw_opening_m
+    if opening_m is None:
+        raise common.CommandFailedError(
+            f"{path}: its jaw opening isn't known (jaw.source is {config.settings.jaw.source}); --jaw-opening M, or "
+            f"jaw_opening_m in {table}",
+            common.EXIT_USAGE,
+        )
+    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise common.CommandFailedError(
+            f"{path}: jaw opening {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m",
+            common.EXIT_USAGE,
+        )
+    return opening_m
+
+
+def _check_different(inputs: list[_Input]) -> None:
+    """The same image twice would make the scatter, and so the uncertainty, too small."""
+    seen: dict[str, Path] = {}
+    for one in inputs:
+        if one.sha256 in seen:
+            raise common.CommandFailedError(
+                f"{one.path}: is the same image as {seen[one.sha256]}; each image once", common.EXIT_USAGE
+            )
+        seen[one.sha256] = one.path
+
+
+def _model(config: Config, taught: Taught, inputs: list[_Input], arguments: argparse.Namespace) -> TaughtModel:
+    from datetime import UTC, datetime
+
+    from gripmon.corners import TaughtModel
+    from gripmon.corners.taught import Provenance, TaughtImage, identity
+
+    camera, gripper, reference = identity(
+        config.camera, config.gripper, config.reference.reference_id, config.cam_T_grip
+    )
+    return TaughtModel(
+        provenance=Provenance(
+            gripmon=__version__,
+            time=datetime.now(UTC).isoformat(timespec="seconds"),
+            command=_command(arguments),
+            images=tuple(TaughtImage(file=str(i.path), sha256=i.sha256, jaw_opening_m=i.jaw_opening_m) for i in inputs),
+            closure_px=taught.closure_px,
+        ),
+        camera=camera,
+        gripper=gripper,
+        reference=reference,
+        edge_settings=config.settings.monitor.corners.edges,
+        edges=taught.edges,
+        corners=taught.corners,
+    )
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    words = ["gripmon", "teach", *arguments.images, "--config", arguments.config]
+    for option, value in (("--out", arguments.out), ("--jaw-opening", arguments.jaw_opening)):
+        words += [] if value is None else [option, str(value)]
+    return shlex.join(words)
+
+
+def _write(model: TaughtModel, out: Path) -> None:
+    from gripmon.atomic import write_atomically
+    from gripmon.teaching.document import to_yaml
+
+    try:
+        write_atomically(out, to_yaml(model).encode())
+    except OSError as error:
+        raise common.not_writable(out, error) from None
+
+
+def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
+    import cv2
+
+    from gripmon.atomic import write_atomically
+    from gripmon.corners import TaughtEdges
+    from gripmon.teaching.picture import draw
+
+    picture = draw(
+        config.camera, config.gripper, config.cam_T_grip, image, TaughtEdges.of_model(model, config.gripper), model
+    )
+    _, data = cv2.imencode(path.suffix, picture)
+    try:
+        write_atomically(path, data.tobytes())
+    except OSError as error:
+        raise common.not_writable(path, error, "--picture") from None
+
+
+def _summary(config: Config, taught: Taught, out: Path) -> str:
+    px_per_m = config.camera.fx_px / float(config.cam_T_grip[2, 3])
+    width = max(map(len, [*taught.edges, *taught.untaught]))
+    lines = [f"{'edge':<{width}}          offset                 +-         seen  brighter"]
+    lines += [_edge_line(name, edge, px_per_m, width) for name, edge in taught.edges.items()]
+    lines += [f"{name:<{width}}  not taught: {reason}" for name, reason in taught.untaught.items()]
+    lines += [f"note: {note}" for note in taught.notes]
+    lines.append(f"measured again with this, the gripper shows at most {taught.closure_px:.2f} px from the reference")
+    lines.append(f"written: {out}")
+    if config.taught_path is None or config.taught_path.resolve() != out.resolve():
+        name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
+        lines.append(f"next: put the line `taught: {name}` into {config.path}")
+    return "\n".join(lines)
+
+
+def _edge_line(name: str, edge: TaughtEdge, px_per_m: float, width: int) -> str:
+    offset_m = max(edge.offset_m, key=abs)
+    sigma_m = math.hypot(*edge.sigma_m) / math.sqrt(2.0)
+    place = f"{1e6 * offset_m:+8.1f} um ({px_per_m * offset_m:+6.2f} px)   {1e6 * sigma_m:6.1f} um"
+    kind = "crease" if edge.crease else "outline"
+    return f"{name:<{width}}  {place}  {100.0 * edge.seen:5.0f} %  {edge.brighter:<5} {kind}"

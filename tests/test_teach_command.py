@@ -1,0 +1,389 @@
+"""``gripmon teach`` as its users meet it, the file that it writes, and what refuses that file."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from meters import moved
+from simulated import BOX_FINGERS, nominal_cam_T_grip
+from taught_scenes import OPENING_M, image_of, scene
+
+from gripmon.atomic import write_atomically
+from gripmon.cli import main
+from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.config.typed import to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.corners import TaughtModel
+from gripmon.corners.taught import TaughtEdge, gripper_digest
+from gripmon.geometry import to_record
+from gripmon.gripper import load_gripper
+from gripmon.teaching.document import to_yaml
+
+POSE = nominal_cam_T_grip()
+BEVEL_M = 3e-4
+LEVELS = (120.0, 180.0, 230.0)
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A configuration with sharp fingers, and images of bevelled ones: three to teach from, five of a moved camera."""
+    folder = tmp_path_factory.mktemp("rig")
+    model = yaml.safe_load(BOX_FINGERS.read_text())
+    for edge in model["edges"].values():
+        edge.pop("bevel_m", None)
+    (folder / "gripper.yaml").write_text(yaml.safe_dump(model, sort_keys=False))
+    values = yaml.safe_load(builtin_config("demo.yaml").read_text())
+    transform = msgspec.to_builtins(to_record(POSE))
+    values["reference"]["cam_T_grip"] = {key: list(value) for key, value in transform.items()}
+    values.update(gripper="gripper.yaml", source={"kind": "folder", "path": "moved"})
+    values["publish"]["enabled"] = values["recording"]["enabled"] = False
+    (folder / "untaught.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+    (folder / "config.yaml").write_text(yaml.safe_dump({**values, "taught": "taught.yaml"}, sort_keys=False))
+    (folder / "first").mkdir()
+    rows = ["file,stamp_ns,jaw_opening_m"]
+    for n, level in enumerate(LEVELS):
+        cv2.imwrite(str(folder / "first" / f"{n}.png"), image_of(BEVEL_M, scene(level)))
+        rows.append(f"{n}.png,{n + 1},{OPENING_M}")
+    (folder / "first" / "timestamps.csv").write_text("\n".join(rows) + "\n")
+    (folder / "moved").mkdir()
+    rows, truth = ["file,stamp_ns,jaw_opening_m"], []
+    rng = np.random.default_rng(7)
+    for n in range(5):
+        pose = moved(POSE, np.concatenate([rng.normal(0.0, 2e-4, 3), np.radians(rng.normal(0.0, 0.1, 3))]))
+        opening_m = OPENING_M + rng.uniform(-0.003, 0.003)
+        cv2.imwrite(str(folder / "moved" / f"{n}.png"), image_of(BEVEL_M, scene(180.0, opening_m), pose))
+        rows.append(f"{n}.png,{(n + 1) * 40_000_000},{opening_m!r}")
+        truth.append(pose[:3, 3].tolist())
+    (folder / "moved" / "timestamps.csv").write_text("\n".join(rows) + "\n")
+    (folder / "truth.json").write_text(json.dumps(truth))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def taught(rig: Path) -> Path:
+    """The file that a process of its own has written."""
+    images = sorted((rig / "first").glob("*.png"))
+    done = subprocess.run(
+        [
+            *(sys.executable, "-m", "gripmon", "teach", *map(str, images)),
+            *("--config", str(rig / "config.yaml"), "--picture", str(rig / "pictures" / "taught.png")),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    assert f"written: {rig / 'taught.yaml'}" in done.stdout and "put the line" not in done.stdout
+    assert len([line for line in done.stdout.splitlines() if line.endswith(("outline", "crease"))]) == 10
+    return rig / "taught.yaml"
+
+
+def fault(arguments: Sequence[object], capsys: pytest.CaptureFixture[str], code: int = 2) -> str:
+    """The one line that a command ends with."""
+    capsys.readouterr()
+    assert main([str(argument) for argument in arguments]) == code
+    text = capsys.readouterr()
+    assert text.out == ""
+    lines = text.err.splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def changed(path: Path, out: Path, **values: object) -> Path:
+    """A copy of a YAML file with other values at dotted keys, ``__`` for the dot."""
+    content = yaml.safe_load(path.read_text())
+    for dotted, value in values.items():
+        *above, last = dotted.split("__")
+        section = content
+        for key in above:
+            section = section[key]
+        section[last] = value
+    out.write_text(yaml.safe_dump(content, sort_keys=False))
+    return out
+
+
+def test_the_file_says_where_it_comes_from(rig: Path, taught: Path):
+    model = to_settings(read_yaml(taught), TaughtModel)
+    config = load_config(rig / "config.yaml")
+    assert config.taught == model and config.taught_edges is not None
+    assert model.provenance.command.startswith("gripmon teach ") and len(model.provenance.images) == len(LEVELS)
+    for image in model.provenance.images:
+        assert Path(image.file).is_file() and image.jaw_opening_m == OPENING_M
+    assert model.camera == config.camera.settings
+    assert model.gripper.sha256 == gripper_digest(config.gripper)
+    assert model.reference.id == "demo-calibration"
+    assert taught.read_text().startswith("# Taught model: written by gripmon teach")
+    assert [p.name for p in taught.parent.iterdir() if p.name.startswith(".")] == [], "no temporary file is left"
+
+
+def test_the_picture_shows_every_taught_edge(rig: Path, taught: Path):
+    picture = cv2.imread(str(rig / "pictures" / "taught.png"))
+    assert picture is not None and picture.shape == (1152, 1536, 3)
+    grey = np.ptp(picture.astype(int), axis=2) == 0
+    assert 0.9 < grey.mean() < 0.999, "the image is grey, what is drawn isn't"
+
+
+def test_replay_with_the_taught_model_is_right_where_it_was_half_a_millimetre_off(rig: Path, taught: Path):
+    truth = np.array(json.loads((rig / "truth.json").read_text()))
+    rms = {}
+    for name in ("untaught", "config"):
+        out = rig / f"{name}.jsonl"
+        assert main(["replay", str(rig / "moved"), "--config", str(rig / f"{name}.yaml"), "--out", str(out)]) == 0
+        lines = [json.loads(line) for line in out.read_text().splitlines()]
+        found = np.array([line["cam_T_grip"]["translation_m"] for line in lines])
+        assert all(line["source"] != "held" for line in lines)
+        rms[name] = float(np.sqrt(np.square(found - truth).sum(axis=1).mean()))
+    assert rms["untaught"] > 4e-4
+    assert rms["config"] < rms["untaught"] / 8.0
+
+
+def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(rig / "config.yaml")]) == 0
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("taught ")]
+    assert "10 edges from 3 images" in line and "µm" in line and "px)" in line and "not taught" not in line
+    assert main(["check", str(rig / "config.yaml"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    largest = report["taught"]["largest"]
+    edges = load_config(rig / "config.yaml").taught.edges  # type: ignore[union-attr]
+    assert abs(largest["offset_m"]) == max(abs(v) for edge in edges.values() for v in edge.offset_m)
+    assert largest["offset_px"] == pytest.approx(largest["offset_m"] * 962.0 / 0.115)
+    assert report["accuracy"]["edges"] == 10, "the creases, too"
+    assert main(["check", str(rig / "untaught.yaml")]) == 0
+    assert "gripmon teach" in capsys.readouterr().out
+
+
+def test_a_second_run_needs_force_and_changes_nothing_without(
+    rig: Path, taught: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    before = taught.read_bytes()
+    arguments = ["teach", rig / "first" / "0.png", "--config", rig / "config.yaml"]
+    assert "is there already" in fault(arguments, capsys) and taught.read_bytes() == before
+    out = tmp_path / "again.yaml"
+    out.write_text("old")
+    assert main([*map(str, arguments), "--out", str(out), "--force"]) == 0
+    text = capsys.readouterr().out
+    assert f"put the line `taught: {out}` into" in text
+    assert len(to_settings(read_yaml(out), TaughtModel).provenance.images) == 1
+
+
+@pytest.mark.parametrize(
+    ("what", "code", "said"),
+    [
+        ("nowhere.png", 2, "nowhere.png: the file is missing; an image file"),
+        ("empty.png", 2, "empty.png: the file is empty"),
+        ("text.png", 2, "text.png: truncated, damaged or not an image"),
+        ("first", 2, "is a folder; image files"),
+        ("small.png", 2, "wrong_size: 384x288 pixels; 768x576"),
+        ("black.png", 2, "black: no pixel brighter"),
+        ("first/0.png first/../first/0.png", 2, "is the same image as"),
+        ("alone.png", 2, "its jaw opening isn't known (jaw.source is frames); --jaw-opening M, or"),
+        ("alone.png --jaw-opening 0.9", 2, "alone.png: jaw opening 0.9 m; the gripper's 0 to 0.06 m"),
+        ("alone.png --jaw-opening 0.0605", 2, "jaw opening 0.0605 m; the gripper's 0 to 0.06 m"),
+        ("grey.png --jaw-opening 0.034", 3, "teach: {folder}/grey.png: the gripper isn't found"),
+        ("alone.png --jaw-opening 0.0346", 3, "the jaw shows an opening of 0.03"),
+        ("alone.png --jaw-opening 0.034 --out first", 2, "--out {folder}/first: is a folder; a file"),
+        ("alone.png --jaw-opening 0.034 --picture x.tiff", 2, "has no known ending"),
+    ],
+)
+def test_what_can_not_be_taught_from_is_one_line(
+    rig: Path, tmp_path: Path, what: str, code: int, said: str, capsys: pytest.CaptureFixture[str]
+):
+    """Unreadable or foreign files end with 2, images without the gripper at the reference with 3; nothing written."""
+    image = image_of(BEVEL_M, scene(120.0))
+    (tmp_path / "first").mkdir()
+    for name in ("alone.png", "first/0.png"):
+        cv2.imwrite(str(tmp_path / name), image)
+    (tmp_path / "first" / "timestamps.csv").write_text(f"file,stamp_ns,jaw_opening_m\n0.png,1,{OPENING_M}\n")
+    cv2.imwrite(str(tmp_path / "small.png"), image[::2, ::2])
+    cv2.imwrite(str(tmp_path / "black.png"), 0 * image)
+    cv2.imwrite(str(tmp_path / "grey.png"), np.tile(np.arange(768, dtype=np.uint8) // 8 + 60, (576, 1)))
+    (tmp_path / "empty.png").write_bytes(b"")
+    (tmp_path / "text.png").write_text("no image")
+    words = [w if w.startswith("-") or w[0] == "0" else str(tmp_path / w) for w in what.split()]
+    reference = {"position_sigma_m": 2e-5, "rotation_sigma_rad": 2e-4}
+    values = yaml.safe_load((rig / "untaught.yaml").read_text())
+    values["reference"].update(reference)
+    values.update(gripper=str(rig / "gripper.yaml"))
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(values))
+    out = [] if "--out" in words else ["--out", str(tmp_path / "t.yaml")]
+    line = fault(["teach", *words, "--config", tmp_path / "config.yaml", *out], capsys, code)
+    assert said.format(folder=tmp_path) in line
+    assert not (tmp_path / "t.yaml").exists()
+
+
+def test_a_gripper_without_a_jaw_takes_no_opening(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    cv2.imwrite(str(tmp_path / "a.png"), np.tile(np.arange(640, dtype=np.uint8) // 8 + 60, (480, 1)))
+    config = builtin_config("visp_cube.yaml")
+    arguments = ["teach", tmp_path / "a.png", "--config", config, "--out", tmp_path / "t.yaml"]
+    assert "the gripper has no jaw" in fault([*arguments, "--jaw-opening", "0.03"], capsys)
+    assert "the gripper isn't found" in fault(arguments, capsys, 3)
+
+
+# --- a taught model that belongs to something else ---
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"camera__fx_px": 962.5}, "camera.fx_px: taught with 962.0, the configuration has 962.5; teach again"),
+        ({"camera__fy_px": 961.0}, "camera.fy_px: taught with 962.0"),
+        ({"camera__cx_px": 383.0}, "camera.cx_px: taught with 383.5"),
+        ({"camera__cy_px": 288.0}, "camera.cy_px: taught with 287.5"),
+        ({"camera__kappa_per_px2": 2e-7}, "camera.kappa_per_px2: taught with 1.9e-07"),
+        ({"camera__width_px": 800}, "camera.width_px: taught with 768, the configuration has 800"),
+        ({"camera__height_px": 600}, "camera.height_px: taught with 576"),
+        ({"reference__cam_T_grip__translation_m": [0.0005, 0.0013, 0.115]}, "reference.cam_T_grip: taught at demo-"),
+        ({"monitor__corners": {"edges": {"blur_px": 1.0}}}, "edge_settings.blur_px: taught with 0.65"),
+        ({"gripper": "other.yaml"}, "gripper: taught with two_box_fingers with other contents"),
+        ({"gripper": "named.yaml"}, "gripper: taught with two_box_fingers, the configuration has somebody_elses"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_another_camera_gripper_or_reference_is_refused(
+    rig: Path, taught: Path, changes: dict[str, object], said: str, capsys: pytest.CaptureFixture[str]
+):
+    changed(rig / "gripper.yaml", rig / "other.yaml", points__L_in_near__xyz_m=[-0.017, -0.00801, 0.0])
+    changed(rig / "gripper.yaml", rig / "named.yaml", name="somebody_elses")
+    path = changed(rig / "config.yaml", rig / "changed.yaml", **changes)
+    line = fault(["check", path], capsys)
+    assert line.startswith(f"{taught}: {said}")
+    assert line.endswith("teach again (gripmon teach), or use what it was taught with")
+    assert "taught" in fault(["replay", rig / "moved", "--config", path, "--out", rig / "x.jsonl"], capsys)
+    assert load_config(path, with_taught=False).taught is None, "to teach anew it is not in the way"
+
+
+def test_another_lens_is_refused(rig: Path, taught: Path):
+    lens = yaml.safe_load((rig / "config.yaml").read_text())["camera"]
+    lens.pop("kappa_per_px2")
+    path = changed(rig / "config.yaml", rig / "lens.yaml", camera={**lens, "model": "brown_conrady"})
+    with pytest.raises(ConfigError, match=r"camera\.model: taught with paper, the configuration has brown_conrady"):
+        load_config(path)
+
+
+def test_comments_order_and_spelling_of_the_gripper_file_do_not_matter(rig: Path, taught: Path):
+    text = (rig / "gripper.yaml").read_text()
+    (rig / "same.yaml").write_text("# A comment.\n" + text.replace("-0.017", "-0.0170"))
+    assert load_config(changed(rig / "config.yaml", rig / "same_config.yaml", gripper="same.yaml")).taught is not None
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"edges__L_tip_in__offset_m": [0.5, 0.0]}, "edges.L_tip_in.offset_m[0]: is 0.5; "),
+        ({"edges__L_tip_in__offset": 1.0}, "edges.L_tip_in.offset: unknown key, did you mean"),
+        ({"edges__L_tip_in__share": [0.5, 0.5]}, "edges.L_tip_in.share: is [0.5, 0.5]; two shares, ascending"),
+        (
+            {"edges__nobody": {"share": [0, 1], "offset_m": [0, 0], "sigma_m": [0, 0], "crease": False}},
+            "edges.nobody: ",
+        ),
+        ({"corners__nobody": {"uv_px": [0, 0], "sigma_px": 1}}, "corners.nobody: the gripper has no such"),
+        ({"gripper__sha256": "abc"}, "gripper.sha256: is 'abc'; "),
+        ({"edges": {}}, "edges"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_a_damaged_file_is_refused(rig: Path, taught: Path, changes: dict[str, object], said: str):
+    changed(taught, rig / "damaged.yaml", **changes)
+    path = changed(rig / "config.yaml", rig / "damaged_config.yaml", taught="damaged.yaml")
+    with pytest.raises(ConfigError) as refused:
+        load_config(path)
+    assert str(refused.value).startswith(f"{rig / 'damaged.yaml'}: {said}")
+
+
+def test_a_missing_file_is_refused(rig: Path):
+    path = changed(rig / "config.yaml", rig / "missing.yaml", taught="nowhere.yaml")
+    with pytest.raises(ConfigError, match=r"taught: there is no file .*nowhere\.yaml; a file of gripmon teach"):
+        load_config(path)
+
+
+# --- the file itself ---
+
+METRES = st.floats(-0.02, 0.02)
+DEVIATIONS = st.floats(0.0, 0.02)
+LOOKS: st.SearchStrategy[object] = st.none() | st.builds(dict, level=st.floats(0.0, 1e3), spread=st.floats(0.0, 1e3))
+EDGES = st.fixed_dictionaries(
+    {
+        "share": st.tuples(st.floats(0.0, 0.4), st.floats(0.5, 1.0)),
+        "offset_m": st.tuples(METRES, METRES),
+        "sigma_m": st.tuples(DEVIATIONS, DEVIATIONS),
+        "depth_m": METRES,
+        "depth_sigma_m": DEVIATIONS,
+        "crease": st.booleans(),
+        "brighter": st.sampled_from(["left", "right", "any"]),
+        "rms_px": st.floats(0.0, 1e3),
+        "seen": st.floats(0.0, 1.0),
+        "left": LOOKS,
+        "right": LOOKS,
+    }
+)
+NAMES = st.text(
+    st.characters(codec="utf-8", exclude_categories=["C"], exclude_characters="\x85\u2028\u2029"), min_size=1
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(edges=st.dictionaries(NAMES | st.sampled_from(["no", "1e5", "~", "0x1", "a: b", " x", "-"]), EDGES, min_size=1))
+def test_reading_gives_back_what_was_written(tmp_path_factory: pytest.TempPathFactory, edges: dict[str, object]):
+    """Any names and numbers, to the last bit, through the file and the reader of configurations."""
+    config = load_config(builtin_config("demo.yaml"))
+    plain = {
+        "provenance": {
+            "gripmon": "1.0",
+            "time": "2030-01-01T00:00:00+00:00",
+            "command": "gripmon teach 'a b'.png: # no comment",
+            "images": [{"file": "é.png", "sha256": "0" * 64}],
+            "closure_px": 0.1,
+        },
+        "camera": msgspec.to_builtins(config.camera.settings),
+        "gripper": {"name": "null", "sha256": "9" * 64},
+        "reference": {"id": "12", "cam_T_grip": msgspec.to_builtins(config.reference.cam_T_grip)},
+        "edge_settings": {},
+        "edges": edges,
+    }
+    model = msgspec.convert(plain, TaughtModel)
+    path = tmp_path_factory.getbasetemp() / "round_trip.yaml"
+    path.write_text(to_yaml(model), encoding="utf-8")
+    assert to_settings(read_yaml(path), TaughtModel) == model
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "taught.yaml"
+    path.write_bytes(b"old")
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("gripmon.atomic.os.fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    monkeypatch.undo()
+    write_atomically(path, b"new")
+    assert path.read_bytes() == b"new" and list(tmp_path.iterdir()) == [path]
+    assert path.stat().st_mode & 0o777 == 0o644 & ~_mask(), "as any other file, not private"
+
+
+def _mask() -> int:
+    import os
+
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def test_the_gripper_files_digest_is_that_of_its_content():
+    one, two = load_gripper(BOX_FINGERS), load_gripper(BOX_FINGERS)
+    assert gripper_digest(one) == gripper_digest(two) and len(gripper_digest(one)) == 64
+    assert TaughtEdge.__struct_config__.forbid_unknown_fields
