@@ -6,6 +6,7 @@ A pure function of the frames so far: no clock, no I/O, no threads.  Time is the
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import msgspec
@@ -36,6 +37,7 @@ from gripmon.geometry import (
 )
 from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
+from gripmon.jaw import JawKnowledge
 from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
 from gripmon.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.records import (
@@ -92,8 +94,22 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         ),
     ] = "all"
     jaw_sigma_m: Annotated[
-        float, Meta(ge=0.0, le=0.05, description="standard deviation of the reported jaw opening (m)")
+        float,
+        Meta(
+            ge=0.0,
+            le=0.05,
+            description="standard deviation of the part of the reported jaw opening's error that changes as the jaw "
+            "moves; 0: the report is exact (m)",
+        ),
     ] = 5e-5
+    jaw_offset_sigma_m: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.05,
+            description="standard deviation of the part that never changes; no effect where the report is exact (m)",
+        ),
+    ] = 2e-4
     floor_m: Annotated[
         float,
         Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)"),
@@ -120,7 +136,8 @@ class Monitor:
     ):
         self._camera, self._gripper, self._settings = camera, gripper, settings
         # What was taught belongs to the gripper's edges: a new reference doesn't change it.
-        self._meter = FingertipMeter(camera, gripper, settings.corners, settings.jaw_sigma_m, taught)
+        self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
+        self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         reference_sigma = np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal())
         self._policy = Policy(settings.policy, reference_sigma)
         self._average = PoseAverage(settings.smoothing)
@@ -154,6 +171,7 @@ class Monitor:
         if not measurement.trusted:
             return self._unmeasured(frame, "too few edges of the gripper agree", CornerFault.NO_FIT, None)
         before_T = self._cam_T_grip
+        measurement = self._newest = self._with_known_jaw(measurement, frame.jaw_opening_m)
         self._cam_T_grip, self._covariance = self.update(measurement)
         self._jaw_opening_m, self._measured_s = measurement.jaw_opening_m, self._now_s
         drift = self._drift()
@@ -212,6 +230,22 @@ class Monitor:
         if measurement.trusted:
             self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         return measurement
+
+    def _with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
+        """The same with the opening's error as earlier frames have shown it."""
+        if reported_m is None or not self._gripper.has_jaw:
+            return measurement
+        fused = self._jaw.fuse(measurement.jaw_reported_m, measurement.jaw_opening_m, measurement.covariance)
+        covariance = measurement.covariance.copy()
+        covariance[:6, :6] = fused.covariance
+        covariance[6, 6] = fused.sigma_m**2
+        return replace(
+            measurement,
+            cam_T_grip=perturb(measurement.cam_T_grip, fused.xi),
+            jaw_opening_m=min(max(fused.jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m),
+            covariance=covariance,
+            jaw_surprise=max(measurement.jaw_surprise, fused.surprise, key=abs),
+        )
 
     def update(self, measurement: Measurement) -> tuple[Array, Array]:
         """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation
