@@ -8,7 +8,7 @@ px.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import msgspec
@@ -70,10 +70,14 @@ GATE_PX = 0.5
 FARTHEST_PX = 1.0
 """Robust spread (px) beyond which edge points are not believed to show the gripper's edges."""
 
+FEWEST_EDGES = 3
+"""Edges that must be seen for a fit to be believed at all."""
+
 _TUKEY = 4.685
 _LARGEST_SPREAD = 3.0
 _SMALLEST_SPREAD_PX = 0.05
 _SMALLEST_STIFFNESS = 0.2
+_AGAIN_PX = 0.4  # width at a start that is nearly right
 _NARROWING = 0.4  # of the width that covers the start's error, from round to round
 _ROUNDS = 6
 _CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard deviation; what is still to come is less
@@ -158,9 +162,11 @@ def base_weights(
     return weight
 
 
-def agree(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings) -> Consensus:
-    """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``start_width_px`` to what each
-    candidate's own standard deviation and the measured scatter allow.
+def agree(
+    votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
+) -> Consensus:
+    """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``width_px`` (``start_width_px``
+    of the settings if None) to what each candidate's own standard deviation and the measured scatter allow.
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
@@ -173,7 +179,8 @@ def agree(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings)
     shared = votes.edge_spread_px**2
     xi = start
     residual = offset - xi @ jacobian
-    width, spread, spread_px = settings.start_width_px, 1.0, FARTHEST_PX
+    width = settings.start_width_px if width_px is None else width_px
+    spread, spread_px = 1.0, FARTHEST_PX
     for round_ in range(_ROUNDS):
         if round_:
             width *= _NARROWING
@@ -190,6 +197,19 @@ def agree(votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings)
             break
     stiffness = _stiffness(weight, residual, reach)
     return _judge(votes, active, Fit(xi, weight, residual, information, spread_px, stiffness), settings)
+
+
+def agree_on_seen(
+    votes: Votes, prior: Prior, consensus: Consensus, settings: ConsensusSettings
+) -> tuple[Votes, Consensus]:
+    """The fit again without the edges that are no better supported than by chance: what lies near them is background."""
+    edges = votes.prediction.layout.edges
+    seen = consensus.edge_seen
+    if seen[edges].all() or np.count_nonzero(seen) < FEWEST_EDGES:
+        return votes, consensus
+    edge = votes.prediction.layout.edge[votes.candidates.sample]
+    rest = replace(votes, weight=np.where(seen[edge], votes.weight, 0.0))
+    return rest, agree(rest, prior, consensus.xi, settings, _AGAIN_PX)
 
 
 def agree_from_grid(
@@ -312,7 +332,7 @@ def _judge(votes: Votes, active: NDArray[np.bool_] | None, fit: Fit, settings: C
     # What chance supports is scattered, what the gripper supports comes in runs: neighbours are counted, not profiles.
     pair = prediction.pair
     believed = 0.0
-    if prediction.pairs and np.count_nonzero(seen) >= 3:
+    if prediction.pairs and np.count_nonzero(seen) >= FEWEST_EDGES:
         agreeing_pairs = pair & supported[1:] & supported[:-1] & seen[edge_of[1:]]
         believed = int(np.count_nonzero(agreeing_pairs)) / prediction.pairs
     return Consensus(

@@ -23,6 +23,7 @@ from gripmon.corners.consensus import (
     Votes,
     agree,
     agree_from_grid,
+    agree_on_seen,
     base_weights,
     grid_of_starts,
     prior_information,
@@ -211,6 +212,8 @@ class FingertipMeter:
         jaw_opening_m = min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
+        if self._gripper.has_jaw and not jaw_reported:
+            best = max(best, self._from_openings(image, expected), key=_agreement)
         satisfied = SATISFIED * usual_share
         if best.consensus.share < satisfied:
             best = self._at_other_zooms(image, expected, best)
@@ -298,12 +301,13 @@ class FingertipMeter:
             expected = self._moved(prediction, consensus.xi, expected)
             if moved_px <= settings.relinearise_px:
                 break
+        votes, consensus = agree_on_seen(votes, prior, consensus, settings.consensus)
         uncertainty = self._assess(votes, consensus)
         if uncertainty.contradiction > CONTRADICTION:
             found = without_one_edge(votes, prior, start, settings.consensus, uncertainty.contradiction)
             if found is not None:
                 votes, consensus, uncertainty = found
-                expected = self._moved(prediction, consensus.xi, expected)
+        expected = self._moved(prediction, consensus.xi, expected)
         corners = intersect_edges(votes, consensus, uncertainty.line_weight, self._geometry, settings.corners)
         return Measurement(
             prediction,
@@ -317,6 +321,28 @@ class FingertipMeter:
             self._jaw_surprise(consensus.xi, prior),
             Effort.NARROW,
         )
+
+    def _from_openings(self, image: Image, expected: _Expected) -> Measurement:
+        """Starts at other openings, for a jaw that moves and doesn't report it: as far as two profiles reach."""
+        settings, gripper = self._settings.consensus, self._gripper
+        prediction, _ = self._predicted(expected)
+        rate = float(np.abs(prediction.jacobian[:, 6]).max(initial=0.0))  # px/m
+        if rate == 0.0:
+            return self._settle(image, expected)
+        reach_m = self._reach_px / rate
+        ticks_m = np.arange(-self._reach_px, self._reach_px, 1.0) / rate
+        best = self._settle(image, expected)
+        for beside_m in (-1.5 * reach_m, 0.0, 1.5 * reach_m):
+            opening_m = min(max(expected.jaw_opening_m + beside_m, gripper.jaw_min_m), gripper.jaw_max_m)
+            there = replace(expected, jaw_opening_m=opening_m)
+            seen = self._predict(prediction.layout, there)
+            starts = np.zeros((len(ticks_m), 7))
+            starts[:, 6] = ticks_m
+            prior = self._prior_about(seen, there)
+            fit = agree_from_grid(self._look(image, seen), prior, starts, settings, refine=2)
+            if fit.share > best.consensus.share:
+                best = max(best, self._settle(image, self._moved(seen, fit.xi, there)), key=_agreement)
+        return best
 
     def _from_grid(self, image: Image, expected: _Expected) -> Measurement:
         """Starts all over the reach of the profiles; the best one settled."""

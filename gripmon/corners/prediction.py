@@ -46,7 +46,7 @@ class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     ] = False
 
 
-STRETCH = 10
+STRETCH = 16
 """Neighbouring profiles of an edge whose errors are taken together."""
 
 STEP_PX = 0.5

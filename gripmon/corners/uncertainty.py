@@ -14,7 +14,7 @@ CONTRADICTION = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
 
 _EXPLAINED = 1.0 / 3.0
-_SMALLEST_SCATTER = 0.3
+_SMALLEST_SCATTER = 0.1
 _FEWEST_FREE = 3
 
 
@@ -66,7 +66,8 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     total = np.add.reduceat(alone, first)
     moment = np.add.reduceat(alone * consensus.residual_px[inlier], first)
-    contradiction = _contradiction(total, moment, len(consensus.xi))
+    freedom = len(total) - len(consensus.xi)
+    contradiction = _contradiction(total, moment, freedom)
     scatter, shared = max(min(contradiction, 1.0), _SMALLEST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
@@ -78,6 +79,8 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     begin = np.flatnonzero(np.diff(of_stretch, prepend=-1))
     pulls = np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[of_stretch[begin]])
     middle += pulls @ pulls.T
+    # A scatter that is itself estimated from few stretches makes Student's distribution, with this variance.
+    middle *= freedom / (freedom - 2.0) if freedom >= _FEWEST_FREE else _FEWEST_FREE
     middle.flat[:: len(middle) + 1] += prior_information
     covariance = inverse @ middle @ inverse
     line_weight = np.zeros(len(consensus.weight))
@@ -87,12 +90,11 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     return Uncertainty(0.5 * (covariance + covariance.T), line_weight, shared_px, contradiction)
 
 
-def _contradiction(total: Array, moment: Array, unknowns: int) -> float:
+def _contradiction(total: Array, moment: Array, freedom: int) -> float:
     """Weighted squares of the stretches' means over their degrees of freedom; 1 where too few stretches are left.
 
     Above 1 it gives tau² = (contradiction - 1) * stretches / sum of their weights.
     """
-    freedom = len(total) - unknowns
     return float((moment**2 / total).sum()) / freedom if freedom >= _FEWEST_FREE else 1.0
 
 
