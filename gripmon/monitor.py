@@ -64,7 +64,7 @@ USUAL_SHARE = 0.6
 USUAL_RATES = (0.02, 0.1)
 """How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
 
-FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.25
+FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
 
 CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}

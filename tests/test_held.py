@@ -175,5 +175,5 @@ def test_corners_that_do_not_determine_the_motion_leave_it_to_the_edges(mask: Ma
         # Both start from what the frame before gave, and end at the same place within the fit's own tolerance.
         apart = error_of(one) - error_of(other)
         assert apart @ np.linalg.solve(covariance_of(other), apart) < 0.25
-        np.testing.assert_allclose(covariance_of(one).diagonal(), covariance_of(other).diagonal(), rtol=0.1)
+        np.testing.assert_allclose(covariance_of(one).diagonal(), covariance_of(other).diagonal(), rtol=0.3)
     assert measured > HIDDEN // 2

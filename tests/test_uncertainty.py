@@ -79,7 +79,8 @@ def test_what_a_line_is_worth_is_the_scatter_of_its_edge():
         weight = uncertainty.line_weight[mine]
         means.append(np.average(noise[mine], weights=weight))
         claimed.append(1.0 / weight.sum())
-    assert np.mean(claimed) == pytest.approx(np.var(means), rel=0.35)
+    # An edge has few stretches, which share what all edges together scatter.
+    assert 0.8 < np.mean(claimed) / np.var(means) < 1.8
 
 
 def test_without_inliers_the_prior_alone_is_claimed():

@@ -165,8 +165,8 @@ def base_weights(
 def agree(
     votes: Votes, prior: Prior, start: Array, settings: ConsensusSettings, width_px: float | None = None
 ) -> Consensus:
-    """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``width_px`` (``start_width_px``
-    of the settings if None) to what each candidate's own standard deviation and the measured scatter allow.
+    """Robust fit from one start (m,): iteratively re-weighted, the width shrinking from ``width_px`` (if None, from the
+    settings' ``start_width_px``) to what each candidate's own standard deviation and the measured scatter allow.
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
@@ -202,7 +202,7 @@ def agree(
 def agree_on_seen(
     votes: Votes, prior: Prior, consensus: Consensus, settings: ConsensusSettings
 ) -> tuple[Votes, Consensus]:
-    """The fit again without the edges that are no better supported than by chance: what lies near them is background."""
+    """The fit again without the edges that chance supports as well: what lies near them is background."""
     edges = votes.prediction.layout.edges
     seen = consensus.edge_seen
     if seen[edges].all() or np.count_nonzero(seen) < FEWEST_EDGES:

@@ -188,7 +188,7 @@ def _unrest(response: NDArray[np.float32], sample: NDArray[np.intp], column: NDA
     row = sample * columns
     last = columns - 1
     near, far = round(UNREST_FROM_PX / STEP_PX), round(UNREST_TO_PX / STEP_PX)
-    ends = [np.clip(column + k, 0, last) for k in (-far, -near, near, far)]
+    ends = [np.minimum(np.maximum(column + k, 0), last) for k in (-far, -near, near, far)]
     a, b, c, d = (running[row + end] for end in ends)
     total = (b - a) + (d - c)
     count = (ends[1] - ends[0]) + (ends[3] - ends[2])
