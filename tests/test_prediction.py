@@ -115,8 +115,15 @@ def test_maps_sample_along_the_normals():
     prediction = predicted()
     u = prediction.uv_px[:, :1] + prediction.normal[:, :1] * OFFSETS_PX
     v = prediction.uv_px[:, 1:] + prediction.normal[:, 1:] * OFFSETS_PX
-    np.testing.assert_allclose(prediction.map_x, u, atol=1e-4)
-    np.testing.assert_allclose(prediction.map_y, v, atol=1e-4)
+    # In the middle row; the others lie a pixel beside it along the edge.
+    np.testing.assert_allclose(prediction.map_x[1], u, atol=1e-4)
+    np.testing.assert_allclose(prediction.map_y[1], v, atol=1e-4)
+    for row, sign in ((0, -1.0), (2, 1.0)):
+        beside = np.stack([prediction.map_x[row] - u, prediction.map_y[row] - v], axis=-1)
+        np.testing.assert_allclose(np.linalg.norm(beside, axis=-1), 1.0, atol=1e-3)
+        np.testing.assert_allclose(np.einsum("nsi,ni->ns", beside, prediction.normal), 0.0, atol=1e-3)
+        tangent = np.stack([prediction.normal[:, 1], -prediction.normal[:, 0]], axis=1)
+        assert (sign * np.einsum("nsi,ni->ns", beside, tangent) > 0.9).all()
     np.testing.assert_allclose(OFFSETS_PX, np.arange(-7.0, 7.25, 0.5))
 
 

@@ -52,6 +52,9 @@ STRETCH = 16
 STEP_PX = 0.5
 """Distance of samples along a profile, px."""
 
+ROWS = 3
+"""Neighbouring rows of pixels along an edge that make one profile."""
+
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
@@ -109,7 +112,7 @@ class Prediction:
     and, where the jaw opening is an unknown too, by the opening (px/m). ``along`` (n,) and ``gain`` (n,): ideal
     coordinate along the edge's line, and ideal distance from the line for each px of offset along the normal.
     ``line_origin``, ``line_direction`` (e, 2): the edges' lines in ideal coordinates.  ``ok`` (n,): the profile lies
-    in the image.
+    in the image.  ``map_x``, ``map_y`` (r, n, s): where r neighbouring rows of each profile are read.
 
     With a taught model ``uv_px`` lies where the edge was taught to show, everything else is the sharp model's: what is
     measured from there is the model's own motion.  ``edge_spread_m`` (e,): standard deviation of what a
@@ -295,6 +298,9 @@ def predict(
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
     offsets = offsets_px.astype(np.float32)
     uv32, normal32 = uv.astype(np.float32), normal.astype(np.float32)
+    # Rows as far apart as the profiles' pixels: noise and fine texture differ, the edge doesn't.
+    spacing_px = (offsets_px[1] - offsets_px[0]) / STEP_PX if len(offsets_px) > 1 else 1.0
+    along32 = (spacing_px * np.arange(-(ROWS // 2), ROWS // 2 + 1, dtype=np.float32))[:, None, None].astype(np.float32)
     return Prediction(
         cam_T_grip=cam_T_grip,
         jaw_opening_m=jaw_opening_m,
@@ -307,8 +313,8 @@ def predict(
         line_origin=origin,
         line_direction=direction,
         ok=ok,
-        map_x=uv32[:, 0:1] + normal32[:, 0:1] * offsets,
-        map_y=uv32[:, 1:2] + normal32[:, 1:2] * offsets,
+        map_x=(uv32[:, 0:1] + normal32[:, 0:1] * offsets) + along32 * normal32[:, 1:2],
+        map_y=(uv32[:, 1:2] + normal32[:, 1:2] * offsets) - along32 * normal32[:, 0:1],
         corners=corners,
         edge_spread_m=edge_spread_m,
     )

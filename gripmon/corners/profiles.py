@@ -81,15 +81,21 @@ def profile_offsets_px(reach_px: float) -> Array:
 
 
 def read_profiles(image: Image, map_x: NDArray[np.float32], map_y: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Interpolate the image at the maps (n, s): float32 grey levels; colour is reduced to grey here, so that cost
-    grows with edges.
+    """Interpolate the image at the maps (r, n, s), or (n, s), and average over r: float32 grey levels (n, s); colour is
+    reduced to grey here, so that cost grows with edges.
     """
+    samples = map_x.shape[-1]
     if map_x.size == 0:
-        return np.zeros(map_x.shape, dtype=np.float32)
-    values = cv2.remap(image, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        return np.zeros((map_x.shape[-2], samples), dtype=np.float32)
+    rows = map_x.reshape(-1, samples), map_y.reshape(-1, samples)
+    values = cv2.remap(image, *rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     if values.ndim == 3:
-        return values.astype(np.float32) @ GREY_BGR
-    return values.astype(np.float32)
+        values = values.astype(np.float32) @ GREY_BGR
+    if map_x.ndim == 2:
+        return values.astype(np.float32)
+    summed = values.reshape(map_x.shape).sum(axis=0, dtype=np.float32)
+    summed *= np.float32(1.0 / len(map_x))
+    return np.asarray(summed, dtype=np.float32)
 
 
 def full_scale(image: Image) -> float:
@@ -208,7 +214,8 @@ def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
 
 
 def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float:
-    """Standard deviation of the image noise, grey levels, from the quiet parts of the profiles (n, s).
+    """Standard deviation of the noise of a pixel, averaged as the profiles (n, s) are, from their quiet parts, grey
+    levels.
 
     Third differences at whole pixels suppress everything smooth; texture and edges only add to their size, so that
     the lowest tenth is taken.  ``quantum`` is the step of the image's grey levels, whose rounding alone gives 0.29
@@ -221,5 +228,5 @@ def estimate_noise(profiles: NDArray[np.float32], quantum: float = 1.0) -> float
         return floor
     tenth = float(np.partition(third, third.size // 10)[third.size // 10])
     # Of a normal distribution a tenth lies within 0.1257 sigma; a third difference of white noise has variance 20,
-    # of which cubic interpolation at a random phase leaves 0.64 along the profile and 0.86 across.
-    return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64 * 0.86)), floor)
+    # of which cubic interpolation at a random phase leaves 0.64 along the profile.
+    return max(tenth / (0.1257 * math.sqrt(20.0 * 0.64)), floor)
