@@ -84,7 +84,7 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     ] = 1.0
     suspect_sigma_m: Annotated[
         float, Meta(gt=0.0, le=1.0, description="a transform whose TCP is less certain than this is suspect (m)")
-    ] = 3e-4
+    ] = 1e-4
 
 
 GRIPPER_CAUSES = (Cause.FINGER_BENT, Cause.JAW_OPENING)
