@@ -31,10 +31,21 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     largest_sigma_px: Annotated[
         float, Meta(ge=0.01, le=10.0, description="largest standard deviation of a corner that may be used (px)")
     ] = 1.0
-    neighbourhood: Annotated[
-        int,
-        Meta(ge=1, le=20, description="profiles next to the corner, half of which must be seen on each of its edges"),
-    ] = 4
+    neighbourhood_px: Annotated[
+        float,
+        Meta(
+            ge=2.0,
+            le=100.0,
+            description="stretch of each edge next to the corner that must show half as well as the whole edge (px)",
+        ),
+    ] = 16.0
+
+
+SHOWN_BESIDE = 0.5
+"""Share of agreeing profiles next to a corner, over the edge's own, from which the corner counts as seen."""
+
+FEWEST_BESIDE = 4
+"""Profiles next to a corner that are looked at, however far apart they are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +129,9 @@ class CornerGeometry:
                 direction = prediction.line_direction[edge]
                 along = float((corners.xy[i] - prediction.line_origin[edge]) @ direction)
                 x, y = direction.tolist()
-                near = min(settings.neighbourhood, last - first)
+                reach_px = float(np.linalg.norm(prediction.uv_px[last - 1] - prediction.uv_px[first]))
+                near = round(settings.neighbourhood_px / max(reach_px, 1.0) * (last - first - 1))
+                near = min(max(near, FEWEST_BESIDE), last - first)
                 at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
                 beside = (first, first + near) if at_start else (last - near, last)
                 at_corner.append(_Spoke(slots[edge], edge, along, x, y, *beside))
@@ -153,9 +166,10 @@ def intersect_edges(
     lines = _fit_lines(votes, line_weight)
     seen = consensus.edge_seen.tolist()
     agreed = [0, *np.cumsum(consensus.supported).tolist()]
+    share = consensus.edge_share.tolist()
     sides = tuple(_seen_sides(lines, seen, spokes) for spokes in geometry.spokes)
     measured = [
-        fault or _intersect(rests_on, agreed, lens, settings)
+        fault or _intersect(rests_on, agreed, share, lens, settings)
         for fault, rests_on, lens in zip(geometry.fault, sides, geometry.lens, strict=True)
     ]
     faults = tuple(m if isinstance(m, CornerFault) else None for m in measured)
@@ -183,18 +197,22 @@ def _seen_sides(lines: list[_Line | None], seen: list[bool], spokes: tuple[_Spok
 def _intersect(
     sides: list[tuple[_Spoke, _Line]],
     agreed: list[int],
+    share: list[float],
     lens: tuple[float, float, float, float],
     settings: CornerSettings,
 ) -> tuple[float, float, float, float, float, float] | CornerFault:
     """One corner: shift x and y from the prediction (ideal coordinates), sigma (px), variance x, covariance, variance
     y.
 
-    ``agreed`` are running counts of the profiles that agree.  Hidden if fewer than two edges are seen right beside it.
+    ``agreed`` are running counts of the profiles that agree, ``share`` is the part of each edge's that do.  Hidden if
+    fewer than two edges show beside it nearly as well as on the whole.
     """
     beside, rows = 0, []
     ixx = ixy = iyy = bx = by = 0.0
     for spoke, line in sides:
-        beside += 2 * (agreed[spoke.end] - agreed[spoke.begin]) >= spoke.end - spoke.begin
+        beside += agreed[spoke.end] - agreed[spoke.begin] >= SHOWN_BESIDE * share[spoke.edge] * (
+            spoke.end - spoke.begin
+        )
         x, y = line.normal(spoke)
         along = spoke.along
         weight = 1.0 / line.variance(along)

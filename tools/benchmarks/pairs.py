@@ -14,6 +14,7 @@ from benchmarks import rendered
 from gripmon.camera import Camera
 from gripmon.config import builtin_config, load_config
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.corners.prediction import SamplingSettings
 from gripmon.differential import DegenerateGeometry, differential_update
 from gripmon.geometry import from_record, invert, perturb
 from gripmon.gripper import Gripper
@@ -25,6 +26,9 @@ from gripmon.simulator.scenario import Background
 _RENDERED = "rendered series2, true jaw"
 _ITERATIONS = 5
 """Linearisations of an update from the reference, some degrees away: as many as change anything."""
+
+SETTINGS = MeasurementSettings(sampling=SamplingSettings(samples=960))
+"""A pair is no stream of frames: edges are sampled at every pixel, for which 960 profiles suffice."""
 
 CLUTTER = Background(kind="speckle")
 _EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
@@ -163,7 +167,7 @@ class MeasuredPair:
         """Both images are measured from the reference, of the second nothing else is known; None where the gripper
         isn't found in one.
         """
-        meter = FingertipMeter(camera, gripper, MeasurementSettings(), jaw_sigma_m=0.0)
+        meter = FingertipMeter(camera, gripper, SETTINGS, jaw_sigma_m=0.0)
         first, second = (
             meter.measure(shot.image, before.cam_T_grip, shot.jaw_opening_m, _USUAL_SHARE, _EVERYWHERE)
             for shot in (before, after)

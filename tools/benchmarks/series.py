@@ -6,12 +6,13 @@ after it, and the comparison of the tool centre point (TCP) in the camera frame 
 - in place of the paper's off-line calibration (plane coincidence constraint, PCC) stands the true pose of the first
   image; in place of the second such calibration, which the estimate is held against, that of the second image.  The
   printed figures contain the errors of both calibrations, ours don't;
-- the camera's intrinsics are the true ones.
+- the camera's intrinsics and the jaw opening, the same in both images, are the true ones.
 
 As in the paper, the corners that were *measured* in the first image serve as the model: each is projected back onto
 the plane that the reference calibration gives it (equation 8, from its known height in the gripper frame), and the
 update starts from these points, so that what shifts a corner in both images alike cancels.  Weights of equation (17)
-and of the recalibration come from the covariances of both measurements.  A pair in which a variant doesn't find enough
+and of the recalibration come from the covariances of both measurements.  The edges are sampled at every pixel; all
+other settings are the monitor's defaults.  A pair in which a variant doesn't find enough
 corners in both images counts as missed.
 """
 
