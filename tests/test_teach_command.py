@@ -135,7 +135,7 @@ def test_the_picture_shows_every_taught_edge(rig: Path, taught: Path):
     assert 0.9 < grey.mean() < 0.999, "the image is grey, what is drawn isn't"
 
 
-def test_replay_with_the_taught_model_is_right_where_it_was_half_a_millimetre_off(rig: Path, taught: Path):
+def test_replay_with_the_taught_model_is_right_where_it_was_a_fifth_of_a_millimetre_off(rig: Path, taught: Path):
     truth = np.array(json.loads((rig / "truth.json").read_text()))
     rms = {}
     for name in ("untaught", "config"):
@@ -145,8 +145,8 @@ def test_replay_with_the_taught_model_is_right_where_it_was_half_a_millimetre_of
         found = np.array([line["cam_T_grip"]["translation_m"] for line in lines])
         assert all(line["source"] != "held" for line in lines)
         rms[name] = float(np.sqrt(np.square(found - truth).sum(axis=1).mean()))
-    assert rms["untaught"] > 4e-4
-    assert rms["config"] < rms["untaught"] / 8.0
+    assert rms["untaught"] > 1.5e-4
+    assert rms["config"] < rms["untaught"] / 10.0
 
 
 def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest.CaptureFixture[str]):
@@ -191,8 +191,8 @@ def test_a_second_run_needs_force_and_changes_nothing_without(
         ("alone.png", 2, "its jaw opening isn't known (jaw.source is frames); --jaw-opening M, or"),
         ("alone.png --jaw-opening 0.9", 2, "alone.png: jaw opening 0.9 m; the gripper's 0 to 0.06 m"),
         ("alone.png --jaw-opening 0.0605", 2, "jaw opening 0.0605 m; the gripper's 0 to 0.06 m"),
-        ("grey.png --jaw-opening 0.034", 3, "teach: {folder}/grey.png: the gripper isn't found"),
-        ("alone.png --jaw-opening 0.0346", 3, "the jaw shows an opening of 0.03"),
+        ("grey.png --jaw-opening 0.034", 3, "teach: the gripper isn't found: only 0 % of the outlines"),
+        ("alone.png --jaw-opening 0.0349", 3, "the jaw shows an opening of 0.03"),
         ("alone.png --jaw-opening 0.034 --out first", 2, "--out {folder}/first: is a folder; a file"),
         ("alone.png --jaw-opening 0.034 --picture x.tiff", 2, "has no known ending"),
     ],

@@ -22,6 +22,9 @@ SHAPE_M = 5e-4
 INSET_SIGMA_M = 0.5 * SHAPE_M
 """Of what bevels shift all outlines by alike, to the finger's side (standard deviation)."""
 
+PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
+"""By so much bevels differ from edge to edge (standard deviation)."""
+
 SINGLE_SIGMA_PX = 0.03
 """By so much the background and the pixel grid move a whole edge in one image (standard deviation)."""
 
@@ -33,6 +36,7 @@ BACKGROUND_SHARE = 0.3
 outline by depends on the background's shade (bevels of the simulator before grey levels of 60 to 230)."""
 
 _SMALLEST_DEPTH_M = 1e-6
+_NOTHING_M = 1.0  # standard deviation of an offset that isn't seen: what all edges together say of it remains
 
 _SHRINKAGE = 2  # the usual scatter of all edges counts as so many images more of each edge
 
@@ -41,18 +45,20 @@ _SHRINKAGE = 2  # the usual scatter of all edges counts as so many images more o
 class EdgeLines:
     """One edge in all images: the ``line`` through all of them, ``ends_px`` (s, 2) those in the images that show it,
     numbers ``images`` (s,), and ``within_px2`` (2,) the ends' mean variance by the scatter of the points.
+
+    Without a line (``line`` None, no images) it is an outline in view that too little is seen of.
     """
 
     sampled: Sampled
-    line: Line
+    line: Line | None
     images: tuple[int, ...]
     ends_px: Array
     within_px2: Array
 
     @property
     def mean_px(self) -> Array:
-        """(2,) over the images."""
-        return np.asarray(self.ends_px.mean(axis=0))
+        """(2,) over the images; zero without any."""
+        return np.asarray(self.ends_px.mean(axis=0)) if self.images else np.zeros(2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,19 +106,21 @@ class _Measured:
     @property
     def means_m(self) -> Array:
         """(e, 2) over the images."""
-        return np.array([ends_m.mean(axis=0) for ends_m in self.ends_m])
+        return np.array([ends_m.mean(axis=0) if len(ends_m) else np.zeros(2) for ends_m in self.ends_m])
 
 
 def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance: Array) -> Pooled:
     """What reference and opening are off by (``common``, the first 7) to the outlines, from a prior (7, 7) about zero.
 
-    Bevels of all outlines alike and each outline's own offset are allowed for; creases have more of their own.
+    Bevels of all outlines alike and each outline's own offset are allowed for, :data:`PLAUSIBLE_OWN_M` at least, since
+    what happens to look like a motion doesn't show as their own; creases have more of it.
     """
     measured = _Measured.of(viewer, lines, None)
-    which = np.flatnonzero(measured.outline)
+    seen = np.array([len(ends_m) > 0 for ends_m in measured.ends_m])
+    which = np.flatnonzero(measured.outline & seen)
     return pool(
         measured.means_m[which],
-        measured.noise_m2[which][:, :, None] * np.eye(2),
+        (measured.noise_m2[which][:, :, None] + PLAUSIBLE_OWN_M**2) * np.eye(2),
         measured.rows[which],
         np.zeros(len(which), dtype=np.intp),
         block_diag(prior_covariance, INSET_SIGMA_M**2),
@@ -122,7 +130,8 @@ def motion_off(viewer: Viewer, lines: Mapping[int, EdgeLines], prior_covariance:
 def estimate_edges(
     viewer: Viewer, lines: Mapping[int, EdgeLines], before: Mapping[str, TaughtEdge] | None
 ) -> dict[str, TaughtEdge]:
-    """Means over the images, their noise from the scatter between them, pooled over all edges.
+    """Means over the images, their noise from the scatter between them, pooled over all edges; an outline that too
+    little is seen of is expected where the others put it, with what edges have of their own as its deviation.
 
     ``before``: the edges as known so far, whose depths carry the lines of images with other jaw openings over.
     """
@@ -141,8 +150,8 @@ def estimate_edges(
             depth_m=round(float(depth_m[i]), 9),
             depth_sigma_m=round(float(depth_sigma_m[i]), 9),
             crease=not measured.outline[i],
-            rms_px=round(edge.line.rms_px, 4),
-            seen=round(edge.line.seen, 4),
+            rms_px=round(edge.line.rms_px, 4) if edge.line else 0.0,
+            seen=round(edge.line.seen, 4) if edge.line else 0.0,
         )
         for i, (index, edge) in enumerate(zip(measured.indices, measured.edges, strict=True))
     }
@@ -162,7 +171,7 @@ def _changing_m(measured: _Measured, shape_m: Array) -> Array:
         if len(ends_m) > 1:
             beyond_m2 = ends_m.var(axis=0, ddof=1) - edge.within_px2 / edge.sampled.per_m**2
             out[i] = np.sqrt(np.maximum(beyond_m2, 0.0))
-        elif measured.outline[i]:
+        elif len(ends_m) and measured.outline[i]:
             out[i] = BACKGROUND_SHARE * np.abs(shape_m[i])
     return out
 
@@ -177,6 +186,9 @@ def _noise_m2(ends_m: Sequence[Array], within_px2: Array, per_m: Array) -> Array
     usual_px2 = np.median(between_px2, axis=0) if between_px2 else np.full(2, SINGLE_SIGMA_PX**2)
     noise = []
     for scale, ends, within in zip(per_m, ends_m, within_px2, strict=True):
+        if not len(ends):
+            noise.append(np.full(2, _NOTHING_M**2))
+            continue
         own_px2 = np.square(scale * (ends - ends.mean(axis=0))).sum(axis=0)
         scatter_px2 = (own_px2 + _SHRINKAGE * usual_px2) / (len(ends) - 1 + _SHRINKAGE)
         noise.append((np.maximum(scatter_px2, within) / len(ends) + GRID_SIGMA_PX**2) / scale**2)
@@ -198,6 +210,8 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
     information = 1.0 / (np.square(unsure_m) + np.square(offset_m) + _SMALLEST_DEPTH_M**2)
     moment = information * wished_m
     for i, (angle, ends_m) in enumerate(zip(measured.turned, measured.ends_m, strict=True)):
+        if not len(ends_m):
+            continue
         away, seen_m = angle - angle.mean(), ends_m.mean(axis=1) + angle * measured.depth_m[i]
         per_image_m2 = len(angle) * measured.noise_m2[i].mean()
         information[i] += np.square(away).sum() / per_image_m2

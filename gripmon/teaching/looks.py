@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners.prediction import STEP_PX
-from gripmon.corners.profiles import full_scale, read_profiles
+from gripmon.corners.profiles import full_scale
 from gripmon.corners.taught import Look
 from gripmon.records import Array
 from gripmon.teaching.estimate import EdgeLines
@@ -52,8 +52,7 @@ def edge_looks(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLi
 
     Levels count relative to the median over all edges of an image, which takes exposure out.
     """
-    profiles = [_profiles(view) for view in views]
-    sides = {index: _sides(views, profiles, edge) for index, edge in lines.items()}
+    sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
     gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
     scale = full_scale(views[0].image.image)
     looks = {}
@@ -67,17 +66,13 @@ def edge_looks(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLi
     return looks
 
 
-def _profiles(view: View) -> NDArray[np.float32]:
-    prediction = view.measurement.prediction
-    return read_profiles(view.image.image, prediction.map_x, prediction.map_y)
-
-
-def _sides(views: Sequence[View], profiles: Sequence[NDArray[np.float32]], edge: EdgeLines) -> _Sides:
+def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:
+    assert edge.line is not None
     points, inlier = edge.sampled.points, edge.line.inlier
     parts = []
-    for number, (view, grey) in enumerate(zip(views, profiles, strict=True)):
+    for number, view in enumerate(views):
         candidate = points.candidate[inlier & (points.image == number)]
-        found = view.measurement.candidates
+        found, grey = view.candidates, view.profiles
         sample, step = found.sample[candidate], found.step[candidate]
         # Samples lie farther apart where the image is measured on a coarser scale, and edges are wider there.
         middle = grey.shape[1] // 2 + found.offset_px[candidate] / (STEP_PX * found.zoom)

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.camera import Camera
-from gripmon.corners import Measurement, MeasurementSettings
+from gripmon.corners import MeasurementSettings
 from gripmon.corners.taught import TaughtCorner, TaughtEdge, TaughtEdges
 from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
@@ -28,7 +27,7 @@ from gripmon.teaching.checks import check_edges, check_enough, check_reference, 
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, estimate_edges
 from gripmon.teaching.lines import find_line, of_image, settle_line
 from gripmon.teaching.looks import edge_looks
-from gripmon.teaching.views import TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teaching.views import Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
 
 SEEN_SHARE = 0.6
 """Part of an edge's profiles that must show its line, in at least half of the images."""
@@ -42,8 +41,7 @@ if that measurement is as uncertain."""
 class Taught:
     """What was learnt.  ``untaught``: for each other edge in view why not; ``notes``: what a person should know.
 
-    ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most;
-    ``found``: the sharp model fitted to the first image.
+    ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most.
     """
 
     edges: dict[str, TaughtEdge]
@@ -51,7 +49,6 @@ class Taught:
     untaught: dict[str, str]
     notes: tuple[str, ...]
     closure_px: float
-    found: Measurement
 
 
 def teach(
@@ -69,23 +66,33 @@ def teach(
     """
     assert images, "nothing to teach from"
     viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, images)
-    crease = viewer.crease
-    found = [viewer.found(image) for image in images]
+    found = [viewer.fitted(image) for image in images]
     views = [viewer.view(image, fit) for image, fit in zip(images, found, strict=True)]
-    check_standing(views, len(gripper.edge_ids))
-    lines, untaught = _lines(views, gripper, search=True)
-    check_enough(views, crease, lines)
+    try:
+        return _teach(viewer, views)
+    except TeachingRefused:
+        for image, fit in zip(images, found, strict=True):
+            if fit is None:
+                viewer.check_elsewhere(image)
+        raise
+
+
+def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
+    gripper, images = viewer.gripper, [view.image for view in views]
+    lines, untaught = _lines(viewer, views, search=True)
+    check_standing(views, list(lines))
+    check_enough(views, viewer.crease, lines)
     doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
-    notes = _notes(lines, gripper, crease, len(images), doubt)
+    notes = _notes(viewer, lines, len(images), doubt)
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
     # Once more from where the edges really are: the profiles then lie even to both sides of them.
-    views = [viewer.view_taught(image, arrays) for image in images]
-    lines, lost = _lines(views, gripper, search=False)
-    looks = {gripper.edge_ids[index]: look for index, look in edge_looks(viewer, views, lines).items()}
+    views = [viewer.view_taught(view.image, arrays, view.candidates.zoom) for view in views]
+    lines, lost = _lines(viewer, views, search=False)
+    looks = {gripper.edge_ids[index]: look._asdict() for index, look in edge_looks(viewer, views, lines).items()}
     edges = estimate_edges(viewer, lines, edges)
-    edges = {name: msgspec.structs.replace(edge, **looks[name]._asdict()) for name, edge in edges.items()}
+    edges = {name: msgspec.structs.replace(edge, **looks.get(name, {})) for name, edge in edges.items()}
     arrays = viewer.arrays(edges)
     return Taught(
         edges,
@@ -93,37 +100,36 @@ def teach(
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
-        found[0],
     )
 
 
-def _lines(views: Sequence[View], gripper: Gripper, search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:
-    """Lines of all edges that some image samples, and why others have none."""
+def _lines(viewer: Viewer, views: Sequence[View], search: bool) -> tuple[dict[int, EdgeLines], dict[str, str]]:
+    """Lines of all edges that some image samples, and why creases have none: outlines then come without a line."""
     lines, untaught = {}, {}
-    for edge in sorted({e for view in views for e in view.measurement.prediction.layout.edges.tolist()}):
-        found = _lines_of(views, edge, search)
-        if isinstance(found, str):
-            untaught[gripper.edge_ids[edge]] = found
-        else:
+    for edge in sorted({e for view in views for e in view.prediction.layout.edges.tolist()}):
+        seen = sampled(views, edge)
+        found = "out of view" if seen is None else _lines_of(seen, len(views), search)
+        if isinstance(found, EdgeLines):
             lines[edge] = found
+        elif seen is None or viewer.crease[edge]:
+            untaught[viewer.gripper.edge_ids[edge]] = found
+        else:
+            lines[edge] = EdgeLines(seen, None, (), np.zeros((0, 2)), np.zeros(2))
     return lines, untaught
 
 
-def _lines_of(views: Sequence[View], edge: int, search: bool) -> EdgeLines | str:
+def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
     """An edge's line in all images together and in each, or why there is none."""
-    seen = sampled(views, edge)
-    if seen is None:
-        return "out of view"
     points, expected_px = seen.points, seen.expected_px
     line = find_line(points, expected_px, SHAPE_M * seen.per_m) if search else settle_line(points, expected_px)
     if line is None:
         return "no line is seen"
     shown = {}
-    for number in range(len(views)):
+    for number in range(images):
         own = settle_line(of_image(points, number), line.ends_px)
         if own is not None and own.seen >= SEEN_SHARE:
             shown[number] = own
-    if 2 * len(shown) < len(views):
+    if 2 * len(shown) < images:
         return f"its line shows along {100.0 * line.seen:.0f} % of it"
     ends_px = np.array([own.ends_px for own in shown.values()])
     within_px2 = np.mean([own.covariance_px2.diagonal() for own in shown.values()], axis=0)
@@ -182,13 +188,12 @@ def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[
 _LARGEST_CONDITION = 100.0  # edges that meet at less than some 10° make no corner
 
 
-def _notes(
-    lines: Mapping[int, EdgeLines], gripper: Gripper, crease: NDArray[np.bool_], images: int, doubt: str | None
-) -> tuple[str, ...]:
+def _notes(viewer: Viewer, lines: Mapping[int, EdgeLines], images: int, doubt: str | None) -> tuple[str, ...]:
     """What can be doubted about what was taught."""
     notes = [] if doubt is None else [doubt]
-    rivals = {i: e.line.rival_px for i, e in lines.items() if e.line.rival_px is not None and not crease[i]}
+    found = {index: edge.line for index, edge in lines.items() if edge.line is not None and not viewer.crease[index]}
+    rivals = {index: line.rival_px for index, line in found.items() if line.rival_px is not None}
     if rivals and images == 1:
-        named = ", ".join(f"{gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())
+        named = ", ".join(f"{viewer.gripper.edge_ids[i]} ({px:+.1f} px)" for i, px in rivals.items())
         notes.append(f"another line runs beside {named}: teach from several images with different backgrounds")
     return tuple(notes)

@@ -9,20 +9,30 @@ from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.corners.prediction import EdgeLayout, Prediction, predict
-from gripmon.corners.profiles import profile_offsets_px
+from gripmon.corners.prediction import EdgeLayout, Prediction, lay_out, predict
+from gripmon.corners.profiles import (
+    Candidates,
+    estimate_noise,
+    find_candidates,
+    full_scale,
+    profile_offsets_px,
+    quantum,
+    read_profiles,
+)
 from gripmon.corners.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Image, ReferenceRecord
 from gripmon.teaching.lines import EdgePoints
 
-USUAL_SHARE = 0.9
-"""Share of agreeing profiles that is expected before anything is known about this gripper."""
+USUAL_SHARE = 0.6
+"""Share of agreeing profiles that is expected: before clutter, or with bevels, fewer agree than in quiet images."""
 
+_CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is looked for elsewhere
 _DENSE = 4096  # profiles: as many as there are pixels along the edges
 _EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 _NARROW = Patience(when_doubtful=False, when_lost=False)
@@ -43,15 +53,18 @@ class TeachingImage:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image, measured along all edges in view, with their predictions at the reference.
+    """One image, looked at along all edges in view, with their predictions at the reference.
 
-    ``measurement`` lies near where the gripper shows; ``at_reference`` predicts the same samples at the reference and
-    the reported opening; ``offset_m`` (k,) how far each candidate lies from there across the line of sight,
-    ``expected_m`` (n,) how far the model that was looked from, ``per_m`` (n,) how many px a metre is.
+    ``prediction`` from where it was looked, with its ``profiles`` (n, s) in grey levels and edge ``candidates``;
+    ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m`` (k,) how far each
+    candidate lies from there across the line of sight, ``expected_m`` (n,) how far the samples do, ``per_m`` (n,) how
+    many px a metre is.
     """
 
     image: TeachingImage
-    measurement: Measurement
+    prediction: Prediction
+    profiles: NDArray[np.float32]
+    candidates: Candidates
     at_reference: Prediction
     offset_m: Array
     expected_m: Array
@@ -78,9 +91,7 @@ class Viewer:
         self.camera, self.gripper, self._settings, self._jaw_sigma_m = camera, gripper, settings, jaw_sigma_m
         self.ref_cam_T_grip = from_record(reference.cam_T_grip)
         self.reference_covariance = np.reshape(reference.covariance, (6, 6))
-        dense = msgspec.structs.replace(settings.sampling, samples=_DENSE, creases=True)
-        self._dense = msgspec.structs.replace(settings, sampling=dense)
-        self._offsets_px = profile_offsets_px(settings.sampling.reach_px)
+        self._dense = msgspec.structs.replace(settings.sampling, samples=_DENSE, creases=True)
         self.jaw_opening_m = float(np.mean([image.jaw_opening_m for image in images]))
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
         edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
@@ -108,58 +119,86 @@ class Viewer:
         right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
         return np.sign(np.einsum("ei,ei->e", right, inside - eye))
 
-    def found(self, image: TeachingImage) -> Measurement:
-        """The sharp model fitted to the image.  Raises :class:`TeachingRefused` where the gripper isn't found within
-        the profiles' reach of the reference.
+    def fitted(self, image: TeachingImage) -> Measurement | None:
+        """The sharp model fitted to the image from the reference; None where it doesn't fit, as with wide bevels."""
+        meter = self._meter(None)
+        found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, USUAL_SHARE, _NARROW)
+        near = meter.moved_px(found, self.ref_cam_T_grip) <= self._settings.sampling.reach_px
+        return found if found.trusted and near else None
+
+    def check_elsewhere(self, image: TeachingImage) -> None:
+        """Raise :class:`TeachingRefused` if the gripper clearly stands farther from the reference than the profiles
+        reach.
         """
-        meter = FingertipMeter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
-        found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, USUAL_SHARE, _EVERYWHERE)
-        if not found.trusted:
-            raise TeachingRefused(
-                f"{image.name}: the gripper isn't found: {100.0 * found.consensus.share:.0f} % of its outlines agree; "
-                "an image with the whole gripper in view, at the reference and at its jaw opening"
-            )
+        meter = self._meter(None)
+        found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, _CLEAR_SHARE, _EVERYWHERE)
         away_px = meter.moved_px(found, self.ref_cam_T_grip)
-        if away_px > self._settings.sampling.reach_px:
+        if found.trusted and away_px > self._settings.sampling.reach_px:
             motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
             raise TeachingRefused(
                 f"{image.name}: the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
                 f"{self._settings.sampling.reach_px:g} px: {self.advice(motion)}"
             )
-        return found
 
-    def view(self, image: TeachingImage, found: Measurement) -> View:
-        """All edges in view, as densely as pixels lie, from where the sharp model was found."""
-        return self._view(image, found.cam_T_grip, found.jaw_opening_m, None)
+    def view(self, image: TeachingImage, found: Measurement | None) -> View:
+        """All edges in view, as densely as pixels lie, from where the sharp model was found, or else from the
+        reference.
+        """
+        if found is None:
+            return self._view(image, self.ref_cam_T_grip, image.jaw_opening_m, None, 1)
+        return self._view(image, found.cam_T_grip, found.jaw_opening_m, None, found.candidates.zoom)
 
-    def view_taught(self, image: TeachingImage, taught: TaughtEdges) -> View:
+    def view_taught(self, image: TeachingImage, taught: TaughtEdges, zoom: int) -> View:
         """The edges that were taught, from the reference."""
-        return self._view(image, self.ref_cam_T_grip, image.jaw_opening_m, taught)
+        return self._view(image, self.ref_cam_T_grip, image.jaw_opening_m, taught, zoom)
 
-    def _view(self, image: TeachingImage, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None) -> View:
-        meter = FingertipMeter(self.camera, self.gripper, self._dense, self._jaw_sigma_m, taught)
-        measurement = meter.measure(image.image, cam_T_grip, jaw_opening_m, USUAL_SHARE, _NARROW)
-        there, candidates = measurement.prediction, measurement.candidates
-        here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None)
-        expected = self._predict(there.layout, cam_T_grip, jaw_opening_m, taught)
+    def _view(
+        self,
+        image: TeachingImage,
+        cam_T_grip: Array,
+        jaw_opening_m: float,
+        taught: TaughtEdges | None,
+        zoom: int,
+    ) -> View:
+        sampling, grey = self._dense, image.image
+        margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
+        sampling = msgspec.structs.replace(sampling, **margins)
+        layout = lay_out(self.camera, self.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
+        there = self._predict(layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        profiles = read_profiles(grey, there.map_x, there.map_y)
+        noise = estimate_noise(profiles, quantum(grey))
+        candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), self._settings.edges, zoom)
         per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
         # Edges are straight: that a sample moves along its edge, too, doesn't matter.
+        expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)
         sample = candidates.sample
-        uv_px = there.uv_px[sample] + candidates.offset_px[:, None] * there.normal[sample]
-        offset_px = np.einsum("ki,ki->k", uv_px - here.uv_px[sample], here.normal[sample])
-        expected_px = np.einsum("ni,ni->n", expected.uv_px - here.uv_px, here.normal)
-        return View(image, measurement, here, offset_px / per_m[sample], expected_px / per_m, per_m)
+        across = np.einsum("ni,ni->n", there.normal, here.normal)
+        offset_px = expected_px[sample] + candidates.offset_px * across[sample]
+        return View(
+            image,
+            there,
+            profiles,
+            candidates,
+            here,
+            offset_px / per_m[sample],
+            expected_px / per_m,
+            per_m,
+        )
 
     def _predict(
-        self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None
+        self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
     ) -> Prediction:
-        offsets_px = self._offsets_px
+        offsets_px = zoom * profile_offsets_px(self._settings.sampling.reach_px)
         return predict(self.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
+
+    def _meter(self, taught: TaughtEdges | None) -> FingertipMeter:
+        return FingertipMeter(self.camera, self.gripper, self._settings, self._jaw_sigma_m, taught)
 
     def measured(self, image: TeachingImage, taught: TaughtEdges) -> Measurement:
         """The image measured as in use, from the reference."""
-        meter = FingertipMeter(self.camera, self.gripper, self._settings, self._jaw_sigma_m, taught)
-        return meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, USUAL_SHARE, _NARROW)
+        here = self.ref_cam_T_grip
+        return self._meter(taught).measure(image.image, here, image.jaw_opening_m, USUAL_SHARE, _NARROW)
 
     def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
         """How far an edge may show from the reference: a bevel's offset and so many standard deviations of the
@@ -186,14 +225,18 @@ class Viewer:
         x, y, z = (1e3 * motion[:3]).tolist()
         return f"by ({x:.3f}, {y:.3f}, {z:.3f}) mm and {np.degrees(np.linalg.norm(motion[3:6])):.3f}°"
 
-    def advice(self, motion: Array) -> str:
-        """What to do about a reference that is off by a motion (6 or 7,)."""
+    def pose(self, motion: Array) -> str:
+        """The reference after a motion (6 or 7,), as it stands in a configuration."""
         there = to_record(perturb(self.ref_cam_T_grip, motion[:6]))
         translation_m = [round(v, 7) for v in there.translation_m]
         rotation_xyzw = [round(v, 8) for v in there.rotation_xyzw]
+        return f"reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
+
+    def advice(self, motion: Array) -> str:
+        """What to do about a reference that is off by a motion (6 or 7,)."""
         return (
             "images at the reference; or correct gripper file or jaw opening; or calibrate again, or take the measured "
-            f"pose as reference.cam_T_grip: {{translation_m: {translation_m}, rotation_xyzw: {rotation_xyzw}}}"
+            f"pose as {self.pose(motion)}"
         )
 
 
@@ -211,18 +254,19 @@ class Sampled(NamedTuple):
 
 def sampled(views: Sequence[View], edge: int) -> Sampled | None:
     """Everything seen of one edge; None if no image samples it."""
-    spans, scales, expected, rows = [], [], [], []
+    spans, scales, expected, rows, profiles = [], [], [], [], []
     parts: list[tuple[Any, ...]] = []
     before = 0
     for number, view in enumerate(views):
-        prediction, candidates = view.measurement.prediction, view.measurement.candidates
-        layout = prediction.layout
-        mine = np.flatnonzero((layout.edge == edge) & prediction.ok)
+        layout, candidates = view.prediction.layout, view.candidates
+        mine = np.flatnonzero((layout.edge == edge) & view.prediction.ok)
+        profiles.append(len(mine))
         if len(mine) > 1:
-            spans.append(layout.fraction[mine[[0, -1]]])
+            ends = mine[[0, -1]]
+            spans.append(layout.fraction[ends])
             scales.append(view.per_m[mine].mean())
-            expected.append(view.expected_m[mine[[0, -1]]])
-            rows.append(view.at_reference.jacobian[mine[[0, -1]]] / view.per_m[mine[[0, -1]], None])
+            expected.append(view.expected_m[ends])
+            rows.append(view.at_reference.jacobian[ends] / view.per_m[ends, None])
         own = np.flatnonzero(layout.edge[candidates.sample] == edge)
         sample = candidates.sample[own]
         image = np.full(len(own), number)
@@ -233,8 +277,6 @@ def sampled(views: Sequence[View], edge: int) -> Sampled | None:
     low, high = np.median(spans, axis=0).tolist()
     per_m = float(np.mean(scales))
     fraction, offset_m, step, profile, image, own = (np.concatenate(part) for part in zip(*parts, strict=True))
-    profiles = np.array(
-        [np.count_nonzero(v.measurement.prediction.ok & (v.measurement.prediction.layout.edge == edge)) for v in views]
-    )
-    points = EdgePoints((fraction - low) / (high - low), per_m * offset_m, step, profile, image, own, profiles)
+    way = (fraction - low) / (high - low)
+    points = EdgePoints(way, per_m * offset_m, step, profile, image, own, np.array(profiles))
     return Sampled(points, (low, high), per_m, per_m * np.mean(expected, axis=0), np.mean(rows, axis=0))
