@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from gripmon.geometry import exp_rotation, log_rotation, skew
+from gripmon.gripper import on_a_line
 from gripmon.records import Array
 
 SMALLEST_EIGENVALUE = 1e-12
@@ -55,10 +56,13 @@ def differential_update(
     ``points_cam_m`` (n, 3): corners predicted by the present transform; ``measured_xy`` (n, 2): where they were
     measured, ideal coordinates; ``covariance_xy`` of each (n, 2, 2), or of all together (2n, 2n), since corners on one
     edge err together; ``tcp_cam_m`` (3,): the transform's translation.  Raises :class:`DegenerateGeometry` for fewer
-    than three corners or a singular system.
+    than three corners, for corners that lie nearly on a line (about which any turn would fit, were it ever so large)
+    or a singular system.
     """
     if len(points_cam_m) < 3:
         raise DegenerateGeometry(f"{len(points_cam_m)} corners; the update needs at least 3")
+    if on_a_line(points_cam_m):
+        raise DegenerateGeometry("the corners lie on a line, or nearly so")
     rotation, tcp = np.eye(3), tcp_cam_m.copy()
     weight_xy = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
     for _ in range(iterations):

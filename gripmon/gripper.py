@@ -205,7 +205,7 @@ class Gripper:
         order = outwards[np.argsort(turn, kind="stable")]
         taken = order[:count]
         for instead in order[count:]:
-            if not _on_a_line(self._nominal_points_m[self.corner_points[taken]]):
+            if not on_a_line(self._nominal_points_m[self.corner_points[taken]]):
                 break
             taken = np.append(order[: count - 1], instead)
         chosen = np.zeros(len(self.corner_points), dtype=bool)
@@ -336,7 +336,7 @@ class Gripper:
             raise GripperError(
                 f"points: {len(corners)} marked `corner: true`; at least 3 corners that are not on a line"
             )
-        if _on_a_line(corners):
+        if on_a_line(corners):
             raise GripperError("points: all corners lie on a line; at least 3 corners that are not on a line")
         if len(self.edge_ids) < 3:
             raise GripperError(f"edges: {len(self.edge_ids)}; at least 3 edges, two at each corner")
@@ -356,10 +356,10 @@ def _normal(loop: Array) -> Array:
     return np.cross(loop, following).sum(axis=0)
 
 
-def _on_a_line(points_m: Array) -> bool:
-    """Whether points (n, 3) lie on a line, or nearly so."""
+def on_a_line(points_m: Array) -> bool:
+    """Whether points (n, 3) lie on a line, or nearly so: two per cent of their extent beside it."""
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
-    return bool(spread[1] < SMALLEST_SPREAD_RATIO * spread[0])
+    return bool(spread[1] <= SMALLEST_SPREAD_RATIO * spread[0])
 
 
 def _interpolate(table: Array, opening_m: float) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from gripmon.geometry import make_transform, perturb, perturbation_between, skew
+from gripmon.gripper import on_a_line
 from gripmon.records import Array
 
 FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
@@ -77,8 +78,7 @@ def refusal(points_grip_m: Array) -> str | None:
         return f"{count} corners; at least {FEWEST_COPLANAR} coplanar ones or {FEWEST_GENERAL} are needed"
     if count < FEWEST_GENERAL and not coplanar(points_grip_m):
         return f"{count} corners; at least {FEWEST_GENERAL} are needed"
-    spread = np.linalg.svd(points_grip_m - points_grip_m.mean(axis=0), compute_uv=False)
-    return "the corners lie on a line" if spread[1] <= COPLANAR_RATIO * spread[0] else None
+    return "the corners lie on a line" if on_a_line(points_grip_m) else None
 
 
 def _closed_forms(points_grip_m: Array, measured_xy: Array, flat: bool) -> list[Array]:

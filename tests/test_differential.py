@@ -198,8 +198,9 @@ CLOSE = corners_cam_m()
         LINE,
         LINE * [0.0, 0.0, 1.0] + [0.0, 0.01, 0.0],
         LINE * [1.0, 0.0, 0.0] + [0.0, 0.0, 0.1],
+        LINE + np.random.default_rng(6).normal(scale=2e-5, size=(5, 3)),
     ],
-    ids=["none", "two", "one thrice", "two twice", "line of 3", "line of 5", "line along z", "line along x"],
+    ids=["none", "two", "one thrice", "two twice", "line of 3", "line of 5", "line along z", "line along x", "nearly"],
 )
 def test_corners_that_do_not_determine_the_motion_are_refused(points: np.ndarray):
     with pytest.raises(DegenerateGeometry):
