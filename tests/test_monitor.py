@@ -200,7 +200,7 @@ def test_a_start_from_a_wrong_calibration_ends_at_the_right_one():
         "creep",
         "bump",
         "hand",
-        pytest.param("lighting", marks=pytest.mark.xfail(reason="over-exposure and shadows move edges")),
+        "lighting",
         "bent_finger",
     ],
 )

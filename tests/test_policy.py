@@ -210,7 +210,7 @@ def test_a_slow_creep_past_the_limit_recalibrates_only_when_it_stops():
 
 def test_an_uncertain_transform_is_suspect():
     run = settled()
-    wide = np.array([4e-6, 4e-6, 3.1e-4, 3e-4, 3e-4, 1e-4])
+    wide = np.array([4e-6, 4e-6, 1.05e-4, 3e-4, 3e-4, 1e-4])
     assert run.feed(seen(sigma=wide)).verdict is SUSPECT
     assert run.feed(seen(sigma=wide * 0.9)).verdict is VALID
 

@@ -284,4 +284,5 @@ def test_a_box_that_comes_back_is_found_again(covered: Path, lines: Lines):
     assert all(line["source"] == "held" for line in again[60:68])
     assert all(line["verdict"] == "valid" for line in again[100:])
     away_m = [np.linalg.norm(transform(a)[:3, 3] - transform(b)[:3, 3]) for a, b in zip(again, lines, strict=False)]
-    assert max(away_m[100:]) < 1e-3
+    # Along the axis, where a frame claims 1 to 2 mm at more than half a metre.
+    assert max(away_m[100:]) < 2e-3
