@@ -212,9 +212,9 @@ class FingertipMeter:
         jaw_opening_m = min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
         expected = _Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
-        if self._gripper.has_jaw and not jaw_reported:
-            best = max(best, self._from_openings(image, expected), key=_agreement)
         satisfied = SATISFIED * usual_share
+        if self._gripper.has_jaw and not jaw_reported:
+            best = self._from_openings(image, expected, satisfied, best)
         if best.consensus.share < satisfied:
             best = self._at_other_zooms(image, expected, best)
         if best.consensus.share >= self._settings.consensus.trusted_share:
@@ -279,9 +279,9 @@ class FingertipMeter:
         if measurement.effort is Effort.NARROW:
             return measurement.consensus.share >= max(consensus.trusted_share, TRUSTED * usual_share)
         # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
-        seen = measurement.consensus.edge_seen[measurement.prediction.layout.edges]
-        enough = np.count_nonzero(seen) >= FOUND_EDGES * len(seen)
-        return bool(enough) and measurement.consensus.share >= max(consensus.found_share, TRUSTED * usual_share)
+        return _shows_nearly_all(measurement) and measurement.consensus.share >= max(
+            consensus.found_share, TRUSTED * usual_share
+        )
 
     def _settle(self, image: Image, expected: _Expected) -> Measurement:
         """Fit from the expected pose; linearise again where the result lies too far from the prediction, twice at
@@ -322,26 +322,33 @@ class FingertipMeter:
             Effort.NARROW,
         )
 
-    def _from_openings(self, image: Image, expected: _Expected) -> Measurement:
-        """Starts at other openings, for a jaw that moves and doesn't report it: as far as two profiles reach."""
-        settings, gripper = self._settings.consensus, self._gripper
+    def _from_openings(self, image: Image, expected: _Expected, satisfied: float, best: Measurement) -> Measurement:
+        """Starts at other openings, for a jaw that moves and doesn't report it: nearby first, then in its whole range
+        until nearly all edges are seen.
+        """
         prediction, _ = self._predicted(expected)
         rate = float(np.abs(prediction.jacobian[:, 6]).max(initial=0.0))  # px/m
         if rate == 0.0:
-            return self._settle(image, expected)
-        reach_m = self._reach_px / rate
-        ticks_m = np.arange(-self._reach_px, self._reach_px, 1.0) / rate
-        best = self._settle(image, expected)
-        for beside_m in (-1.5 * reach_m, 0.0, 1.5 * reach_m):
-            opening_m = min(max(expected.jaw_opening_m + beside_m, gripper.jaw_min_m), gripper.jaw_max_m)
+            return best
+        gripper, step_m = self._gripper, 0.8 * self._reach_px / rate
+        starts = np.zeros((7, 7))
+        starts[:, 6] = np.linspace(-0.5, 0.5, len(starts)) * step_m
+        openings_m = expected.jaw_opening_m + step_m * np.arange(
+            math.floor((gripper.jaw_min_m - expected.jaw_opening_m) / step_m),
+            math.ceil((gripper.jaw_max_m - expected.jaw_opening_m) / step_m) + 1,
+        )
+        openings_m = np.clip(openings_m, gripper.jaw_min_m, gripper.jaw_max_m)
+        for opening_m in sorted(openings_m.tolist(), key=lambda o: abs(o - expected.jaw_opening_m)):
+            far = abs(opening_m - expected.jaw_opening_m) > 2.1 * step_m
+            if far and best.consensus.share >= satisfied and _shows_nearly_all(best):
+                break
             there = replace(expected, jaw_opening_m=opening_m)
             seen = self._predict(prediction.layout, there)
-            starts = np.zeros((len(ticks_m), 7))
-            starts[:, 6] = ticks_m
-            prior = self._prior_about(seen, there)
-            fit = agree_from_grid(self._look(image, seen), prior, starts, settings, refine=2)
-            if fit.share > best.consensus.share:
-                best = max(best, self._settle(image, self._moved(seen, fit.xi, there)), key=_agreement)
+            votes, prior = self._look(image, seen), self._prior_about(seen, there)
+            fit = agree_from_grid(votes, prior, starts, self._settings.consensus, refine=len(starts))
+            if _completeness(fit, seen) > _completeness(best.consensus, best.prediction):
+                other = self._settle(image, self._moved(seen, fit.xi, there))
+                best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
         return best
 
     def _from_grid(self, image: Image, expected: _Expected) -> Measurement:
@@ -463,6 +470,21 @@ class FingertipMeter:
 
 def _agreement(measurement: Measurement) -> float:
     return measurement.consensus.share
+
+
+def _shows_nearly_all(measurement: Measurement) -> bool:
+    return _seen_part(measurement.consensus, measurement.prediction) >= FOUND_EDGES
+
+
+def _seen_part(consensus: Consensus, prediction: Prediction) -> float:
+    """Part of the sampled edges that are seen."""
+    edges = prediction.layout.edges
+    return np.count_nonzero(consensus.edge_seen[edges]) / max(len(edges), 1)
+
+
+def _completeness(consensus: Consensus, prediction: Prediction) -> float:
+    """At a wrong opening one finger can agree alone: what agrees counts by how many edges it is spread over."""
+    return consensus.share * _seen_part(consensus, prediction)
 
 
 def _median(values: Array) -> float:
