@@ -1,6 +1,7 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
-from gripmon.corners.measure import Effort, FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.corners.measure import FingertipMeter, Patience
+from gripmon.corners.settling import Effort, Measurement, MeasurementSettings
 from gripmon.corners.taught import TaughtEdges, TaughtModel
 from gripmon.corners.views import agreeing_fingers, finger_shares, trace_of
 

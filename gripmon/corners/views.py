@@ -6,7 +6,7 @@ import numpy as np
 
 from gripmon.camera import Camera
 from gripmon.corners.consensus import GATE_PX
-from gripmon.corners.measure import Measurement
+from gripmon.corners.settling import Measurement
 from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.records import Array, MeasurementTrace

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gripmon.corners.measure
+import gripmon.corners.settling
 import gripmon.monitor
 from gripmon.corners import FingertipMeter
 from gripmon.monitor import Monitor
@@ -24,11 +24,11 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "predict": ((FingertipMeter, "_predicted"),),
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
-        (gripmon.corners.measure, "agree"),
-        (gripmon.corners.measure, "assess"),
+        (gripmon.corners.settling, "agree"),
+        (gripmon.corners.settling, "assess"),
         (FingertipMeter, "measure"),
     ),
-    "corners": ((gripmon.corners.measure, "intersect_edges"),),
+    "corners": ((gripmon.corners.settling, "intersect_edges"),),
     "update and judge": (
         (Monitor, "update"),
         (Monitor, "_evidence"),
