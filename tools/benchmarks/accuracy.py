@@ -6,7 +6,7 @@ import argparse
 import importlib.util
 import multiprocessing
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,38 +111,27 @@ def measure(plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
 
     names = [name for name in row_names() if not plan.only or name.startswith(plan.only)]
     results: dict[str, Any] = {"machine": machine.description(), "plan": {"seed": plan.seed, "jobs": plan.jobs}}
-    done = dict(zip(names, _in_processes(_row, names, plan), strict=True))
-    results["rows"] = {name: figures for name, (figures, _) in done.items()}
+    tasks = [(_row, name, plan) for name in names] + ([(_series, plan.seed)] if plan.series else [])
+    done = list(_in_processes(tasks, plan.jobs))
+    rows = dict(zip(names, done, strict=False))
+    results["rows"] = {name: figures for name, (figures, _) in rows.items()}
     simulated = [row for name, row in results["rows"].items() if is_simulated(name)]
     results["together"] = {way: together([row["ours"][way] for row in simulated]) for way in WAYS}
-    if plan.series:
-        results["series"] = _series(plan.seed)
+    results["series"] = done[-1] if plan.series else None
     results["machine"]["load_after"] = machine.load()
-    return results, {name: tracks for name, (_, tracks) in done.items()}
+    return results, {name: tracks for name, (_, tracks) in rows.items()}
 
 
-def _series(seed: int) -> dict[str, Any]:
-    """The self-viewing paper's tables beside ours (see :mod:`benchmarks.series`)."""
-    from tqdm import tqdm
-
-    from benchmarks import series
-
-    with tqdm(desc="series", unit="pair", file=sys.stderr, disable=None) as bar:
-        rows = series.tables(seed, bar.update)
-    return {"markdown": series.markdown(rows), "verdicts": series.verdicts(rows)}
-
-
-def _in_processes(function: Callable[..., Any], names: list[str], plan: Plan) -> Iterator[Any]:
-    """The function's results by name, in order; new processes, one thread each."""
+def _in_processes(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[Any]:
+    """The results of functions with their arguments, in order; new processes, one thread each."""
     from tqdm import tqdm
 
     context = multiprocessing.get_context("spawn")
-    jobs = min(plan.jobs, len(names))
     with (
-        ProcessPoolExecutor(max_workers=jobs, mp_context=context, initializer=_prepare) as pool,
-        tqdm(total=len(names), desc="accuracy", unit="row", file=sys.stderr, disable=None) as bar,
+        ProcessPoolExecutor(max_workers=min(jobs, len(tasks)), mp_context=context, initializer=_prepare) as pool,
+        tqdm(total=len(tasks), desc="accuracy", unit="row", file=sys.stderr, disable=None) as bar,
     ):
-        waiting = [pool.submit(function, name, plan) for name in names]
+        waiting = [pool.submit(*task) for task in tasks]
         for one in waiting:
             one.add_done_callback(lambda _: bar.update())
         yield from [one.result() for one in waiting]
@@ -152,10 +141,19 @@ def _prepare() -> None:
     """One thread for everybody, and everything imported and run once before anything is timed."""
     import cv2
 
+    from benchmarks import pairs, series  # noqa: F401 - so that a checkout that changes meanwhile does no harm
     from benchmarks.rows import warm_up
 
     cv2.setNumThreads(1)
     warm_up()
+
+
+def _series(seed: int) -> dict[str, Any]:
+    """The self-viewing paper's tables beside ours (see :mod:`benchmarks.series`)."""
+    from benchmarks import series
+
+    rows = series.tables(seed)
+    return {"markdown": series.markdown(rows), "verdicts": series.verdicts(rows)}
 
 
 def _row(name: str, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:

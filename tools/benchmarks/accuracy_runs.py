@@ -96,7 +96,7 @@ def monitor_for(sequence: Sequence, way: str) -> Monitor:
     settings = MonitorSettings(measurement=way, policy=PolicySettings(frames_per_s=sequence.fps), **known)  # type: ignore[arg-type]
     covariance = tuple(sequence.start_covariance.ravel().tolist())
     reference = ReferenceRecord("start", 0, 0, "configuration", to_record(sequence.start_cam_T_grip), covariance)
-    return Monitor(sequence.camera, sequence.gripper, settings, reference)
+    return Monitor(sequence.camera, sequence.gripper, settings, reference, sequence.taught)
 
 
 def judge(record: FrameRecord, shot: Shot, scene: int, index: int, time_ms: float) -> Row:

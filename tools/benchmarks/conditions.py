@@ -31,7 +31,7 @@ from gripmon.simulator.scenario import (
 )
 
 FPS = 30.0
-SCENES, FRAMES = 12, 32
+SCENES, FRAMES = 10, 32
 """Scenes of a condition and frames of a scene, where it doesn't say otherwise.  Systematic errors are constant in a
 scene: their spread shows only over many."""
 
@@ -73,7 +73,8 @@ class Condition:
     about the reported opening (None: the product's default).  ``judged_s``: errors count from this time on;
     ``always_seen``: every judged frame has to be measured.  ``standing``: nothing moves but the background, so the
     smoothed transform has one second to settle.  ``missing_finger``: only one finger is drawn.  ``bevel_m``: range of
-    bevels on all edges.
+    bevels on all edges; ``taught``: they were taught from images at the reference, which the scene is some tenths of a
+    millimetre and of a degree away from.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Condition:
     standing: bool = False
     missing_finger: bool = False
     bevel_m: tuple[float, float] | None = None
+    taught: bool = False
 
 
 def _with(settings: Any, **changes: Any) -> Any:
@@ -259,6 +261,7 @@ BUMP_AT_S = 9.5 / FPS
 """Between two frames, so that the jump is in no frame's exposure."""
 _BUMP: dict[str, Any] = {"frames": 48, "judged_s": BUMP_AT_S + 5.0 / FPS}
 _JAW_NOISE_M, _JAW_OFFSET_M = 3e-5, 3e-4
+_BEVEL_M = (2e-4, 5e-4)
 
 CONDITIONS: tuple[Condition, ...] = (
     Condition("clean", "plain table, even fingers, no noise", CLEAN, _clean, frames=9, scenes=40),
@@ -304,7 +307,8 @@ CONDITIONS: tuple[Condition, ...] = (
         jaw_sigma_m=None,
     ),
     Condition("jaw unreported", "jaw cycle, opening unknown", HARD, _jaw(reported=False), jaw_sigma_m=None),
-    Condition("bevel untaught", "bevels of 0.2 to 0.5 mm on all edges", HARD, _ordinary, bevel_m=(2e-4, 5e-4)),
+    Condition("bevel untaught", "bevels of 0.2 to 0.5 mm on all edges", HARD, _ordinary, bevel_m=_BEVEL_M),
+    Condition("bevel taught", "the same after gripmon teach", HARD, _ordinary, bevel_m=_BEVEL_M, taught=True),
     Condition("vibration", "mount vibrates by 0.1 to 0.3 mm", HARD, _vibration),
     Condition("bump 1.5 mm", "sideways jump, from 5 frames after", HARD, _bump((1.5e-3, 0.0), 3e-4), **_BUMP),
     Condition("bump 4.5 mm", "jump along y, from 5 frames after", HARD, _bump((0.0, 4.5e-3), 2e-4), **_BUMP),

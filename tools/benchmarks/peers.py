@@ -100,7 +100,7 @@ class RapidPeer:
     _LENGTHS_PX = (12, 8, 5, 3, 3)
     _WEAK_DN = 20
     _REAR_SHARE = 0.2
-    _MARGIN_PX = 300
+    _MARGIN_PX = 200
 
     def __init__(self, sequence: Sequence) -> None:
         camera, self._gripper = sequence.camera, _with_faces(sequence.gripper)

@@ -105,6 +105,7 @@ def sequences(row: str) -> list[Rendered]:
             np.array(start),
             np.diag(sigma**2),
             0.0 if true_jaw else None,
+            None,
             float(truth["fps"]),
             folder,
             tuple(frames),

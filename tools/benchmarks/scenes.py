@@ -5,6 +5,7 @@ Every scene is a pure function of the condition, the seed and the scene's number
 
 from __future__ import annotations
 
+import sys
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -21,11 +22,13 @@ from benchmarks.conditions import Condition, Draw, scenario
 from benchmarks.machine import ROOT
 from benchmarks.tags import FingerTags
 from gripmon.camera import Camera, PaperLens, make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.corners import MeasurementSettings, TaughtEdges
+from gripmon.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Array, Frame
-from gripmon.simulator import FrameTruth, Hidden, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, Sensor
+from gripmon.records import Array, Frame, ReferenceRecord
+from gripmon.simulator import FrameTruth, Hidden, Scenario, Simulator
+from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+from gripmon.teaching import TeachingImage, TeachingRefused, teach
 
 CAMERA = PaperLens(
     width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
@@ -34,6 +37,9 @@ CAMERA = PaperLens(
 
 START_SIGMA_M, START_SIGMA_RAD = 1e-4, 1e-3
 """By how much a scene's reference is wrong, each axis; the monitor is told."""
+MOVED_M, MOVED_RAD = 3e-4, 3e-3
+"""By how much the camera has moved since teaching, each axis."""
+TEACHING_IMAGES = 4
 _BORDER_PX = 14.0
 _MOVES_M = 1e-5
 """Tags that move further than this within the exposure are printed smeared."""
@@ -54,7 +60,8 @@ class Shot:
 class Sequence(ABC):
     """What a monitor and its peers look at: frames with truth, and what they may know before the first.
 
-    ``jaw_sigma_m`` is what the monitor is told about the reported opening, None for the product's default.
+    ``jaw_sigma_m`` is what the monitor is told about the reported opening, None for the product's default; ``taught``
+    what it was taught about the gripper's edges.
     """
 
     camera: Camera
@@ -62,6 +69,7 @@ class Sequence(ABC):
     start_cam_T_grip: Array
     start_covariance: Array
     jaw_sigma_m: float | None
+    taught: TaughtEdges | None
     fps: float
 
     @abstractmethod
@@ -139,17 +147,51 @@ def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Sce
         shown = Gripper(msgspec.convert(without_finger(model, str(rng.choice(gripper.finger_ids))), GripperModel))
     simulator = Simulator(camera, shown, cam_T_grip, scenario(condition, draw), seed=int(rng.integers(2**31)))
     sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
+    start, taught = perturb(simulator.truth(0).cam_T_grip, rng.normal(0.0, sigma)), None
+    if condition.taught:
+        # What is taught holds at the reference by definition, so that is exact, and the camera has moved since.
+        start = perturb(cam_T_grip, rng.normal(0.0, [MOVED_M] * 3 + [MOVED_RAD] * 3))
+        taught = _taught(camera, gripper, start, np.diag(sigma**2), simulator.scenario, rng)
     return Scene(
-        camera,
-        gripper,
-        perturb(simulator.truth(0).cam_T_grip, rng.normal(0.0, sigma)),
-        np.diag(sigma**2),
-        condition.jaw_sigma_m,
-        simulator.scenario.fps,
-        simulator,
-        condition.judged_s,
-        frames,
+        camera=camera,
+        gripper=gripper,
+        start_cam_T_grip=start,
+        start_covariance=np.diag(sigma**2),
+        jaw_sigma_m=condition.jaw_sigma_m,
+        taught=taught,
+        fps=simulator.scenario.fps,
+        simulator=simulator,
+        judged_s=condition.judged_s,
+        frames=frames,
     )
+
+
+def _taught(
+    camera: Camera,
+    gripper: Gripper,
+    cam_T_grip: Array,
+    covariance: Array,
+    scenario: Scenario,
+    rng: np.random.Generator,
+) -> TaughtEdges | None:
+    """What ``gripmon teach`` learns from images at a pose, before other backgrounds and with other openings; None if it
+    refuses them.
+    """
+    nominal_m = scenario.jaw.knots[0][1]
+    openings_m = [float(nominal_m + rng.uniform(-2e-3, 2e-3)) for _ in range(TEACHING_IMAGES)]
+    images = []
+    for opening_m in openings_m:
+        still = msgspec.structs.replace(scenario, jaw=JawScript(knots=((0.0, opening_m),)))
+        image = Simulator(camera, gripper, cam_T_grip, still, int(rng.integers(2**31))).render(0)
+        images.append(TeachingImage(image, opening_m, f"{opening_m:.4f}"))
+    flat = tuple(covariance.ravel().tolist())
+    reference = ReferenceRecord("taught", 0, 0, "configuration", to_record(cam_T_grip), flat)
+    try:
+        learnt = teach(camera, gripper, MeasurementSettings(), 0.0, reference, images)
+    except TeachingRefused as refused:
+        print(f"accuracy: not taught: {refused}", file=sys.stderr)
+        return None
+    return TaughtEdges.of(learnt.edges, gripper, cam_T_grip, float(np.mean(openings_m)))
 
 
 def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
