@@ -80,6 +80,7 @@ _SMALLEST_STIFFNESS = 0.2
 _AGAIN_PX = 0.4  # width at a start that is nearly right
 _NARROWING = 0.4  # of the width that covers the start's error, from round to round
 _ROUNDS = 6
+_ROUNDS_AGAIN = 3
 _CONVERGED = 0.04  # squared step over its covariance: a fifth of a standard deviation; what is still to come is less
 
 
@@ -170,33 +171,31 @@ def agree(
 
     With fewer candidates than unknowns the fit stays at the start and supports nothing.
     """
-    candidates, prediction, weights = votes.candidates, votes.prediction, votes.weight
-    jacobian = prediction.jacobian_by_unknown[:, candidates.sample]
-    offset = candidates.offset_px
-    active = None if weights.all() else weights > 0.0
-    sigma = 1.0 / np.sqrt(weights if active is None else np.where(active, weights, 1.0))
-    edge = prediction.layout.edge[candidates.sample]
-    shared = votes.edge_spread_px**2
-    xi = start
-    residual = offset - xi @ jacobian
+    candidates, prediction = votes.candidates, votes.prediction
     width = settings.start_width_px if width_px is None else width_px
-    spread, spread_px = 1.0, FARTHEST_PX
-    for round_ in range(_ROUNDS):
+    shared = votes.edge_spread_px**2
+    xi, spread, spread_px = start, 1.0, FARTHEST_PX
+    near = _near(votes, start, max(width, _TUKEY * FARTHEST_PX))
+    rounds = _ROUNDS if width_px is None else _ROUNDS_AGAIN
+    for round_ in range(rounds):
         if round_:
             width *= _NARROWING
-            spread, spread_px = _spread(residual, sigma, active, settings.start_width_px)
-        reach = np.minimum(np.hypot(width, (_TUKEY * spread) * sigma), max(width, _TUKEY * spread_px))
+            spread, spread_px = _spread(near.residual(xi), near.sigma, settings.start_width_px)
+        residual = near.residual(xi)
+        reach = np.minimum(np.hypot(width, (_TUKEY * spread) * near.sigma), max(width, _TUKEY * spread_px))
         weight = _biweight(residual, reach)
-        weight *= weights
+        weight *= near.weight
         # All points of an edge together are worth no more than one with the spread that they share.
-        weight /= (1.0 + shared * np.bincount(edge, weight, len(shared)))[edge]
-        step, information = _step(jacobian, residual, weight, prior.mean - xi, prior.information)
+        weight /= (1.0 + shared * np.bincount(near.edge, weight, len(shared)))[near.edge]
+        step, information = _step(near.jacobian, residual, weight, prior.mean - xi, prior.information)
         xi = xi + step
-        residual = offset - xi @ jacobian
-        if round_ >= 4 and float(step @ information @ step) < _CONVERGED:
+        if round_ >= rounds - 3 and float(step @ information @ step) < _CONVERGED:
             break
-    stiffness = _stiffness(weight, residual, reach)
-    return _judge(votes, active, Fit(xi, weight, residual, information, spread_px, stiffness), settings)
+    stiffness = _stiffness(weight, near.residual(xi), reach)
+    every = np.zeros(len(candidates.sample))
+    every[near.place] = weight
+    residual = candidates.offset_px - xi @ prediction.jacobian_by_unknown[:, candidates.sample]
+    return _judge(votes, Fit(xi, every, residual, information, spread_px, stiffness), settings)
 
 
 def agree_on_seen(
@@ -245,6 +244,37 @@ def grid_of_starts(prediction: Prediction, reach_px: float, step_px: float) -> A
     return starts
 
 
+class _Near(NamedTuple):
+    """The candidates that may belong to a fit: ``place`` (j,) among all, and what the fit needs of them."""
+
+    place: NDArray[np.intp]
+    jacobian: Array
+    offset: Array
+    sigma: Array
+    weight: Array
+    edge: NDArray[np.intp]
+
+    def residual(self, xi: Array) -> Array:
+        return np.asarray(self.offset - xi @ self.jacobian)
+
+
+def _near(votes: Votes, start: Array, reach_px: float) -> _Near:
+    """Candidates with a weight within ``reach_px`` of where ``start`` puts the edges."""
+    candidates, prediction = votes.candidates, votes.prediction
+    moved = prediction.jacobian @ start
+    far = np.abs(candidates.offset_px - moved[candidates.sample])
+    index = np.flatnonzero((far < reach_px) & (votes.weight > 0.0))
+    sample, weight = candidates.sample[index], votes.weight[index]
+    return _Near(
+        index,
+        prediction.jacobian_by_unknown[:, sample],
+        candidates.offset_px[index],
+        1.0 / np.sqrt(weight),
+        weight,
+        prediction.layout.edge[sample],
+    )
+
+
 def _biweight(residual: Array, reach: Array) -> Array:
     """Tukey's weights (1 - (r / reach)²)², zero beyond the reach."""
     weight = residual / reach
@@ -291,28 +321,27 @@ def _stiffness(weight: Array, residual: Array, reach: Array) -> float:
     return max(float(base @ growth) / total, _SMALLEST_STIFFNESS) if total > 0.0 else 1.0
 
 
-def _spread(residual: Array, sigma: Array, active: NDArray[np.bool_] | None, width: float) -> tuple[float, float]:
+def _spread(residual: Array, sigma: Array, width: float) -> tuple[float, float]:
     """Robust size of the residuals that may belong to the fit, 1.4826 times their median: over their standard
     deviations, at least 1, and in px.
     """
     size = np.abs(residual)
-    near = size < np.minimum(width, 4.0 * sigma + 0.3)
-    if active is not None:
-        near &= active
-    size = size[near]
-    if len(size) < 12:
+    near = np.flatnonzero(size < np.minimum(width, 4.0 * sigma + 0.3))
+    if len(near) < 12:
         return 1.0, FARTHEST_PX
+    size = size[near]
     middle = len(size) // 2
     spread_px = 1.4826 * float(np.partition(size, middle)[middle])
     spread = 1.4826 * float(np.partition(size / sigma[near], middle)[middle])
     return min(max(spread, 1.0), _LARGEST_SPREAD), min(max(spread_px, _SMALLEST_SPREAD_PX), FARTHEST_PX)
 
 
-def _judge(votes: Votes, active: NDArray[np.bool_] | None, fit: Fit, settings: ConsensusSettings) -> Consensus:
+def _judge(votes: Votes, fit: Fit, settings: ConsensusSettings) -> Consensus:
     """Count who agrees, and hold it against chance: the density of candidates tells how many would lie in the gate
     anyway.
     """
     candidates, prediction, residual = votes.candidates, votes.prediction, fit.residual_px
+    active = None if votes.weight.all() else votes.weight > 0.0
     edges = len(prediction.line_origin)
     gate_px = GATE_PX * candidates.zoom
     edge_of = prediction.layout.edge
