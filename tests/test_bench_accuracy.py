@@ -156,7 +156,8 @@ def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
             assert not visible or condition.missing_finger, condition.name
             assert np.isfinite(last.corner_uv_px).all()
             start_error_m = scene.start_cam_T_grip[:3, 3] - first.cam_T_grip[:3, 3]
-            assert 0.0 < np.linalg.norm(start_error_m) < 5e-4
+            assert 0.0 < np.linalg.norm(start_error_m) < (15e-4 if condition.taught else 5e-4)
+            assert (scene.taught is not None) == condition.taught
 
 
 def test_scenes_differ_and_come_back_the_same():
