@@ -36,13 +36,13 @@ class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         Meta(
             ge=2.0,
             le=100.0,
-            description="stretch of each edge next to the corner that must show half as well as the whole edge (px)",
+            description="stretch of each edge next to the corner that must show half as well as its rest (px)",
         ),
     ] = 16.0
 
 
 SHOWN_BESIDE = 0.5
-"""Share of agreeing profiles next to a corner, over the edge's own, from which the corner counts as seen."""
+"""Share of agreeing profiles next to a corner, over that on the rest of the edge, from which the corner is seen."""
 
 FEWEST_BESIDE = 4
 """Profiles next to a corner that are looked at, however far apart they are."""
@@ -90,7 +90,7 @@ class Corners:
 class _Spoke(NamedTuple):
     """One edge at one corner, for a prediction: ``slot`` among the sampled edges, ``edge`` of the gripper, ``along``
     the predicted corner on the edge's line, ``direction`` of the line, first and last + 1 of the profiles beside the
-    corner.
+    corner, and of all on the edge.
     """
 
     slot: int
@@ -100,6 +100,17 @@ class _Spoke(NamedTuple):
     direction_y: float
     begin: int
     end: int
+    first: int
+    last: int
+
+    def shows(self, agreed: list[int]) -> bool:
+        """Whether the edge shows beside the corner half as well as elsewhere; ``agreed`` are running counts of the
+        profiles that agree.
+        """
+        near, rest = self.end - self.begin, self.last - self.first - self.end + self.begin
+        seen = agreed[self.end] - agreed[self.begin]
+        elsewhere = agreed[self.last] - agreed[self.first] - seen
+        return seen >= SHOWN_BESIDE * near * (elsewhere / rest if rest >= FEWEST_BESIDE else 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +145,7 @@ class CornerGeometry:
                 near = min(max(near, FEWEST_BESIDE), last - first)
                 at_start = gripper.edge_points[edge, 0] == gripper.corner_points[i]
                 beside = (first, first + near) if at_start else (last - near, last)
-                at_corner.append(_Spoke(slots[edge], edge, along, x, y, *beside))
+                at_corner.append(_Spoke(slots[edge], edge, along, x, y, *beside, first, last))
             spokes.append(tuple(at_corner))
             faults.append(_fault_of_view(bool(corners.inside[i]), bool(corners.facing[i]), len(at_corner)))
         lens = tuple((a, b, c, d) for a, b, c, d in corners.d_uv_d_xy.reshape(-1, 4).tolist())
@@ -166,10 +177,9 @@ def intersect_edges(
     lines = _fit_lines(votes, line_weight)
     seen = consensus.edge_seen.tolist()
     agreed = [0, *np.cumsum(consensus.supported).tolist()]
-    share = consensus.edge_share.tolist()
     sides = tuple(_seen_sides(lines, seen, spokes) for spokes in geometry.spokes)
     measured = [
-        fault or _intersect(rests_on, agreed, share, lens, settings)
+        fault or _intersect(rests_on, agreed, lens, settings)
         for fault, rests_on, lens in zip(geometry.fault, sides, geometry.lens, strict=True)
     ]
     faults = tuple(m if isinstance(m, CornerFault) else None for m in measured)
@@ -197,22 +207,18 @@ def _seen_sides(lines: list[_Line | None], seen: list[bool], spokes: tuple[_Spok
 def _intersect(
     sides: list[tuple[_Spoke, _Line]],
     agreed: list[int],
-    share: list[float],
     lens: tuple[float, float, float, float],
     settings: CornerSettings,
 ) -> tuple[float, float, float, float, float, float] | CornerFault:
     """One corner: shift x and y from the prediction (ideal coordinates), sigma (px), variance x, covariance, variance
     y.
 
-    ``agreed`` are running counts of the profiles that agree, ``share`` is the part of each edge's that do.  Hidden if
-    fewer than two edges show beside it nearly as well as on the whole.
+    ``agreed`` are running counts of the profiles that agree.  Hidden if fewer than two edges show right beside it.
     """
     beside, rows = 0, []
     ixx = ixy = iyy = bx = by = 0.0
     for spoke, line in sides:
-        beside += agreed[spoke.end] - agreed[spoke.begin] >= SHOWN_BESIDE * share[spoke.edge] * (
-            spoke.end - spoke.begin
-        )
+        beside += spoke.shows(agreed)
         x, y = line.normal(spoke)
         along = spoke.along
         weight = 1.0 / line.variance(along)

@@ -1,0 +1,80 @@
+"""Golden images with text truth: neither the measurement nor the renderer changes unnoticed.
+
+The images lie in the repository, with camera, gripper, pose, corner pixels and limits as text beside them.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from golden_images import FOLDER, SCENES, load, simulator
+from meters import EVERYWHERE, USUAL_SHARE, difference
+
+from gripmon.camera import LensSettings, make_camera
+from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings
+
+NAMES = sorted(SCENES)
+
+
+def measured(name: str) -> tuple[Measurement, dict]:
+    image, truth, gripper = load(name)
+    camera = make_camera(msgspec.convert(truth["camera"], LensSettings))
+    meter = FingertipMeter(camera, gripper, MeasurementSettings(), 0.0)
+    start = np.array(truth["start_cam_T_grip"])
+    return meter.measure(image, start, truth["jaw_opening_m"], USUAL_SHARE, EVERYWHERE), truth
+
+
+def test_the_folder_holds_these_images_and_nothing_else():
+    names = {path.name for path in FOLDER.iterdir()}
+    grippers = {f"gripper_{gripper}.yaml" for gripper, *_ in SCENES.values()}
+    assert names == {f"{name}.{end}" for name in NAMES for end in ("png", "yaml")} | grippers
+    assert all(path.stat().st_size < 60_000 for path in FOLDER.iterdir())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_golden_image_measures_as_its_text_says(name: str):
+    found, truth = measured(name)
+    limits = truth["limits"]
+    assert found.trusted
+    error_um = 1e6 * difference(found.cam_T_grip, np.array(truth["cam_T_grip"]))[:3]
+    assert (np.abs(error_um) < limits["tcp_um"]).all(), error_um
+    used = dict(zip(truth["corners_uv_px"], found.corners.usable, strict=True))
+    assert sum(used.values()) >= limits["corners_at_least"]
+    assert not any(used[corner] for corner in truth["hidden_corners"])
+    for (corner, true_px), uv_px in zip(truth["corners_uv_px"].items(), found.corners.uv_px, strict=True):
+        if used[corner]:
+            assert np.linalg.norm(uv_px - true_px) < limits["corner_px"], corner
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_errors_are_within_what_the_measurement_claims(name: str):
+    found, truth = measured(name)
+    error = difference(found.cam_T_grip, np.array(truth["cam_T_grip"]))
+    assert error @ np.linalg.solve(found.covariance[:6, :6], error) < 22.46
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_text_agrees_with_itself(name: str):
+    """Pose, gripper and lens put the corners where the text has them."""
+    _, truth, gripper = load(name)
+    camera = make_camera(msgspec.convert(truth["camera"], LensSettings))
+    cam_T_grip = np.array(truth["cam_T_grip"])
+    points = gripper.points_grip_m(truth["jaw_opening_m"])[gripper.corner_points]
+    uv_px = camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+    np.testing.assert_allclose(uv_px, list(truth["corners_uv_px"].values()), atol=1e-3)
+    assert list(truth["corners_uv_px"]) == list(gripper.corner_ids)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_renderer_still_draws_it(name: str):
+    """From the text alone, up to rounding and another JPEG library."""
+    image, truth, gripper = load(name)
+    made = simulator(truth, gripper)
+    drawn = made.render(truth["frame"])
+    difference_dn = np.abs(drawn.astype(float) - image)
+    assert difference_dn.mean() < 0.5
+    assert np.percentile(difference_dn, 99.9) <= 4.0
+    known = made.truth(truth["frame"])
+    np.testing.assert_allclose(known.cam_T_grip, truth["cam_T_grip"], atol=1e-12)
+    assert [i for i, seen in zip(known.corner_ids, known.visible, strict=True) if not seen] == truth["hidden_corners"]
