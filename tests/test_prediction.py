@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 from box_models import cube_model
 from meters import FISHEYE_LENS, box_gripper, moved
-from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.camera import Camera, LensSettings, make_camera
 from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
 from gripmon.corners.profiles import profile_offsets_px
-from gripmon.gripper import Gripper, gripper_from_dict
+from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
 
 LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
 LENS_NAMES = ["paper", "brown_conrady", "fisheye"]
 OPENING_M = 0.031
+ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
 OFFSETS_PX = profile_offsets_px(7.0)
 
 
@@ -49,11 +50,12 @@ def crossing_px(camera: Camera, ends_m: np.ndarray, fraction: float, uv_px: np.n
     return float(np.polyval(fit[:, 1], at))
 
 
+@pytest.mark.parametrize("gripper", [box_gripper(), ADAPTIVE], ids=["along an axis", "on an arc"])
 @pytest.mark.parametrize("lens", LENSES, ids=LENS_NAMES)
-def test_jacobian_is_the_motion_of_the_edge_along_its_normal(lens: LensSettings):
+def test_jacobian_is_the_motion_of_the_edge_along_its_normal(lens: LensSettings, gripper: Gripper):
     """All seven columns: the moved edge, projected through the lens, is intersected with the profile."""
-    camera, gripper, pose = make_camera(lens), box_gripper(), nominal_cam_T_grip()
-    prediction = predicted(lens)
+    camera, pose = make_camera(lens), nominal_cam_T_grip()
+    prediction = predicted(lens, gripper)
     steps = np.array([2e-6] * 3 + [2e-5] * 3 + [2e-6])
     for i in range(0, len(prediction.uv_px), 7):
         edge, fraction = prediction.layout.edge[i], prediction.layout.fraction[i]
