@@ -14,7 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.camera import Camera
-from gripmon.corners.reduced import ORIENTATIONS, Floats, Window, against_surroundings, evidence_table, gradients
+from gripmon.corners.reduced import (
+    LEVELS,
+    ORIENTATIONS,
+    Floats,
+    Window,
+    against_surroundings,
+    calmness,
+    evidence_table,
+    gradients,
+)
 from gripmon.geometry import invert, skew
 from gripmon.gripper import Gripper
 from gripmon.records import Array
@@ -25,7 +34,6 @@ DENSITY = 0.75
 FEWEST_EDGES = 3
 """With fewer outlines in view, lines between two faces are looked at, too."""
 
-_LEVELS = 256
 _EDGE_MARGIN = 0.03  # of an edge at each end: the neighbour shows there
 
 
@@ -178,54 +186,88 @@ class MapScore:
         return many.take(chosen), score[np.arange(count), best]
 
 
+class _Table(NamedTuple):
+    """What values say, ranked among those that were read first."""
+
+    evidence: Floats
+    per_level: float
+
+    @classmethod
+    def of(cls, values: Floats) -> _Table:
+        if not values.size:
+            return cls(np.zeros(LEVELS, np.float32), 0.0)
+        place = int(0.998 * (values.size - 1))
+        per_level = (LEVELS - 1) / (float(np.partition(values, place)[place]) + 1e-12)
+        counts = np.bincount(_levels(values, per_level), minlength=LEVELS)
+        return cls(evidence_table(counts.astype(float)), per_level)
+
+    def look_up(self, values: Floats) -> Floats:
+        return np.asarray(self.evidence.take(_levels(values, self.per_level)), dtype=np.float32)
+
+
+def _levels(values: Floats, per_level: float) -> NDArray[np.uint8]:
+    return np.minimum(values * np.float32(per_level), LEVELS - 1).astype(np.uint8)
+
+
 class ProfileScore:
     """Evidence along profiles across the outlines: to the pixel, for poses that are nearly right.
 
     Strengths are averaged over neighbouring points of an edge, and ranked among all that were read first.
     """
 
-    def __init__(self, points: OutlinePoints, window: Window, grey: Floats, seen: NDArray[np.bool_]) -> None:
-        self._points, self._window = points, window
+    def __init__(self, points: OutlinePoints, window: Window, grey: Floats, seen: NDArray[np.bool_], side: int) -> None:
+        """``side``: cells from an outline to where its sides are looked at."""
+        self._points, self._window, self._side = points, window, side
         gx, gy = gradients(grey)
         factor = against_surroundings(np.hypot(gx, gy), seen)
         self._columns, self._rows = window.columns + 2, window.rows + 2
         field = np.zeros((self._rows, self._columns, 2), np.float32)
         field[1:-1, 1:-1, 0], field[1:-1, 1:-1, 1] = gx * factor, gy * factor
         self._field = field.reshape(-1, 2)
+        self._calm = np.pad(calmness(gx, gy, seen), 1).ravel()
         self._seen = np.pad(seen, 1).ravel()
         same = np.asarray(points.edge[1:] == points.edge[:-1], dtype=np.float32)
         self._same = same[None, :, None]
         neighbours = 1.0 + np.append(same, 0.0) + np.append(0.0, same)
         self._per_neighbours = np.asarray(1.0 / neighbours, dtype=np.float32)[None, :, None]
-        self._table: tuple[Floats, float] | None = None
+        self._tables: list[_Table] = []
 
-    def evidence(self, at: Projected, offsets: Floats) -> Floats:
-        """(h, n, s) at offsets (s,) along the normals, cells."""
+    def evidence(self, at: Projected, half: int) -> Floats:
+        """(h, n, 2 half + 1) at whole cells along the normals."""
+        side = self._side
+        offsets = np.arange(-half - side, half + side + 1, dtype=np.float32)
         normal_x, normal_y = at.normal_x[..., None], at.normal_y[..., None]
         column = (at.column + np.float32(1.5))[..., None] + normal_x * offsets
         row = (at.row + np.float32(1.5))[..., None] + normal_y * offsets
-        index = np.clip(row, 0.0, self._rows - 1.0).astype(np.int32)
-        index *= self._columns
-        index += np.clip(column, 0.0, self._columns - 1.0).astype(np.int32)
+        around = np.clip(row, 0.0, self._rows - 1.0, out=row).astype(np.int32)
+        around *= self._columns
+        around += np.clip(column, 0.0, self._columns - 1.0, out=column).astype(np.int32)
+        calm = self._calm.take(around)
+        index = around[..., side:-side]
+        strength = self._strength(index, normal_x, normal_y)
+        calmer = np.maximum(calm[..., : -2 * side], calm[..., 2 * side :])
+        shown = self._seen.take(index)
+        if not self._tables:
+            self._tables = [_Table.of(values[shown]) for values in (strength, calmer)]
+        found = self._tables[0].look_up(strength) + self._tables[1].look_up(calmer)
+        found *= shown
+        return found
+
+    def _strength(self, index: NDArray[np.int32], normal_x: Floats, normal_y: Floats) -> Floats:
         field = self._field[index]
-        across = field[..., 0] * normal_x + field[..., 1] * normal_y
+        across = field[..., 0] * normal_x
+        across += field[..., 1] * normal_y
         mean = across.copy()
         mean[:, 1:] += across[:, :-1] * self._same
         mean[:, :-1] += across[:, 1:] * self._same
-        strength = np.abs(mean, out=mean)
-        strength *= self._per_neighbours
-        shown = self._seen[index]
-        if self._table is None:
-            self._table = _table_of(strength[shown])
-        table, per_level = self._table
-        found = table[np.minimum(strength * np.float32(per_level), _LEVELS - 1).astype(np.uint8)]
-        found *= shown
-        return found
+        np.abs(mean, out=mean)
+        mean *= self._per_neighbours
+        return mean
 
     def score(self, poses: Poses) -> Floats:
         """(h,) sums of evidence exactly where the poses put the outlines."""
         at = project(self._points, poses, self._window)
-        return np.asarray(self.evidence(at, np.zeros(1, np.float32)).sum(axis=(1, 2)), dtype=np.float32)
+        return np.asarray(self.evidence(at, 0).sum(axis=(1, 2)), dtype=np.float32)
 
     def polished(self, poses: Poses, reach: int, rounds: int, sigma: Array) -> Poses:
         """Poses that the evidence up to ``reach`` cells beside the outlines pulls them to: of all rounds the one with
@@ -241,7 +283,7 @@ class ProfileScore:
             half = max(round(width), 1)
             offsets = np.arange(-half, half + 1, dtype=np.float32)
             at = project(self._points, Poses(rotation, translation), self._window)
-            found = self.evidence(at, offsets)
+            found = self.evidence(at, half)
             score = found[:, :, half - 1 : half + 2].max(axis=2).sum(axis=1)
             better = score > best_score
             best_score[better] = score[better]
@@ -298,13 +340,3 @@ def apart(poses: Poses, points: OutlinePoints, window: Window, scores: Floats, c
                 break
             taken |= np.abs(places - places[k]).max(axis=1) <= cells
     return kept
-
-
-def _table_of(strength: Floats) -> tuple[Floats, float]:
-    if not strength.size:
-        return np.zeros(_LEVELS, np.float32), 0.0
-    place = int(0.998 * (strength.size - 1))
-    top = float(np.partition(strength, place)[place]) + 1e-12
-    per_level = (_LEVELS - 1) / top
-    levels = np.minimum(strength * np.float32(per_level), _LEVELS - 1).astype(np.uint8)
-    return evidence_table(np.bincount(levels, minlength=_LEVELS).astype(float)), per_level

@@ -1,9 +1,10 @@
 """The reduced image that a search looks at: a window about the gripper, without the lens, and what its pixels say for
-an edge.
+an outline.
 
-Its coordinates are cells: ideal coordinates from the window's first cell, in steps of its pitch.  Edge strengths say
-little by themselves, since what is strong differs from scene to scene and from place to place.  So a strength is
-divided by the mean about it, and counts by how rare it is in this image.
+Its coordinates are cells: ideal coordinates from the window's first cell, in steps of its pitch.  Two things speak for
+an outline: the grey level changes across it, and on one of its sides, the finger's, it changes less than elsewhere.
+What a strong change is differs from scene to scene and from place to place: it is divided by the mean about it, and
+both count by how rare they are in this image.
 """
 
 from __future__ import annotations
@@ -37,8 +38,16 @@ RARITY = 0.35
 SMALLEST_RANK = 0.004
 """Strengths rarer than this count alike."""
 
+SIDE = 3
+"""Cells from an outline to where its sides are looked at."""
+
+QUIET = 0.1
+"""Changes smaller than this part of the image's strong ones, the strongest 5 %, are none."""
+
+LEVELS = 256
+"""Steps in which values are ranked."""
+
 _NODE = 8  # cells between places at which the lens is reckoned
-_LEVELS = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,29 +140,61 @@ def evidence_table(counts: Array) -> Floats:
     return np.asarray(table - (table @ counts) / total, dtype=np.float32)
 
 
-def evidence_maps(grey: Floats, seen: NDArray[np.bool_]) -> Floats:
-    """(o, rows, columns) what each cell says for an edge through it or its neighbours, by the orientation of the edge's
-    normal; zero where the image doesn't reach.
+def calmness(gx: Floats, gy: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """One over the mean gradient (rows, columns) about each cell; what is small against the image's strong ones counts
+    alike.
     """
+    strength = np.hypot(gx, gy)
+    some = strength[::2, ::2][seen[::2, ::2]]
+    least = QUIET * float(np.quantile(some, 0.95)) if some.size else 0.0
+    return np.asarray(1.0 / np.maximum(cv2.blur(strength, (3, 3)), least + 1e-12), dtype=np.float32)
+
+
+def evidence_maps(grey: Floats, seen: NDArray[np.bool_]) -> Floats:
+    """(o, rows, columns) what each cell says for an outline through it or its neighbours, by the orientation of the
+    outline's normal; zero where the image doesn't reach.
+    """
+    maps = np.zeros((ORIENTATIONS, *grey.shape), dtype=np.float32)
+    if not seen.any():
+        return maps
     gx, gy = gradients(grey)
-    maps = np.empty((ORIENTATIONS, *grey.shape), dtype=np.float32)
+    calm, calmer = calmness(gx, gy, seen), np.empty_like(maps)
     block = np.ones((3, 3), np.uint8)
     for k in range(ORIENTATIONS):
         angle = math.pi * k / ORIENTATIONS
-        across = cv2.filter2D(math.cos(angle) * gx + math.sin(angle) * gy, -1, _line_kernel(angle))
-        maps[k] = cv2.dilate(np.abs(across), block)
+        c, s = math.cos(angle), math.sin(angle)
+        maps[k] = cv2.dilate(np.abs(cv2.filter2D(c * gx + s * gy, -1, _line_kernel(angle))), block)
+        calmer[k] = np.maximum(*(_moved(calm, round(sign * SIDE * c), round(sign * SIDE * s)) for sign in (1, -1)))
     maps *= against_surroundings(maps.mean(axis=0), seen)
-    shown = np.count_nonzero(seen)
-    if not shown:
-        return np.zeros_like(maps)
-    top = float(np.quantile(maps[:, ::3, ::3], 0.998)) + 1e-12
-    levels = np.minimum(maps * ((_LEVELS - 1) / top), _LEVELS - 1).astype(np.uint8)
-    mask = seen.astype(np.uint8)
-    for k in range(ORIENTATIONS):
-        counts = cv2.calcHist([levels[k]], [0], mask, [_LEVELS], [0, _LEVELS]).ravel().astype(float)
-        cv2.LUT(levels[k], evidence_table(counts), dst=maps[k])
+    _add_evidence(maps, calmer, seen)
     maps *= seen
     return maps
+
+
+def _moved(values: Floats, right: int, down: int) -> Floats:
+    """Whole cells on, the border repeated."""
+    shift = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+    size = (values.shape[1], values.shape[0])
+    moved = cv2.warpAffine(values, shift, size, flags=cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(moved, dtype=np.float32)
+
+
+def _add_evidence(maps: Floats, calmer: Floats, seen: NDArray[np.bool_]) -> None:
+    """Replace strengths (o, rows, columns) by their evidence and that of the calmer sides, each orientation ranked
+    among its own.
+    """
+    mask = seen.astype(np.uint8)
+    levels = [_levels(values) for values in (maps, calmer)]
+    for k in range(ORIENTATIONS):
+        for which, level in enumerate(levels):
+            counts = cv2.calcHist([level[k]], [0], mask, [LEVELS], [0, LEVELS]).ravel().astype(float)
+            found = cv2.LUT(level[k], evidence_table(counts))
+            maps[k] = maps[k] + found if which else found
+
+
+def _levels(values: Floats) -> NDArray[np.uint8]:
+    top = float(np.quantile(values[:, ::3, ::3], 0.998)) + 1e-12
+    return np.minimum(values * ((LEVELS - 1) / top), LEVELS - 1).astype(np.uint8)
 
 
 @lru_cache(maxsize=ORIENTATIONS)

@@ -28,7 +28,7 @@ from gripmon.corners.hypotheses import (
     project,
     rotations,
 )
-from gripmon.corners.reduced import Floats, Window, evidence_maps, rectify, window_about
+from gripmon.corners.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
 
@@ -38,10 +38,10 @@ POINTS, FINE_POINTS = 80, 120
 TICK = 3.0
 """Step of turn and scale: so many cells of motion at the farthest outline point."""
 
-PLACES = 64
+PLACES = 96
 """Best places of the votes that are followed."""
 
-POLISHED = 24
+POLISHED = 36
 """Of these, how many are polished."""
 
 SHAKES = ((24, 2.5, 1.0), (12, 1.25, 0.5))
@@ -119,7 +119,7 @@ def search_poses(
     poses = poses.take(np.array(apart(poses, points, window, scores, 0.5 * APART / FINER, POLISHED)))
     finer = window.finer(FINER)
     points = outline_points(camera, gripper, cam_T_grip, jaw_opening_m, margin_px, FINE_POINTS)
-    profiles = ProfileScore(points, finer, *rectify(image, camera, finer))
+    profiles = ProfileScore(points, finer, *rectify(image, camera, finer), FINER * SIDE)
     poses = profiles.polished(poses, POLISH_REACH, POLISH_ROUNDS, place.sigma)
     best = apart(poses, points, finer, profiles.score(poses), APART, settings.starts)
     return poses.take(np.array(best)).matrices()
@@ -154,7 +154,7 @@ class _Place:
         seen = project(points, self._expected, window)
         places = np.column_stack([seen.column[0], seen.row[0]]).astype(float)
         centre = places.mean(axis=0)
-        orientation = orientation_of(seen)[0] * (math.pi / 16)
+        orientation = orientation_of(seen)[0] * (math.pi / ORIENTATIONS)
         reach = math.ceil(self.reach_m / self.depth_m / window.pitch)
         padded = np.pad(maps, ((0, 0), (reach, reach), (reach, reach)))
         tick = TICK * window.pitch / self._spread
@@ -162,7 +162,7 @@ class _Place:
         for turn in _ticks(settings.turn_rad, tick):
             c, s = math.cos(turn), math.sin(turn)
             turned = (places - centre) @ np.array([[c, s], [-s, c]])
-            index = np.rint((orientation + turn) * (16 / math.pi)).astype(int) % 16
+            index = np.rint((orientation + turn) * (ORIENTATIONS / math.pi)).astype(int) % ORIENTATIONS
             for scale in _ticks(self.reach_m / self.depth_m, tick):
                 column, row = np.rint((1.0 + scale) * turned + centre).astype(int).T
                 votes = _votes(padded, index, column, row, reach)
