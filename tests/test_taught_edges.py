@@ -34,6 +34,13 @@ def predicted(edges: dict[str, TaughtEdge] | None, pose: np.ndarray, opening_m: 
     return predict(CAMERA, GRIPPER, layout, pose, opening_m, OFFSETS_PX, True, taught)
 
 
+def shifts_px(found: Prediction, plain: Prediction, edge: int = EDGE) -> np.ndarray:
+    """(k,) how far an edge's samples lie from those of another prediction, along its normals."""
+    assert found.layout.edge.tolist() == plain.layout.edge.tolist()
+    mine = found.layout.edge == edge
+    return np.einsum("ni,ni->n", found.uv_px - plain.uv_px, plain.normal)[mine]
+
+
 @pytest.mark.parametrize("turn_rad", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.2), (-0.02, 0.05, -0.1)])
 def test_samples_lie_where_the_shifted_edge_projects(turn_rad: tuple[float, float, float]):
     """The edge moved as a line in space by offset and depth, and projected by the camera."""
@@ -44,21 +51,23 @@ def test_samples_lie_where_the_shifted_edge_projects(turn_rad: tuple[float, floa
     sight, along = start - invert(POSE)[:3, 3], end - start
     across = np.cross(sight, along) / np.linalg.norm(np.cross(sight, along))
     depth = np.cross(along, across) / np.linalg.norm(along)
-    fraction = found.layout.fraction[:, None]
+    mine = found.layout.edge == EDGE
+    fraction = found.layout.fraction[mine, None]
     offset_m = 1e-4 + (fraction - 0.1) / 0.8 * 1e-4
     shifted = start + fraction * along + offset_m * across + 3e-4 * depth
     expected_px = CAMERA.project(shifted @ pose[:3, :3].T + pose[:3, 3])
-    away_px = np.einsum("ni,ni->n", found.uv_px - expected_px, found.normal)
+    away_px = np.einsum("ni,ni->n", found.uv_px[mine] - expected_px, found.normal[mine])
     assert np.abs(away_px).max() < 0.02, "but for what one pixel more or less changes in the scale"
     plain = CAMERA.project((start + fraction * along) @ pose[:3, :3].T + pose[:3, 3])
-    assert np.abs(np.einsum("ni,ni->n", found.uv_px - plain, found.normal)).min() > 0.7
+    assert np.abs(np.einsum("ni,ni->n", found.uv_px[mine] - plain, found.normal[mine])).min() > 0.7
 
 
 def test_an_offset_to_the_right_is_to_the_right_in_the_image():
     found = predicted({"L_tip_near": taught_edge()}, POSE)
     plain = predicted({"L_tip_near": taught_edge(offset_m=(0.0, 0.0))}, POSE)
-    along = plain.uv_px[-1] - plain.uv_px[0]
-    shift = (found.uv_px - plain.uv_px).mean(axis=0)
+    mine = plain.layout.edge == EDGE
+    along = plain.uv_px[mine][-1] - plain.uv_px[mine][0]
+    shift = (found.uv_px - plain.uv_px)[mine].mean(axis=0)
     assert along[0] * shift[1] - along[1] * shift[0] > 0.0, "y points down: right of walking along x"
 
 
@@ -79,21 +88,30 @@ def test_an_offset_in_metres_grows_in_the_image_as_the_gripper_comes_nearer():
     for pose in (POSE, near):
         found = predicted({"L_tip_near": taught_edge(offset_m=(1e-4, 1e-4))}, pose)
         plain = predicted({"L_tip_near": taught_edge(offset_m=(0.0, 0.0))}, pose)
-        shifts.append(np.einsum("ni,ni->n", found.uv_px - plain.uv_px, plain.normal).mean())
+        shifts.append(shifts_px(found, plain).mean())
     depth_m = (GRIPPER.points_grip_m(OPENING_M)[GRIPPER.edge_points[EDGE]].mean(axis=0) @ POSE[:3, :3].T + POSE[:3, 3])[
         2
     ]
     assert shifts[1] / shifts[0] == pytest.approx(depth_m / (depth_m - 0.04), rel=0.03)
 
 
-def test_only_taught_edges_are_used_and_only_as_they_were_taught():
+def test_creases_are_used_where_they_were_taught_and_edges_are_shifted_while_they_show_as_taught():
     crease, outline = "L_in_near_along", "R_tip_in"
     edges = {crease: taught_edge(crease=True), outline: taught_edge()}
     otherwise = {crease: taught_edge(), outline: taught_edge(crease=True)}
-    used = [{GRIPPER.edge_ids[e] for e in predicted(e, POSE).layout.edges} for e in (edges, otherwise, None)]
-    assert used[0] == {crease, outline}
-    assert used[1] == set()
-    assert outline in used[2] and crease not in used[2]
+    found, other, plain = (predicted(e, POSE) for e in (edges, otherwise, None))
+    used = [{GRIPPER.edge_ids[e] for e in p.layout.edges} for p in (found, other, plain)]
+    assert used[0] == {*used[2], crease} and used[1] == used[2] and crease not in used[2]
+    index = GRIPPER.edge_ids.index(outline)
+    assert np.abs(found.uv_px[found.layout.edge == index][0] - other.uv_px[other.layout.edge == index][0]).max() > 0.5
+    np.testing.assert_array_equal(other.uv_px, plain.uv_px)
+
+
+def test_edges_that_were_not_taught_may_lie_as_far_off_as_those_that_were():
+    found = predicted({"L_tip_near": taught_edge(offset_m=(1e-4, 2e-4))}, POSE)
+    usual_m = np.sqrt(0.5 * (1.0 + 4.0)) * 1e-4
+    other = GRIPPER.edge_ids.index("R_tip_in")
+    assert found.edge_spread_m[other] == pytest.approx(usual_m) and found.edge_spread_m[EDGE] < 2e-6
 
 
 def test_the_width_is_what_teaching_left():

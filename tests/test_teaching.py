@@ -243,7 +243,7 @@ def test_images_between_which_the_camera_moved_are_refused():
 def test_a_half_hidden_gripper_is_refused():
     image = image_of(0.0).copy()
     image[:, :430] = 128
-    with pytest.raises(TeachingRefused, match=r"the outlines|isn't found"):
+    with pytest.raises(TeachingRefused, match=r"the outlines|finger left isn't seen"):
         taught_from(image)
 
 

@@ -264,7 +264,7 @@ def _taught_line(taught: dict[str, Any] | None, visible: list[str]) -> str:
     count = f"{len(taught['edges'])} edges from {images} ({taught['file']}, {taught['time']})"
     farthest = f"farthest off {largest['edge']}, {1e6 * largest['offset_m']:+.0f} µm ({largest['offset_px']:+.2f} px)"
     missing = [name for name in visible if name not in taught["edges"]]
-    return f"{count}; {farthest}" + (f"; visible, but not taught and not used: {', '.join(missing)}" if missing else "")
+    return f"{count}; {farthest}" + (f"; visible, but not taught: {', '.join(missing)}" if missing else "")
 
 
 def _corner_line(corner: dict[str, Any]) -> str:

@@ -64,7 +64,8 @@ class EdgeLayout:
     """Which part of which edge is sampled how densely; holds while the view changes by some pixels only.
 
     ``edge`` (n,) ascending edge indices, ``fraction`` (n,) position between the edge's two ends, ``first`` (v,) index
-    of each visible edge's first sample and ``edges`` (v,) the visible edges themselves.
+    of each visible edge's first sample and ``edges`` (v,) the visible edges themselves.  ``as_taught`` (e,): the edge
+    shows as it was taught.
     """
 
     edge: NDArray[np.intp]
@@ -72,6 +73,7 @@ class EdgeLayout:
     edges: NDArray[np.intp]
     first: NDArray[np.intp]
     visible: NDArray[np.bool_]
+    as_taught: NDArray[np.bool_]
 
     @cached_property
     def stretch(self) -> NDArray[np.intp]:
@@ -186,17 +188,17 @@ def lay_out(
     """Choose the sampled part of each visible edge: inside the image, away from its ends; profiles by the root of its
     length.
 
-    With a taught model only its edges are used, and those only while they show as they were taught, as an outline or
-    as a crease: like is compared with like.
+    With a taught model creases that were taught are used, too.  An edge that shows otherwise than it was taught, as an
+    outline or as a crease, counts as not taught: like is compared with like.
     """
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     view = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3])
     points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
     start, end = points_cam_m[gripper.edge_points[:, 0]], points_cam_m[gripper.edge_points[:, 1]]
-    if taught is None:
-        wanted = view.visible & (settings.creases | ~view.crease)
-    else:
-        wanted = view.visible & taught.known & (view.crease == taught.crease)
+    as_taught = np.zeros(len(gripper.edge_ids), dtype=bool)
+    if taught is not None:
+        as_taught = taught.known & (view.crease == taught.crease)
+    wanted = view.visible & (settings.creases | ~view.crease | as_taught)
     coarse = np.linspace(0.0, 1.0, 65)
     uv = camera.project((start[:, None] + coarse[None, :, None] * (end - start)[:, None]).reshape(-1, 3)).reshape(
         -1, 65, 2
@@ -224,6 +226,7 @@ def lay_out(
         edges,
         first,
         view.visible,
+        as_taught,
     )
 
 
@@ -291,8 +294,9 @@ def predict(
     edge_spread_m: Array = gripper.edge_bevel_m / math.sqrt(12.0)
     if taught is not None:
         shift_px = np.einsum("ni,ni->n", gradient, taught.shift_at_m(edge, layout.fraction) @ rotation.T)
-        uv = uv + shift_px[:, None] * normal
-        edge_spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
+        uv = uv + (layout.as_taught[edge] * shift_px)[:, None] * normal
+        spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
+        edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
     ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
     along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)

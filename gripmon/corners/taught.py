@@ -187,11 +187,12 @@ def taught_pose(model: TaughtModel) -> Array:
 class TaughtEdges:
     """A taught model in arrays over all edges of the gripper.
 
-    ``known`` (e,) the edge was taught; ``crease`` (e,) as a line between two visible faces; ``share`` (e, 2) two places
-    on it, ``shift_grip_m`` (e, 2, 3) the line's shift off the model's edge there, gripper frame; ``sigma_m`` (e,) its
-    standard deviation across the line of sight, ``depth_grip`` (e, 3) the direction that was the line of sight, across
-    the edge, and ``depth_sigma_m`` (e,) the standard deviation along it; ``polarity`` (e,) int8 as in the gripper (1:
-    brighter to the right).  Where an edge is not known the numbers are those of no shift.
+    ``known`` (e,) the edge was taught; ``crease`` (e,) as a line between two visible faces; ``share`` (e, 2) where on
+    it it was seen, ``shift_grip_m`` (e, 2, 3) the line's shift off both ends of the model's edge, gripper frame;
+    ``sigma_m`` (e,) its standard deviation across the line of sight, ``depth_grip`` (e, 3) the direction that was the
+    line of sight, across the edge, and ``depth_sigma_m`` (e,) the standard deviation along it; ``polarity`` (e,) int8
+    as in the gripper (1: brighter to the right).  Where an edge is not known the numbers are those of no shift.
+    ``usual_m``: how far taught edges lie from the sharp model's, root mean square; so far others may lie, too.
     """
 
     known: NDArray[np.bool_]
@@ -202,6 +203,7 @@ class TaughtEdges:
     depth_grip: Array
     depth_sigma_m: Array
     polarity: NDArray[np.int8]
+    usual_m: float
 
     @classmethod
     def of(
@@ -210,17 +212,21 @@ class TaughtEdges:
         """Arrays of edges that were taught at a pose and a jaw opening."""
         listed = [edges.get(name, _UNTAUGHT) for name in gripper.edge_ids]
         across, depth = sight_axes(gripper, gripper.points_grip_m(jaw_opening_m), cam_T_grip)
+        share = np.array([e.share for e in listed])
         offset_m = np.array([e.offset_m for e in listed])
+        slope_m = (offset_m[:, 1] - offset_m[:, 0]) / (share[:, 1] - share[:, 0])
+        ends_m = offset_m[:, :1] + slope_m[:, None] * (np.array([0.0, 1.0]) - share[:, :1])
         depth_m = np.array([e.depth_m for e in listed])
         return cls(
             np.array([name in edges for name in gripper.edge_ids], dtype=bool),
             np.array([e.crease for e in listed], dtype=bool),
-            np.array([e.share for e in listed]),
-            offset_m[:, :, None] * across[:, None] + (depth_m[:, None] * depth)[:, None],
+            share,
+            ends_m[:, :, None] * across[:, None] + (depth_m[:, None] * depth)[:, None],
             np.sqrt(np.square([e.sigma_m for e in listed]).mean(axis=1)),
             depth,
             np.array([e.depth_sigma_m for e in listed]),
             np.array([_POLARITY[e.brighter] for e in listed], dtype=np.int8),
+            float(np.sqrt(np.mean(np.square([edge.offset_m for edge in edges.values()])))) if edges else 0.0,
         )
 
     @classmethod
@@ -231,9 +237,8 @@ class TaughtEdges:
 
     def shift_at_m(self, edge: NDArray[np.intp], fraction: Array) -> Array:
         """Shift (n, 3), gripper frame, of points on edges (n,) at fractions (n,) between their two ends."""
-        share, shift_m = self.share[edge], self.shift_grip_m[edge]
-        way = (fraction - share[:, 0]) / (share[:, 1] - share[:, 0])
-        return shift_m[:, 0] + way[:, None] * (shift_m[:, 1] - shift_m[:, 0])
+        shift_m = self.shift_grip_m[edge]
+        return shift_m[:, 0] + fraction[:, None] * (shift_m[:, 1] - shift_m[:, 0])
 
     def spread_m(self, gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> Array:
         """(e,) standard deviation of each taught edge's offset seen from here, m.
@@ -251,11 +256,19 @@ def sight_axes(gripper: Gripper, points_grip_m: Array, cam_T_grip: Array) -> tup
     ends = points_grip_m[gripper.edge_points]
     sight = ends[:, 0] - invert(cam_T_grip)[:3, 3]
     along = ends[:, 1] - ends[:, 0]
-    across = np.cross(sight, along)
+    across = _cross(sight, along)
     across /= np.sqrt(np.einsum("ei,ei->e", across, across))[:, None]
-    depth = np.cross(along, across)
+    depth = _cross(along, across)
     depth /= np.sqrt(np.einsum("ei,ei->e", depth, depth))[:, None]
     return across, depth
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Row by row; for a few rows np.cross spends most of its time on checks."""
+    out = np.empty_like(a)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        out[:, i] = a[:, j] * b[:, k] - a[:, k] * b[:, j]
+    return out
 
 
 _UNTAUGHT = TaughtEdge(share=(0.0, 1.0), offset_m=(0.0, 0.0), sigma_m=(0.0, 0.0), crease=False)

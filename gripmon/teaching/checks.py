@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.smoothing import GATE
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, motion_off
@@ -24,7 +23,8 @@ NOTED_PX = 1.0
 TAUGHT_SHARE = 0.5
 """Part of the outlines in view, by profiles, that must be seen: with fewer, something hides the gripper."""
 
-_LOST_SHARE = 0.25
+LOST_SHARE = 0.25
+"""With a smaller part the gripper, or a finger, isn't there."""
 
 AGREEING_PX = 0.5
 """So far the edges of an image may lie from where all images show them, in the median; else something has moved."""
@@ -32,17 +32,21 @@ AGREEING_PX = 0.5
 _FEWEST_SHARED = 4
 
 
-def check_enough(views: Sequence[View], crease: NDArray[np.bool_], lines: Mapping[int, EdgeLines]) -> None:
-    profiles = np.sum([view.prediction.profiles for view in views], axis=0)
-    outlines = np.flatnonzero((profiles > 0) & ~crease).tolist()
-    taught = sum(profiles[edge] for edge in outlines if edge in lines and lines[edge].images)
-    share = taught / max(profiles[outlines].sum(), 1)
+def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> None:
+    """Refuse a gripper of which too little is seen, on the whole or of one finger."""
+    profiles = np.sum([view.prediction.profiles for view in views], axis=0) * ~viewer.crease
+    seen = profiles * np.array([e in lines and bool(lines[e].images) for e in range(len(profiles))])
+    share = seen.sum() / max(profiles.sum(), 1)
     if share < TAUGHT_SHARE:
-        found = "the gripper isn't found: " if share < _LOST_SHARE else ""
+        found = "the gripper isn't found: " if share < LOST_SHARE else ""
         raise TeachingRefused(
             f"{found}only {100.0 * share:.0f} % of the outlines in view are seen as lines; at least "
             f"{100.0 * TAUGHT_SHARE:.0f} %: images in focus, at the reference and their jaw openings, the fingers free"
         )
+    for finger, name in enumerate(viewer.gripper.finger_ids):
+        own = viewer.gripper.edge_finger == finger
+        if profiles[own].sum() and seen[own].sum() < LOST_SHARE * profiles[own].sum():
+            raise TeachingRefused(f"finger {name} isn't seen; images in focus, all fingers free")
 
 
 def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:

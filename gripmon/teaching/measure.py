@@ -81,7 +81,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     gripper, images = viewer.gripper, [view.image for view in views]
     lines, untaught = _lines(viewer, views, search=True)
     check_standing(views, list(lines))
-    check_enough(views, viewer.crease, lines)
+    check_enough(viewer, views, lines)
     doubt = check_reference(viewer, images[0].name, lines)
     check_edges(viewer, views, lines)
     notes = _notes(viewer, lines, len(images), doubt)
