@@ -165,7 +165,9 @@ def find_candidates(
     # A flat top would round to a curvature of zero in single precision.
     left, centre, right = (values[at + k].astype(np.float64) for k in (-1, 0, 1))
     curvature = 2.0 * centre - left - right
-    shift = 0.5 * (right - left) / curvature
+    # A blurred step answers with a Gaussian, whose logarithm is a parabola.
+    log_left, log_centre, log_right = (np.log(np.maximum(v, 1e-3 * centre)) for v in (left, centre, right))
+    shift = 0.5 * (log_right - log_left) / (2.0 * log_centre - log_left - log_right)
     offset_px = kernel.first_offset_px + STEP_PX * (column + 1.0 + shift)
     step = response.ravel()[at].astype(np.float64)
     sigma_px = np.maximum(
