@@ -17,7 +17,8 @@ from gripmon.corners.consensus import (
     agree_from_grid,
     grid_of_starts,
 )
-from gripmon.corners.prediction import Prediction
+from gripmon.corners.look import unevenness
+from gripmon.corners.prediction import EdgeLayout, Prediction
 from gripmon.corners.search import search_poses
 from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement, Settler
 from gripmon.records import Array, Image
@@ -25,8 +26,17 @@ from gripmon.records import Array, Image
 FOUND_EDGES = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""
 
-SETTLED_STARTS = 2
-"""Starts of a wide search that are followed to the end."""
+LOOKS_LIKE_IT = (0.35, 0.7)
+"""Unevenness of the edges' calmer sides up to which a smaller part suffices, and that part."""
+
+LOOKS_OTHERWISE = 0.6
+"""Unevenness from which all edges must be seen: neither side of them is of one shade."""
+
+FITTED_AGAIN, SETTLED = 4, 2
+"""Places elsewhere that are fitted roughly once more, and that are followed to the end."""
+
+PROMISING, NEARLY_AS_GOOD = 0.8, 0.9
+"""What places must show in a rough fit to be followed: parts of the share to beat, and of the best one's."""
 
 SATISFIED = 0.65
 """Part of the usual share below which the gripper may be elsewhere."""
@@ -46,6 +56,14 @@ class Patience:
 
     when_doubtful: bool
     when_lost: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """Where the gripper may be, and the share that a rough fit shows there."""
+
+    share: float
+    expected: Expected
 
 
 class FingertipMeter(Settler):
@@ -81,22 +99,28 @@ class FingertipMeter(Settler):
         if best.consensus.share >= satisfied:
             best.trusted = best.consensus.share >= self._settings.consensus.trusted_share
             return best
-        best.trusted = trusted = self._trusted(best, usual_share)
-        if not (patience.when_doubtful if trusted else patience.when_lost):
+        best.trusted = self._trusted(image, best, usual_share)
+        if not (patience.when_doubtful if best.trusted else patience.when_lost):
             return best
+        best = self._from_elsewhere(image, expected, best, usual_share)
+        best.looked_far = True
+        return best
+
+    def _from_elsewhere(self, image: Image, expected: Expected, best: Measurement, usual_share: float) -> Measurement:
+        """The best of the places farther away, if one is better than the expected one."""
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
-        # be true.
-        beat = CLEARLY_BETTER * best.consensus.share if trusted else best.consensus.share
-        for look in (self._from_grid, self._search):
-            other = look(image, expected)
-            # A place that may be true is not given up for one that isn't believed.
-            if other.consensus.share > max(beat, best.consensus.share) and (
-                not trusted or self._trusted(other, usual_share)
-            ):
-                best = other
-            if best.consensus.share >= satisfied:
+        # be true, and such a place is not given up for one that isn't believed.
+        beat = (CLEARLY_BETTER if best.trusted else 1.0) * best.consensus.share
+        least = max(self._settings.consensus.found_share, TRUSTED * usual_share)
+        for effort, places in ((Effort.GRID, self._near_places), (Effort.SEARCH, self._far_places)):
+            again = [self._tried(image, place.expected) for place in _best(places(image, expected, usual_share))]
+            for place in _promising(again, PROMISING * max(beat, least)):
+                other = replace(self._settle(image, place.expected), effort=effort)
+                other.trusted = self._trusted(image, other, usual_share)
+                if other.consensus.share > beat and other.trusted >= best.trusted:
+                    best, beat = other, other.consensus.share
+            if best.trusted and best.consensus.share >= SATISFIED * usual_share:
                 break
-        best.trusted, best.looked_far = self._trusted(best, usual_share), True
         return best
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
@@ -106,21 +130,30 @@ class FingertipMeter(Settler):
             if zoom == chosen:
                 continue
             self._zoom_to(zoom)
+            beat = CLEARLY_BETTER * best.consensus.share
+            least = PROMISING * max(beat, self._settings.consensus.trusted_share)
+            if self._tried(image, expected).share < least:
+                continue
             other = self._settle(image, expected)
             # A coarse zoom reaches far and sees little: only where the edges are as blurred as it expects.
-            if other.consensus.share > CLEARLY_BETTER * best.consensus.share and self._fitting_zoom(other) == zoom:
+            if other.consensus.share > beat and self._fitting_zoom(other) == zoom:
                 best, chosen = other, zoom
         self._zoom_to(chosen)
         return best
 
-    def _trusted(self, measurement: Measurement, usual_share: float) -> bool:
-        consensus = self._settings.consensus
+    def _trusted(self, image: Image, measurement: Measurement, usual_share: float) -> bool:
+        consensus, share = self._settings.consensus, measurement.consensus.share
         if measurement.effort is Effort.NARROW:
-            return measurement.consensus.share >= max(consensus.trusted_share, TRUSTED * usual_share)
+            return share >= max(consensus.trusted_share, TRUSTED * usual_share)
+        if share < max(consensus.found_share, TRUSTED * usual_share):
+            return False
         # Slid along its fingers a gripper looks like itself but for its tips: elsewhere most edges must be seen.
-        return _shows_nearly_all(measurement) and measurement.consensus.share >= max(
-            consensus.found_share, TRUSTED * usual_share
-        )
+        uneven, part = unevenness(image, measurement.prediction), FOUND_EDGES
+        if uneven <= LOOKS_LIKE_IT[0]:
+            part = LOOKS_LIKE_IT[1]
+        elif uneven >= LOOKS_OTHERWISE:
+            part = 1.0
+        return bool(_seen_part(measurement.consensus, measurement.prediction) >= part)
 
     def _from_openings(self, image: Image, expected: Expected, satisfied: float, best: Measurement) -> Measurement:
         """Starts at other openings, for a jaw that moves and doesn't report it: nearby first, then in its whole range
@@ -151,36 +184,49 @@ class FingertipMeter(Settler):
                 best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
         return best
 
-    def _from_grid(self, image: Image, expected: Expected) -> Measurement:
-        """Starts all over the reach of the profiles; the best one settled."""
+    def _near_places(self, image: Image, expected: Expected, _usual_share: float) -> list[_Place]:
+        """The best of starts all over the reach of the profiles."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
-            return self._settle(image, expected)
+            return []
         settings = self._settings.consensus
         starts = grid_of_starts(prediction, self._reach_px, settings.start_width_px)
         prior = self._prior_about(prediction, expected)
-        consensus = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
-        return replace(self._settle(image, self._moved(prediction, consensus.xi, expected)), effort=Effort.GRID)
+        fit = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
+        return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
 
-    def _search(self, image: Image, expected: Expected) -> Measurement:
-        """The places that a search in a reduced image proposes, all tried roughly; the most promising are settled."""
-        tried = []
+    def _far_places(self, image: Image, expected: Expected, usual_share: float) -> list[_Place]:
+        """What a search in a reduced image proposes, up to the first that shows as well as usual."""
         search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
-        for cam_T_grip in search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search):
-            there = replace(expected, cam_T_grip=cam_T_grip)
-            seen = self._predict(self._lay_out(there), there)
-            if not seen.ok.any():
-                continue
-            prior = self._prior_about(seen, there)
-            fit = agree(self._look(image, seen), prior, np.zeros(len(self._prior)), self._settings.consensus)
-            tried.append((fit.share, self._moved(seen, fit.xi, there)))
-        tried.sort(key=lambda item: -item[0])
-        found = [self._settle(image, there) for _, there in tried[:SETTLED_STARTS]]
-        return replace(max(found, key=_agreement) if found else self._settle(image, expected), effort=Effort.SEARCH)
+        found: list[_Place] = []
+        layout = None
+        for pose in search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search):
+            there = replace(expected, cam_T_grip=pose)
+            layout = layout or self._lay_out(there)
+            found.append(self._tried(image, there, layout))
+            if found[-1].share >= usual_share:
+                break
+        return found
+
+    def _tried(self, image: Image, expected: Expected, layout: EdgeLayout | None = None) -> _Place:
+        """One rough fit, on a layout that was made near by, or on its own."""
+        prediction = self._predict(layout or self._lay_out(expected), expected)
+        if not prediction.ok.any():
+            return _Place(0.0, expected)
+        prior = self._prior_about(prediction, expected)
+        start = np.zeros(len(self._prior))
+        fit = agree(self._look(image, prediction), prior, start, self._settings.consensus)
+        return _Place(fit.share, self._moved(prediction, fit.xi, expected))
 
 
-def _agreement(measurement: Measurement) -> float:
-    return measurement.consensus.share
+def _best(places: list[_Place], count: int = FITTED_AGAIN) -> list[_Place]:
+    return sorted(places, key=lambda place: -place.share)[:count]
+
+
+def _promising(places: list[_Place], least: float) -> list[_Place]:
+    """The best places with at least such a share, and only those that may turn out as good as the first."""
+    best = _best(places, SETTLED)
+    return [place for place in best if place.share >= max(least, NEARLY_AS_GOOD * best[0].share)]
 
 
 def _shows_nearly_all(measurement: Measurement) -> bool:

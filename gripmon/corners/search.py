@@ -38,10 +38,10 @@ POINTS, FINE_POINTS = 80, 120
 TICK = 3.0
 """Step of turn and scale: so many cells of motion at the farthest outline point."""
 
-PLACES = 96
+PLACES = 64
 """Best places of the votes that are followed."""
 
-POLISHED = 36
+POLISHED = 24
 """Of these, how many are polished."""
 
 SHAKES = ((24, 2.5, 1.0), (12, 1.25, 0.5))

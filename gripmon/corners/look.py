@@ -1,0 +1,42 @@
+"""Whether a place looks like the gripper beside its edges, too: a finger's own side is of one shade, or nearly."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gripmon.corners.prediction import STEP_PX, Prediction
+from gripmon.corners.profiles import read_profiles
+from gripmon.records import Image
+
+BESIDE_PX = (2.0, 5.0)
+"""From where to where the grey levels beside an edge are averaged, px of the zoomed image: clear of its blur."""
+
+FEWEST_PROFILES = 5
+"""Profiles of an edge from which its sides are judged."""
+
+
+def unevenness(image: Image, prediction: Prediction) -> float:
+    """Standard deviation of the grey level along the more even side of each edge, over that beside all edges together;
+    1 where nothing can be told.
+
+    Along the gripper's outlines one side is the finger and the other whatever lies behind; where a background imitates
+    them, both sides vary alike.
+    """
+    profiles = read_profiles(image, prediction.map_x, prediction.map_y)
+    middle = profiles.shape[1] // 2
+    near, far = (min(round(way_px / STEP_PX), middle) for way_px in BESIDE_PX)
+    right = profiles[:, middle + near : middle + far + 1].mean(axis=1)
+    left = profiles[:, middle - far : middle - near + 1].mean(axis=1)
+    square, count, all_of_them = 0.0, 0, []
+    for edge in prediction.layout.edges:
+        own = (prediction.layout.edge == edge) & prediction.ok
+        number = int(np.count_nonzero(own))
+        if number < FEWEST_PROFILES:
+            continue
+        square += number * min(float(right[own].var()), float(left[own].var()))
+        count += number
+        all_of_them += [right[own], left[own]]
+    together = float(np.concatenate(all_of_them).var()) if all_of_them else 0.0
+    return math.sqrt(square / (count * together)) if together > 0.0 else 1.0
