@@ -106,6 +106,7 @@ def test_figures_of_known_errors():
         ({"nees": np.full(20, 8.0)}, "covariance too small"),
         ({"nees": np.full(20, 1.0)}, "covariance too large"),
         ({"nees": np.array([5.0] * 19 + [40.0])}, "covariance too small"),
+        ({"nees": np.array([3.0] * 19 + [40.0])}, "covariance too small"),
     ],
 )
 def test_verdicts(change: dict[str, Any], verdict: str):

@@ -96,8 +96,10 @@ def verdict(row: Figures, limit_um: Limit, *, always_seen: bool) -> str:
         faults.append(f"lost {100.0 * (1.0 - row['measured']):.1f} %")
     if row["wrong"] > 0.0:
         faults.append(f"lies {100.0 * row['wrong']:.1f} %")
-    if row["nees"] is not None and not (NEES_RANGE[0] <= row["nees"] <= NEES_RANGE[1] and row["in_gate"] >= IN_GATE):
-        faults.append("covariance too small" if row["nees"] > 6.0 else "covariance too large")
+    if row["nees"] is not None and (row["nees"] > NEES_RANGE[1] or row["in_gate"] < IN_GATE):
+        faults.append("covariance too small")
+    elif row["nees"] is not None and row["nees"] < NEES_RANGE[0]:
+        faults.append("covariance too large")
     return ", ".join(f for f in faults if f) or "met"
 
 

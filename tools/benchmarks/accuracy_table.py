@@ -13,7 +13,7 @@ LEGEND = (
     "mean, 95 %, max: error of the TCP in camera x / y / z, µm; rot: mean error of the rotation, millidegrees",
     "given: frames with a new transform, %; valid: verdict valid, %; wrong: valid, yet off by more than 0.2 mm, %",
     "NEES: squared normalised error of valid frames, 6 if the covariance is true; gate: share below 22.46 (99.9 %), %",
-    "ms, 99 %: median and 99th percentile of the time that a frame takes",
+    "ms, 99 %: median and 99th percentile of the processor time that a frame takes, one thread",
     "peer: mean error over that of the best markerless peer, worst axis, at most 0.33",
     "times: median time of the ArUco detector on the same frames over ours, at least 15",
     "limit: mean error to reach; the verdict tells by which factor the worst axis misses it, and other faults",
@@ -40,7 +40,7 @@ def about(results: dict[str, Any]) -> list[str]:
         f"{machine['cpu']}, {machine['cpus']} cores, {machine['system']}",
         f"Python {machine['python']}, {packages}",
         f"{plan['jobs']} rows at the same time, one thread each",
-        f"load average {machine['load_before']} before, {machine['load_after']} after; times grow with it",
+        f"load average {machine['load_before']} before, {machine['load_after']} after; it makes times longer",
     ]
 
 

@@ -195,10 +195,10 @@ def missing_peers() -> dict[str, str]:
 
 
 def timed(peer: Peer, image: Grey, jaw_opening_m: float) -> tuple[Array | None, float]:
-    """The peer's pose and its time, ms."""
-    start_ns = time.perf_counter_ns()
+    """The peer's pose and its processor time, ms; everybody runs in this one thread."""
+    start_ns = time.thread_time_ns()
     pose = peer.cam_T_grip(image, jaw_opening_m)
-    return pose, 1e-6 * (time.perf_counter_ns() - start_ns)
+    return pose, 1e-6 * (time.thread_time_ns() - start_ns)
 
 
 def _with_faces(gripper: Gripper) -> Gripper:
