@@ -122,8 +122,8 @@ def test_ground_truth_and_conventions_agree(replayed: dict[str, Lines]):
 
 
 def test_the_bump_is_found_when_it_happens(replayed: dict[str, Lines]):
-    """4.5 mm along camera y at frame 45: nothing before, then at once a jump, or the old transform held and a jump within
-    two frames, and a drift of the true size soon after.
+    """4.5 mm along camera y at frame 45: nothing before, then at once a jump, or the old transform held and a jump
+    within two frames, and a drift of the true size soon after.
     """
     lines, frames = replayed["bump_y"], truth("bump_y")
     alerts = [(line["seq"], alert["kind"], alert["cause"]) for line in lines for alert in line["alerts"]]
