@@ -327,7 +327,7 @@ class Policy:
 
 
 def _jump_alert(evidence: Evidence) -> Alert:
-    return Alert(AlertKind.JUMP, evidence.cause, Severity.WARNING, f"the transform jumped; {_shift_text(evidence)}")
+    return Alert(AlertKind.STEP, evidence.cause, Severity.WARNING, f"the transform jumped; {_shift_text(evidence)}")
 
 
 def _drift_alert(evidence: Evidence, past_limit: bool) -> Alert:

@@ -358,7 +358,7 @@ def truth(seq: int) -> FrameTruth:
 
 
 def test_the_comparison_counts_by_hand():
-    jump = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "it moved")
+    jump = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "it moved")
     recalibrated = Alert(AlertKind.RECALIBRATED, Cause.UNKNOWN, Severity.INFO, "a new reference")
     records = [record(i, (3e-6, 4e-6, -2e-6)) for i in range(4)]
     records += [record(4, (3e-6, 4e-6, -2e-6), alerts=(recalibrated,))]

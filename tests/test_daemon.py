@@ -123,7 +123,7 @@ def test_only_refused_frames_are_a_failure_at_the_end():
 
 
 def test_alerts_of_the_monitor_go_out_with_their_frame():
-    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    alert = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
     bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)} if seq == 1 else {}))
     bench.run()
     (said,) = bench.network.alerts
@@ -150,14 +150,14 @@ def test_a_new_reference_is_known_before_anything_names_it():
 
 
 def test_an_alert_has_the_stamp_of_its_frame():
-    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    alert = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
     told: dict[int, dict[str, object] | Exception] = {1: {"alerts": (alert,)}, 2: ValueError("singular")}
     script = [0, 1, 2, pause(0.05), Waiting("unplugged"), 3]
     bench = Bench(script, ScriptedMonitor(lambda seq: told.get(seq, {})), no_camera_alert_after_s=0.04)
     bench.run()
     jump, lost, missing, back = bench.network.alerts
     assert [(a.kind, a.stamp_ns) for a in (jump, lost, back)] == [
-        (AlertKind.JUMP, 1_001), (AlertKind.LOST, 1_002), (AlertKind.RECOVERED, 1_003)
+        (AlertKind.STEP, 1_001), (AlertKind.LOST, 1_002), (AlertKind.RECOVERED, 1_003)
     ]  # fmt: skip
     assert abs(missing.stamp_ns - time.time_ns()) < 60e9
 

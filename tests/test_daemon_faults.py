@@ -64,13 +64,13 @@ def test_a_broken_output_is_survived_for_a_while(fails: str):
 
 
 def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
-    alert = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    alert = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
     bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)}))
     bench.network = Listener(fails="transform")
     assert bench.run(estimates=tmp_path / "estimates.jsonl") == 0
     assert [frame.seq for frame, _ in bench.recording.offered] == [0, 1, 2]
     assert len((tmp_path / "estimates.jsonl").read_bytes().splitlines()) == 3
-    assert [said.kind for said in bench.network.alerts] == [AlertKind.JUMP] * 3
+    assert [said.kind for said in bench.network.alerts] == [AlertKind.STEP] * 3
     assert bench.network.states[-1].frames == 3
     assert bench.states[1] == (State.TRACKING, "transform not delivered: OSError: the line is cut")
     assert State.LOST not in [state for state, _ in bench.states]

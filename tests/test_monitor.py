@@ -125,7 +125,7 @@ def test_a_bump_is_a_jump_then_a_recalibration_near_the_truth(measurement: str):
     seen = watched("bump", measurement)
     bumped = next(t.index for t in seen.truths if "bumped" in t.events)
     kinds = seen.alerts()
-    assert kinds[0] == (bumped, AlertKind.JUMP), "noticed in its first frame"
+    assert kinds[0] == (bumped, AlertKind.STEP), "noticed in its first frame"
     assert all(seq >= bumped for seq, _ in kinds)
     [recalibrated] = [seq for seq, kind in kinds if kind is AlertKind.RECALIBRATED]
     assert bumped + 20 <= recalibrated <= bumped + 40, "after the ringing and twenty frames of rest"
@@ -187,7 +187,7 @@ def test_a_start_from_a_wrong_calibration_ends_at_the_right_one():
     wrong = moved(nominal_cam_T_grip(), np.array([0.003, -0.002, 0.001, 0.0, 0.01, 0.02]))
     seen = watch(frames, truths, new_monitor(cam_T_grip=wrong))
     assert seen.records[0].state is State.ACQUIRING
-    assert AlertKind.JUMP not in [kind for _, kind in seen.alerts()], "where it was before nobody saw"
+    assert AlertKind.STEP not in [kind for _, kind in seen.alerts()], "where it was before nobody saw"
     assert seen.records[-1].revision == 2
     assert np.abs(seen.errors()[5:, :2]).max() < 3e-5
 

@@ -113,7 +113,7 @@ TABLES: dict[str, list[Row]] = {
     "a jump within the limit: suspect until confirmed, then a drift": [
         (seen(), ACQUIRING, SUSPECT, [], False),
         (seen(), TRACKING, VALID, [], False),
-        (seen(1.0, jumped=True), TRACKING, SUSPECT, [K.JUMP], False),
+        (seen(1.0, jumped=True), TRACKING, SUSPECT, [K.STEP], False),
         *[(seen(1.0), TRACKING, VALID, [], False)] * 3,
         (seen(1.0), DRIFTING, VALID, [K.DRIFT], False),
         (seen(1.0), DRIFTING, VALID, [], False),
@@ -121,7 +121,7 @@ TABLES: dict[str, list[Row]] = {
     "a jump past the limit: recalibrates when it has stood still for four frames": [
         (seen(), ACQUIRING, SUSPECT, [], False),
         (seen(), TRACKING, VALID, [], False),
-        (seen(4.5, jumped=True), RECALIBRATING, SUSPECT, [K.JUMP], False),
+        (seen(4.5, jumped=True), RECALIBRATING, SUSPECT, [K.STEP], False),
         (seen(4.5), RECALIBRATING, VALID, [], False),
         (seen(4.8), RECALIBRATING, VALID, [], False),  # it still rings
         (seen(4.4), RECALIBRATING, VALID, [], False),
@@ -134,8 +134,8 @@ TABLES: dict[str, list[Row]] = {
     "two jumps": [
         (seen(), ACQUIRING, SUSPECT, [], False),
         (seen(), TRACKING, VALID, [], False),
-        (seen(1.0, jumped=True), TRACKING, SUSPECT, [K.JUMP], False),
-        (seen(jumped=True), TRACKING, SUSPECT, [K.JUMP], False),
+        (seen(1.0, jumped=True), TRACKING, SUSPECT, [K.STEP], False),
+        (seen(jumped=True), TRACKING, SUSPECT, [K.STEP], False),
         (seen(), TRACKING, VALID, [], False),
     ],
     "a turn past the limit without a shift": [
@@ -198,7 +198,7 @@ def test_without_recalibration_past_the_limit_is_a_drift_for_ever():
     judgements = run.feed_all([seen(4.5, jumped=True)] + [seen(4.5)] * 50)
     assert not any(j.recalibrate for j in judgements)
     assert judgements[-1].state is DRIFTING
-    assert kinds(judgements) == [K.JUMP, K.DRIFT]
+    assert kinds(judgements) == [K.STEP, K.DRIFT]
 
 
 def test_a_slow_creep_past_the_limit_recalibrates_only_when_it_stops():

@@ -43,7 +43,7 @@ from gripmon.records import (
 )
 
 COUNT = 24
-JUMP = Alert(AlertKind.JUMP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
+JUMP = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
 
 
 def story(i: int) -> FrameRecord:

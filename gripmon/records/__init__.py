@@ -1,0 +1,65 @@
+"""The records that travel between rooms, and what of them goes over the wire.
+
+Everything here is a value: frozen, without behaviour beyond packing.  The structs are encoded by ``msgspec``; the field
+names of :class:`FrameRecord` are the contract of one JSON line a frame (``gripmon replay``) and of the ``transform``
+key.
+
+Conventions: ``a_T_b`` maps coordinates in frame b to frame a; quaternions are ``x, y, z, w``; SI units; ``*_ns`` are
+Unix nanoseconds for capture time.  A covariance is 6x6, row by row: first the error of the TCP's position in camera
+axes (m²), then the rotation error vector in camera axes (rad²), that is ``t_true = t + rho`` and ``R_true =
+exp(omega) R``.
+"""
+
+from __future__ import annotations
+
+from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
+from gripmon.records.commands import Command, CommandName, CommandReply
+from gripmon.records.frames import (
+    CornerFault,
+    CornerRecord,
+    Frame,
+    FrameRecord,
+    MeasurementTrace,
+    Origin,
+    Refusal,
+    State,
+    Verdict,
+    unmeasured_record,
+)
+from gripmon.records.messages import AlertRecord, StateRecord
+from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
+from gripmon.records.values import Array, Drift, Image, Smoothed, Transform, to_json
+
+__all__ = [
+    "Alert",
+    "AlertEvent",
+    "AlertKind",
+    "AlertRecord",
+    "Array",
+    "Cause",
+    "CauseWeight",
+    "Command",
+    "CommandName",
+    "CommandReply",
+    "CornerFault",
+    "CornerRecord",
+    "Drift",
+    "Frame",
+    "FrameRecord",
+    "Image",
+    "MeasurementTrace",
+    "MonitorState",
+    "OpenAlert",
+    "Origin",
+    "ReferenceInputs",
+    "ReferenceRecord",
+    "Refusal",
+    "Severity",
+    "Smoothed",
+    "State",
+    "StateRecord",
+    "Transform",
+    "Verdict",
+    "to_json",
+    "unmeasured_record",
+]

@@ -1,0 +1,38 @@
+"""What an operator may tell a running monitor, and what it answers."""
+
+from __future__ import annotations
+
+import enum
+
+import msgspec
+
+
+class CommandName(enum.StrEnum):
+    """What an operator may tell a running monitor."""
+
+    RECALIBRATE = "recalibrate"
+    ACCEPT = "accept"
+    REJECT = "reject"
+    UNDO = "undo"
+    RESET = "reset"
+    ACKNOWLEDGE = "acknowledge"
+    STATE = "state"
+
+
+class Command(msgspec.Struct, frozen=True):
+    """``argument``: for ``undo`` the reference to go back to (empty: the one before), for ``accept`` and ``reject`` the
+    proposal that is meant (empty: the one there is), for ``acknowledge`` the alert (empty: all that are open).
+    """
+
+    name: CommandName
+    argument: str = ""
+
+
+class CommandReply(msgspec.Struct, frozen=True):
+    """``done`` or refused, and why, in ``text``; then nothing has changed.  The reference in force afterwards."""
+
+    name: CommandName
+    done: bool
+    text: str
+    reference_id: str
+    revision: int

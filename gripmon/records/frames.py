@@ -1,0 +1,169 @@
+"""A camera frame, and what the monitor decided about it."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records.alerts import Alert
+from gripmon.records.references import ReferenceRecord
+from gripmon.records.values import Array, Drift, Image, Smoothed, Transform
+
+
+class Verdict(enum.StrEnum):
+    """May a controller use the transform?"""
+
+    VALID = "valid"
+    SUSPECT = "suspect"
+    UNKNOWN = "unknown"
+
+
+class State(enum.StrEnum):
+    """What the monitor is doing."""
+
+    ACQUIRING = "acquiring"
+    TRACKING = "tracking"
+    DRIFTING = "drifting"
+    RECALIBRATING = "recalibrating"
+    OCCLUDED = "occluded"
+    LOST = "lost"
+    STALE = "stale"
+
+
+class Origin(enum.StrEnum):
+    """How the transform of a frame came about (``source`` on the wire)."""
+
+    UPDATE = "update"
+    RECALIBRATION = "recalibration"
+    HELD = "held"
+
+
+class Refusal(enum.StrEnum):
+    """Why a frame can't be measured at all."""
+
+    NOT_AN_IMAGE = "not_an_image"
+    WRONG_SIZE = "wrong_size"
+    WRONG_TYPE = "wrong_type"
+    NOT_FINITE = "not_finite"
+    BLACK = "black"
+    WHITE = "white"
+    FLAT = "flat"
+    JAW_OPENING = "jaw_opening"
+
+
+class CornerFault(enum.StrEnum):
+    """Why a corner was not measured, or not used."""
+
+    OUTSIDE = "outside"
+    SELF_HIDDEN = "self_hidden"
+    FEW_POINTS = "few_points"
+    HIDDEN = "hidden"
+    PARALLEL = "parallel"
+    UNCERTAIN = "uncertain"
+    LEFT_OUT = "left_out"
+    FRAME_REFUSED = "frame_refused"
+    NO_FIT = "no_fit"
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera frame as a source hands it over.
+
+    ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
+    (truncated file, failed read); ``fault`` then says why in a few words.  ``jaw_opening_m`` is what the robot
+    reported for this frame, None if nobody did.  ``name`` is the file or stream that the frame came from.
+    """
+
+    seq: int
+    stamp_ns: int
+    image: Image | None
+    jaw_opening_m: float | None = None
+    name: str = ""
+    fault: str | None = None
+
+
+class CornerRecord(msgspec.Struct, frozen=True):
+    """A corner in one frame: where it was measured (None if it was not), its standard deviation in px (the larger
+    axis).
+    """
+
+    id: str
+    uv_px: tuple[float, float] | None
+    sigma_px: float | None
+    used: bool
+    reason: CornerFault | None = None
+
+
+class FrameRecord(msgspec.Struct, frozen=True):
+    """What the monitor decided about one frame; the ``transform`` message and one line of ``replay``."""
+
+    seq: int
+    stamp_ns: int
+    verdict: Verdict
+    state: State
+    source: Origin
+    cam_T_grip: Transform | None
+    covariance: tuple[float, ...] | None
+    smoothed: Smoothed | None
+    drift: Drift | None
+    reference_id: str
+    revision: int
+    rms_px: float | None
+    jaw_opening_m: float | None
+    corners: tuple[CornerRecord, ...]
+    alerts: tuple[Alert, ...]
+    latency_ns: int = 0
+    reason: str | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementTrace:
+    """Pixels behind the newest record, for people who look: all positions in the distorted image, px.
+
+    ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether the fit believed them,
+    ``edge_index`` (n,) the gripper edge each belongs to; ``predicted_edges_uv_px`` one polyline (k, 2) a visible
+    edge; ``predicted_corners_uv_px`` (c, 2) in the order of the gripper model, NaN where a corner is not visible.
+    """
+
+    edge_uv_px: Array
+    edge_used: NDArray[np.bool_]
+    edge_index: NDArray[np.intp]
+    predicted_edges_uv_px: tuple[Array, ...]
+    predicted_corners_uv_px: Array
+
+
+def unmeasured_record(
+    frame: Frame,
+    reference: ReferenceRecord,
+    reason: str | None,
+    *,
+    verdict: Verdict = Verdict.UNKNOWN,
+    state: State = State.LOST,
+    corners: tuple[CornerRecord, ...] = (),
+    alerts: tuple[Alert, ...] = (),
+) -> FrameRecord:
+    """The record of a frame that gave no measurement, without a transform: by default there is nothing to stand by."""
+    return FrameRecord(
+        seq=frame.seq,
+        stamp_ns=frame.stamp_ns,
+        verdict=verdict,
+        state=state,
+        source=Origin.HELD,
+        cam_T_grip=None,
+        covariance=None,
+        smoothed=None,
+        drift=None,
+        reference_id=reference.reference_id,
+        revision=reference.revision,
+        rms_px=None,
+        jaw_opening_m=None,
+        corners=corners,
+        alerts=alerts,
+        reason=reason,
+        name=frame.name,
+    )
