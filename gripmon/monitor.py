@@ -5,7 +5,6 @@ A pure function of the frames so far: no clock, no I/O, no threads.  Time is the
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import replace
 from typing import Annotated, Literal
 
@@ -42,20 +41,28 @@ from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
 from gripmon.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.records import (
     Alert,
+    AlertKind,
     Array,
     Cause,
+    Command,
+    CommandName,
+    CommandReply,
     CornerFault,
     CornerRecord,
     Drift,
     Frame,
     FrameRecord,
     MeasurementTrace,
+    MonitorState,
     Origin,
     ReferenceRecord,
+    Severity,
     Smoothed,
+    State,
     Verdict,
     unmeasured_record,
 )
+from gripmon.references import CommandRefused, ReferenceBook
 from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
 
 USUAL_SHARE = 0.6
@@ -133,18 +140,28 @@ class Monitor:
         settings: MonitorSettings,
         reference: ReferenceRecord,
         taught: TaughtEdges | None = None,
+        state: MonitorState | None = None,
     ):
+        """``state``, where given, is what :meth:`state` said before a restart: its newest reference counts then.
+
+        Raises ValueError for a state that doesn't hold together.
+        """
         self._camera, self._gripper, self._settings = camera, gripper, settings
         # What was taught belongs to the gripper's edges: a new reference doesn't change it.
         self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
         self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
-        reference_sigma = np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal())
+        self._book = (
+            ReferenceBook(reference) if state is None else ReferenceBook.restored(state.references, state.proposal)
+        )
+        reference_sigma = np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal())
         self._policy = Policy(settings.policy, reference_sigma)
         self._average = PoseAverage(settings.smoothing)
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
-        self._reference = reference
-        self._ref_cam_T_grip = from_record(reference.cam_T_grip)
-        self._cam_T_grip = self._ref_cam_T_grip
+        self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
+        last = None if state is None else state.cam_T_grip
+        self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
+        self._restarted = state is not None  # and not yet said whether the picture fits
+        self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
         self._jaw_opening_m = gripper.jaw_nominal_m
         self._now_s = 0.0  # time that has passed since the first frame
@@ -158,7 +175,55 @@ class Monitor:
     @property
     def reference(self) -> ReferenceRecord:
         """The calibration that drift is measured against now."""
-        return self._reference
+        return self._book.current
+
+    @property
+    def state_revision(self) -> int:
+        """Grows with each change of what :meth:`state` gives, the last transform aside."""
+        return self._book.changes
+
+    def state(self) -> MonitorState:
+        """What has to survive a restart."""
+        last = None if self._covariance is None else to_record(self._cam_T_grip)
+        return MonitorState(self._book.history, self._book.proposal, cam_T_grip=last)
+
+    def command(self, command: Command, stamp_ns: int) -> CommandReply:
+        """Do what an operator asks, between two frames; what can't be done is refused and changes nothing."""
+        done = True
+        try:
+            text = self._obey(command, stamp_ns)
+        except CommandRefused as refusal:
+            done, text = False, str(refusal)
+        state = self.state() if command.name is CommandName.STATE else None
+        return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
+
+    def _obey(self, command: Command, stamp_ns: int) -> str:
+        name, argument = command.name, command.argument
+        if name is CommandName.STATE:
+            return f"{self._policy.state}, {self.reference.reference_id} in force, revision {self.reference.revision}"
+        if name is CommandName.ACKNOWLEDGE:
+            raise CommandRefused("no alert is open")
+        if name is CommandName.REJECT:
+            return f"{self._book.reject(argument).reference_id} is rejected"
+        if name is CommandName.RECALIBRATE:
+            if self._newest is None or not self._newest.trusted:
+                raise CommandRefused("nothing was measured in the newest frame")
+            before, told = self.reference, self._recalibrate(self._newest, stamp_ns)
+            if self.reference is before:
+                raise CommandRefused("not calibrated anew now" if told is None else told.text)
+            return f"calibrated anew: {self.reference.reference_id}"
+        if name is CommandName.ACCEPT:
+            self._book.accept(argument)
+        elif name is CommandName.UNDO:
+            self._book.undo(stamp_ns, argument)
+        else:
+            self._book.reset(stamp_ns)
+        self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
+        restored = self.reference.restores
+        text = f"{self.reference.reference_id} is in force" + (f" and restores {restored}" if restored else "")
+        kind = AlertKind.RESTORED if restored else AlertKind.RECALIBRATED
+        self._due.append(msgspec.structs.replace(self._policy.recalibrated(text), kind=kind))
+        return text
 
     def process(self, frame: Frame) -> FrameRecord:
         """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
@@ -181,11 +246,14 @@ class Monitor:
         self._average.add(self._cam_T_grip, self._covariance)
         judgement = self._policy.measured(evidence)
         origin, alerts = Origin.UPDATE, judgement.alerts
+        if self._restarted and judgement.state is not State.ACQUIRING:
+            self._restarted = False
+            alerts = (self._after_restart(evidence), *alerts)
         if judgement.recalibrate:
-            revision = self._reference.revision
+            revision = self.reference.revision
             told = self._recalibrate(measurement, frame.stamp_ns)
             alerts = alerts if told is None else (*alerts, told)
-            if self._reference.revision != revision:
+            if self.reference.revision != revision:
                 origin, drift = Origin.RECALIBRATION, self._drift()
         return self._record(frame, judgement, origin, alerts, measurement, drift)
 
@@ -341,20 +409,24 @@ class Monitor:
         if difference @ np.linalg.solve(pnp.covariance + new_covariance + self._floor, difference) > GATE:
             return self._policy.not_recalibrated("the corners contradict the edges")
         before = self._drift()
-        self._set_reference(new_T, new_covariance + self._floor, stamp_ns, "recalibration")
+        self._book.adopt(self._book.draft(new_T, new_covariance + self._floor, stamp_ns))
+        self._ref_cam_T_grip = new_T
         return self._policy.recalibrated(
             f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} "
             f"degrees; it was calibrated anew from {np.count_nonzero(taken)} corners: "
-            f"revision {self._reference.revision}"
+            f"revision {self.reference.revision}"
         )
 
-    def _set_reference(self, cam_T_grip: Array, covariance: Array, stamp_ns: int, origin: str) -> None:
-        digest = hashlib.sha256(cam_T_grip.tobytes()).hexdigest()[:8]
-        revision = self._reference.revision + 1
-        self._ref_cam_T_grip = cam_T_grip
-        self._reference = ReferenceRecord(
-            f"{origin}-{revision}-{digest}", revision, stamp_ns, origin, to_record(cam_T_grip), _flat(covariance)
+    def _after_restart(self, evidence: Evidence) -> Alert:
+        """Whether the picture fits the reference from which the monitor went on."""
+        sigma = np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal())
+        allowed = np.maximum(self._policy.test.smallest, 4.0 * np.hypot(sigma, evidence.sigma))
+        fits = bool((np.abs(evidence.shift) <= allowed).all())
+        text = f"restarted from {self.reference.reference_id}, revision {self.reference.revision}; the picture " + (
+            "fits it" if fits else "does not fit it: the camera has moved"
         )
+        text += f" ({1e3 * evidence.d_m:.2f} mm, {np.degrees(evidence.delta_rad):.2f} degrees)"
+        return Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.INFO if fits else Severity.WARNING, text)
 
     def _unmeasured(self, frame: Frame, reason: str, fault: CornerFault, refusal: str | None) -> FrameRecord:
         """The last transform held with a covariance that grows, or none when it is too old."""
@@ -362,12 +434,12 @@ class Monitor:
         corners = tuple(CornerRecord(name, None, None, False, fault) for name in self._gripper.corner_ids)
         blank = unmeasured_record(
             frame,
-            self._reference,
+            self.reference,
             reason,
             verdict=judgement.verdict,
             state=judgement.state,
             corners=corners,
-            alerts=judgement.alerts,
+            alerts=(*self._noted(), *judgement.alerts),
         )
         if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
             return blank
@@ -400,16 +472,20 @@ class Monitor:
             covariance=_flat(self._covariance),
             smoothed=self._smoothed(),
             drift=drift,
-            reference_id=self._reference.reference_id,
-            revision=self._reference.revision,
+            reference_id=self.reference.reference_id,
+            revision=self.reference.revision,
             rms_px=measurement.corner_rms_px(self._cam_T_grip),
             jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
             corners=_corner_records(
                 measurement, self._gripper.corner_ids, self._taken(measurement, self._settings.update_corners)
             ),
-            alerts=alerts,
+            alerts=(*self._noted(), *alerts),
             name=frame.name,
         )
+
+    def _noted(self) -> list[Alert]:
+        noted, self._due = self._due, []
+        return noted
 
     def _smoothed(self, growth: Array | float = 0.0) -> Smoothed | None:
         if self._average.cam_T_grip is None:

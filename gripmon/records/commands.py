@@ -6,6 +6,8 @@ import enum
 
 import msgspec
 
+from gripmon.records.references import MonitorState
+
 
 class CommandName(enum.StrEnum):
     """What an operator may tell a running monitor."""
@@ -29,10 +31,14 @@ class Command(msgspec.Struct, frozen=True):
 
 
 class CommandReply(msgspec.Struct, frozen=True):
-    """``done`` or refused, and why, in ``text``; then nothing has changed.  The reference in force afterwards."""
+    """``done`` or refused, and why, in ``text``; then nothing has changed.  The reference in force afterwards.
+
+    ``monitor`` answers ``state``: all references and proposals that other commands may name, and the open alerts.
+    """
 
     name: CommandName
     done: bool
     text: str
     reference_id: str
     revision: int
+    monitor: MonitorState | None = None
