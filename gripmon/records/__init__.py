@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
 from gripmon.records.commands import Command, CommandName, CommandReply
+from gripmon.records.evidence import EdgeEvidence
 from gripmon.records.frames import (
     CornerFault,
     CornerRecord,
@@ -44,6 +45,7 @@ __all__ = [
     "CornerFault",
     "CornerRecord",
     "Drift",
+    "EdgeEvidence",
     "Frame",
     "FrameRecord",
     "Image",

@@ -1,0 +1,5 @@
+"""What moved: competing models compared on the same edges, with probabilities."""
+
+from gripmon.causes.judge import CauseJudge, CauseSettings, Explanation
+
+__all__ = ["CauseJudge", "CauseSettings", "Explanation"]

@@ -1,0 +1,157 @@
+"""Where everything stands that may have moved, and where the edges' stretches should show then.
+
+The unknowns are one vector for all models: the camera's pose (6), the jaw opening (1), the logarithm of the focal
+length (1), and six for each finger.  A model of what moved frees some of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.geometry import exp_rotation, perturb, perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.records import Array, EdgeEvidence
+
+POSE, JAW, FOCAL, FINGERS = slice(0, 6), 6, 7, 8
+"""Places of the unknowns; finger f has the six from ``FINGERS + 6 f`` on: translation, then rotation about the middle
+of its points, camera axes."""
+
+
+def finger_slice(finger: int) -> slice:
+    return slice(FINGERS + 6 * finger, FINGERS + 6 * (finger + 1))
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """``cam_T_grip`` (4, 4), ``jaw_opening_m``, ``log_focal``: logarithm of the focal length over the calibrated one,
+    ``finger`` (f, 6): each finger's own motion beyond that, translation (m) and rotation vector (rad).
+    """
+
+    cam_T_grip: Array
+    jaw_opening_m: float
+    log_focal: float
+    finger: Array
+
+    def moved(self, step: Array, gripper: Gripper) -> State:
+        """After a step (m,) of all unknowns; an opening beyond the jaw's range stays at its end."""
+        opening_m = min(max(self.jaw_opening_m + float(step[JAW]), gripper.jaw_min_m), gripper.jaw_max_m)
+        return State(
+            perturb(self.cam_T_grip, step[POSE]),
+            opening_m,
+            self.log_focal + float(step[FOCAL]),
+            self.finger + step[FINGERS:].reshape(-1, 6),
+        )
+
+    def since(self, before: State) -> Array:
+        """(m,) the unknowns that lead from another state to this one."""
+        return np.concatenate(
+            [
+                perturbation_between(before.cam_T_grip, self.cam_T_grip),
+                [self.jaw_opening_m - before.jaw_opening_m, self.log_focal - before.log_focal],
+                (self.finger - before.finger).ravel(),
+            ]
+        )
+
+    def without_fingers(self) -> State:
+        return replace(self, finger=np.zeros_like(self.finger))
+
+
+class EdgeView:
+    """Predicts the stretches of one frame's evidence."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, evidence: EdgeEvidence):
+        self._gripper, self._evidence = gripper, evidence
+        self._ends = gripper.edge_points[evidence.edge]
+        self._finger = gripper.edge_finger[evidence.edge]
+        self._camera = camera
+        self._uv_px = camera.distort(evidence.xy)
+        self._centre_px = np.array([camera.cx_px, camera.cy_px])
+
+    def residual(self, state: State) -> tuple[Array, Array]:
+        """(s,) measured minus predicted place of each stretch across its edge, px, and (s, m) the derivative of the
+        predicted one by all unknowns.
+        """
+        points, rate = self._points(state)
+        a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
+        xy, by_focal = self._ideal(state.log_focal)
+        line = np.cross(a, b)
+        # The side on which offsets count as positive: to the left of the way from a to b in ideal coordinates.
+        along = b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:]
+        along /= np.sqrt(np.einsum("si,si->s", along, along))[:, None]
+        perp = np.column_stack([-along[:, 1], along[:, 0]])
+        size = np.einsum("si,si->s", line[:, :2], perp)
+        off = (np.einsum("si,si->s", line[:, :2], xy) + line[:, 2]) / size
+        per_px = self._evidence.per_px
+        spot = _on_edge(a, b, xy, along)
+        gradient = np.empty((len(xy), 3))
+        gradient[:, :2] = perp / spot[:, 2:]
+        gradient[:, 2] = -np.einsum("si,si->s", perp, spot[:, :2]) / spot[:, 2] ** 2
+        gradient /= per_px[:, None]
+        return off / per_px, self._jacobian(state, spot, gradient, rate, np.einsum("si,si->s", perp, by_focal) / per_px)
+
+    def _points(self, state: State) -> tuple[Array, Array]:
+        """All points (p, 3) in the camera frame, and their derivative by the opening (p, 3)."""
+        gripper, rotation = self._gripper, state.cam_T_grip[:3, :3]
+        opening_m = state.jaw_opening_m if gripper.has_jaw else None
+        points = gripper.points_grip_m(opening_m) @ rotation.T + state.cam_T_grip[:3, 3]
+        rate = gripper.point_motion(state.jaw_opening_m) @ rotation.T
+        self._middle = np.zeros((len(gripper.finger_ids), 3))
+        for finger, motion in enumerate(state.finger):
+            own = gripper.point_finger == finger
+            self._middle[finger] = points[own].mean(axis=0)
+            if motion.any():
+                lever = points[own] - self._middle[finger]
+                points[own] += lever @ (exp_rotation(motion[3:]) - np.eye(3)).T + motion[:3]
+        return points, rate
+
+    def _ideal(self, log_focal: float) -> tuple[Array, Array]:
+        """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
+        *predictions* by.
+        """
+        from_centre = self._uv_px - self._centre_px
+        xy, d_xy = self._camera.undistort_with_jacobian(self._centre_px + from_centre * np.exp(-log_focal))
+        return xy, np.einsum("sij,sj->si", d_xy, from_centre) * np.exp(-log_focal)
+
+    def _jacobian(self, state: State, spot: Array, gradient: Array, rate: Array, by_focal: Array) -> Array:
+        out = np.zeros((len(spot), FINGERS + state.finger.size))
+        out[:, :3] = gradient
+        out[:, 3:6] = np.cross(spot - state.cam_T_grip[:3, 3], gradient)
+        out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._ends[:, 0]])
+        out[:, FOCAL] = by_focal
+        about_middle = np.cross(spot - self._middle[self._finger] - state.finger[self._finger, :3], gradient)
+        for finger in range(len(state.finger)):
+            own = (self._finger == finger)[:, None]
+            start = FINGERS + 6 * finger
+            out[:, start : start + 3] = own * gradient
+            out[:, start + 3 : start + 6] = own * about_middle
+        return out
+
+
+def _on_edge(a: Array, b: Array, xy: Array, along: Array) -> Array:
+    """Points (s, 3) of the edges from a to b that show beside the places ``xy``: equally far along the image line."""
+    span = b - a
+    at = np.einsum("si,si->s", along, xy)
+    above = at * a[:, 2] - np.einsum("si,si->s", along, a[:, :2])
+    below = np.einsum("si,si->s", along, span[:, :2]) - at * span[:, 2]
+    return a + (above / below)[:, None] * span
+
+
+def finger_lever_m(gripper: Gripper) -> Array:
+    """(f,) root mean square distance of a finger's points from their middle: turns by a lever of one radian show as
+    motions of that size.
+    """
+    points = gripper.points_grip_m(None)
+    levers = []
+    for finger in range(len(gripper.finger_ids)):
+        own = points[gripper.point_finger == finger]
+        levers.append(float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())))
+    return np.array(levers)
+
+
+def fingers_of(evidence: EdgeEvidence, gripper: Gripper) -> NDArray[np.intp]:
+    """(f,) stretches seen on each finger."""
+    return np.bincount(gripper.edge_finger[evidence.edge], minlength=len(gripper.finger_ids))

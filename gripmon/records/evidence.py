@@ -1,0 +1,41 @@
+"""What one frame shows of each finger by itself, for those who ask what has moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records.values import Array
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeEvidence:
+    """Stretches of the fingers' edges (s of them) as each finger's own best rigid motion finds them; f fingers.
+
+    ``cam_T_grip`` (4, 4) is where all fingers together show, ``jaw_opening_m`` the opening that goes with it, and
+    ``jaw_reported_m`` what the robot said (None if nothing was reported).  A stretch is a piece of the gripper's edge
+    number ``edge`` (s,), about ``fraction`` (s,) of the way between its ends: the middle of the points measured on it
+    lies at ``xy`` (s, 2), ideal image coordinates x/z, y/z, and a distance of ``per_px`` (s,) across the edge shows as
+    one pixel.  ``sigma_px`` (s,) is the standard deviation of that middle if the points erred independently,
+    ``spread_px`` (s,) what all stretches of an edge share.  ``blur_px2`` (s,): variance of the edge's blur across it,
+    and ``across`` (s, 2) that direction in the image.
+
+    ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where none
+    was sampled; ``reach_px``: how far from the measured pose edges were looked for.
+    """
+
+    cam_T_grip: Array
+    jaw_opening_m: float
+    jaw_reported_m: float | None
+    edge: NDArray[np.intp]
+    fraction: Array
+    xy: Array
+    per_px: Array
+    sigma_px: Array
+    spread_px: Array
+    blur_px2: Array
+    across: Array
+    finger_share: Array
+    reach_px: float

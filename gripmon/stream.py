@@ -1,0 +1,271 @@
+"""Faults of the frame stream, told from the frames alone: frozen, replaced, a clock or a frame rate that went wrong.
+
+Time is the frames' own stamps.  Some 1,700 pixels of each frame are looked at, whatever its size.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from gripmon.records import Cause, Frame, Image
+
+_NS = 1_000_000_000
+
+SEEN_BEFORE = 8
+"""Newest frames among which a frame that comes again is recognised: drivers that hang hand over a ring of buffers."""
+
+USUAL_RUNS = 4
+"""A source that repeats frames now and then is frozen after so many times its longest repetition."""
+
+CALM_FRAMES = 30
+"""Frames without a fault of their stamps after which the clock is right again."""
+
+STANDING_STAMPS = 3
+"""Stamps that stand still, among that many frames, before it is the clock: one may be a frame handed over twice."""
+
+JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
+"""A stamp that is so many usual periods, and so long, after the one before has jumped."""
+
+BLOCK = 8
+"""Intervals that are taken together."""
+
+LEARN_BLOCKS, LEARN_NS = 6, 2 * _NS
+"""Blocks, and the time that they span, from which the usual rate is learnt."""
+
+ARRIVALS, MOST_BLOCKS = 64, 512
+"""How many newest intervals and blocks are kept."""
+
+REGULAR = 0.3
+"""Median deviation of the blocks over their median up to which there is a usual rate at all."""
+
+DEPARTED, RETURNED = 1.6, 1.3
+"""Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
+
+KIND_FRAMES, OTHER_FRAMES = 5, 3
+"""Frames in a row of one size and type after which that is the camera's own, and of another after which it is not."""
+
+
+class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """When a stream of frames counts as faulty."""
+
+    frozen_s: Annotated[
+        float, Meta(gt=0.0, le=3600.0, description="identical images for so long mean a frozen camera (s)")
+    ] = 1.0
+    frozen_frames: Annotated[int, Meta(ge=2, le=100000, description="and at least so many of them")] = 10
+    rate_s: Annotated[
+        float, Meta(gt=0.0, le=3600.0, description="a frame rate that is not the usual one for so long is a fault (s)")
+    ] = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class StreamFault:
+    """What is wrong with the stream now: of each ``kind`` there is one at a time."""
+
+    kind: Literal["frozen", "replaced", "clock", "rate"]
+    cause: Cause
+    text: str
+
+
+class StreamWatch:
+    """Watches one camera's stream.  A pure function of the frames so far."""
+
+    def __init__(self, settings: StreamSettings | None = None):
+        settings = settings or StreamSettings()
+        self._frozen = _Frozen(settings)
+        self._clock = _Clock()
+        self._rate = _Rate(settings)
+        self._kind = _Kind()
+
+    def add(self, frame: Frame) -> tuple[StreamFault, ...]:
+        """What is wrong now; empty when all is well.  Never raises for a bad frame."""
+        faults = (
+            self._clock.add(frame, self._rate.usual_ns),
+            self._rate.add(frame),
+            self._kind.add(frame.image),
+            self._frozen.add(frame, self._rate.usual_ns),
+        )
+        return tuple(fault for fault in faults if fault is not None)
+
+    @property
+    def frames_per_s(self) -> float | None:
+        """Rate at which frames arrive here, from the median interval of their stamps; None until known."""
+        return self._rate.frames_per_s
+
+
+class _Frozen:
+    """Sensors make noise: no two images of a working camera are the same."""
+
+    def __init__(self, settings: StreamSettings):
+        self._settings = settings
+        self._before: deque[int] = deque(maxlen=SEEN_BEFORE)
+        self._run = 0
+        self._since_ns = 0
+        self._longest = 0
+        self._frozen = False
+
+    def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
+        image = frame.image
+        if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
+            return None
+        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]
+        number = hash(sample.tobytes())
+        again = number in self._before
+        self._before.append(number)
+        # An even image shows no noise, and is another fault.
+        if not again or sample.size == 0 or sample.min() == sample.max():
+            self._longest = self._longest if self._frozen else max(self._longest, self._run)
+            self._run, self._since_ns, self._frozen = 0, frame.stamp_ns, False
+            return None
+        self._run += 1
+        # Stamps may stand still together with the images.
+        lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
+        enough = max(self._settings.frozen_frames, USUAL_RUNS * self._longest)
+        self._frozen |= self._run >= enough and lasted_ns >= _NS * self._settings.frozen_s
+        if not self._frozen:
+            return None
+        text = f"the last {self._run} images repeat earlier ones to the bit: the camera, or its driver, is frozen"
+        return StreamFault("frozen", Cause.CAMERA_FROZEN, text)
+
+
+class _Clock:
+    """Stamps rise, one after the other, by about the same."""
+
+    def __init__(self) -> None:
+        self._stamp_ns: int | None = None
+        self._seq = 0
+        self._calm = CALM_FRAMES
+        self._standing = 0
+        self._text = ""
+
+    def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
+        said = self._said(frame, usual_ns)
+        self._stamp_ns, self._seq = frame.stamp_ns, frame.seq
+        if said is None:
+            self._calm += 1
+            if self._calm >= CALM_FRAMES:
+                self._standing = 0
+                return None
+        else:
+            self._calm, self._text = 0, said
+        return StreamFault("clock", Cause.CLOCK, self._text) if self._text else None
+
+    def _said(self, frame: Frame, usual_ns: float | None) -> str | None:
+        if self._stamp_ns is None:
+            return None
+        step_ns = frame.stamp_ns - self._stamp_ns
+        if step_ns < 0:
+            return f"the frames' clock went back by {-1e-9 * step_ns:.3f} s"
+        if step_ns == 0:
+            self._standing += 1
+            return "the frames' clock stands still" if self._standing >= STANDING_STAMPS else None
+        frames = max(frame.seq - self._seq, 1)
+        if usual_ns is not None and step_ns > max(frames * JUMP_PERIODS * usual_ns, JUMP_NS):
+            return (
+                f"the frames' stamps jumped by {1e-9 * step_ns:.1f} s at once: the clock was set, or "
+                "no frame came for so long"
+            )
+        return None
+
+
+class _Rate:
+    """The interval from frame to frame, dropped ones reckoned in by their missing numbers.
+
+    Intervals are taken in blocks of some, of which the median counts.
+    """
+
+    def __init__(self, settings: StreamSettings):
+        self._settings = settings
+        self._last: tuple[int, int] | None = None
+        self._arrivals_ns: deque[int] = deque(maxlen=ARRIVALS)
+        self._block_ns: list[float] = []
+        self._blocks_ns: deque[tuple[float, float]] = deque(maxlen=MOST_BLOCKS)
+        self.usual_ns: float | None = None
+        self._fault: StreamFault | None = None
+
+    @property
+    def frames_per_s(self) -> float | None:
+        if len(self._arrivals_ns) < BLOCK:
+            return None
+        return _NS / statistics.median(self._arrivals_ns)
+
+    def add(self, frame: Frame) -> StreamFault | None:
+        last, self._last = self._last, (frame.seq, frame.stamp_ns)
+        if last is None or frame.stamp_ns <= last[1]:
+            return self._fault
+        step_ns = frame.stamp_ns - last[1]
+        interval_ns = step_ns / max(frame.seq - last[0], 1)
+        if self.usual_ns is not None and interval_ns > max(JUMP_PERIODS * self.usual_ns, JUMP_NS):
+            return self._fault  # the clock's fault
+        self._arrivals_ns.append(step_ns)
+        self._block_ns.append(interval_ns)
+        if len(self._block_ns) == BLOCK:
+            self._blocks_ns.append((statistics.median(self._block_ns), sum(self._block_ns)))
+            self._block_ns = []
+            if self.usual_ns is None:
+                self._learn()
+            else:
+                self._judge(self.usual_ns)
+        return self._fault
+
+    def _judge(self, usual_ns: float) -> None:
+        recent_ns, span_ns = [], 0.0
+        for middle_ns, lasted_ns in reversed(self._blocks_ns):
+            recent_ns.append(middle_ns)
+            span_ns += lasted_ns
+            if span_ns >= _NS * self._settings.rate_s:
+                break
+        else:
+            return
+        slower = statistics.median(recent_ns) / usual_ns
+        if max(slower, 1.0 / slower) > DEPARTED:
+            text = f"{_NS / (slower * usual_ns):.1f} frames a second arrive; {_NS / usual_ns:.1f} were usual"
+            self._fault = StreamFault("rate", Cause.CLOCK, text)
+        elif max(slower, 1.0 / slower) < RETURNED:
+            self._fault = None
+
+    def _learn(self) -> None:
+        blocks_ns = self._blocks_ns
+        if len(blocks_ns) < LEARN_BLOCKS or sum(lasted_ns for _, lasted_ns in blocks_ns) < LEARN_NS:
+            return
+        middle_ns = statistics.median(m for m, _ in blocks_ns)
+        # Frames that come as they like have no usual rate.
+        if statistics.median(abs(m - middle_ns) for m, _ in blocks_ns) < REGULAR * middle_ns:
+            self.usual_ns = middle_ns
+
+
+class _Kind:
+    """Size and type of the images, which a camera doesn't change by itself."""
+
+    def __init__(self) -> None:
+        self._own: tuple[tuple[int, ...], str] | None = None
+        self._candidate: tuple[tuple[int, ...], str] | None = None
+        self._run = 0
+
+    def add(self, image: Image | None) -> StreamFault | None:
+        if not isinstance(image, np.ndarray):
+            return None
+        kind = image.shape, image.dtype.name
+        self._run = self._run + 1 if kind == self._candidate else 1
+        self._candidate = kind
+        if self._own is None:
+            self._own = kind if self._run >= KIND_FRAMES else None
+            return None
+        if kind == self._own or self._run < OTHER_FRAMES:
+            return None
+        text = f"images are now {_words(kind)}; they were {_words(self._own)}: another camera, or another setting of it"
+        return StreamFault("replaced", Cause.CAMERA_REPLACED, text)
+
+
+def _words(kind: tuple[tuple[int, ...], str]) -> str:
+    shape, dtype = kind
+    if len(shape) < 2:
+        return f"arrays of shape {shape}"
+    colours = f" in {shape[2]} channels" if len(shape) == 3 else ""
+    return f"{shape[1]}x{shape[0]} px{colours} of type {dtype}"

@@ -1,0 +1,165 @@
+"""``tools/bench causes``: is the right cause named, and never a wrong one?"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+_DESCRIPTION = """\
+Lets one thing go wrong at a time before simulated cameras, at random: the mount moves (0.1 to 10 mm, 0.05 to 5
+degrees), one finger is bent (0.15 to 1.5 mm at its tip), the jaw opening is reported wrong (0.1 to 2 mm), focal
+length (0.2 to 3 %) or focus (1 to 3 px) change, a hand or a sheet covers the view, images turn dark, white, flat,
+noisy or are missing, the camera freezes or is replaced, its clock or its frame rate goes wrong; or nothing does.
+Grippers of four shapes, three cameras with lenses of their own, poses, openings, still and moving backgrounds and how
+the opening is reported (exact, noisy, not at all) are random, and no trial is left out.  Prints which cause was told:
+right, another one (wrong), or unknown.  A finger counts as right only if it is the bent one.  Takes about an hour."""
+
+RIGHT_OR_UNKNOWN, WRONG = 0.95, 0.01
+"""To reach, of all trials."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One trial: its number, what went wrong, what was told and how it was weighed."""
+
+    row: str
+    number: int
+    what: str
+    told: str
+    part: str | None
+    right: bool
+    wrong: bool
+    causes: tuple[tuple[str, str | None, float], ...]
+    text: str
+
+
+def add_parser(commands: Any) -> None:
+    """Add the benchmark to ``tools/bench``."""
+    parser = commands.add_parser(
+        "causes",
+        help="is the right cause named when something goes wrong",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--trials", type=_count, default=200, metavar="N", help="of each cause (default 200)")
+    parser.add_argument("--only", metavar="ROWS", help="rows, separated by commas (default: all)")
+    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write every trial")
+    parser.set_defaults(handler=run)
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value}; at least 1")
+    return value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``tools/bench causes``."""
+    from benchmarks import machine
+    from benchmarks.causes_trials import ROWS
+
+    rows = list(ROWS) if arguments.only is None else arguments.only.split(",")
+    strange = [row for row in rows if row not in ROWS]
+    if strange:
+        print(f"--only: there is no row {strange[0]}; {', '.join(ROWS)}", file=sys.stderr)
+        return 2
+    described = machine.description()
+    outcomes = measure(rows, arguments.trials, arguments.seed)
+    print(as_text(described, arguments.seed, outcomes))
+    if arguments.json is not None:
+        plain = [dataclasses.asdict(outcome) for outcome in outcomes]
+        arguments.json.write_text(
+            json.dumps({"machine": described, "seed": arguments.seed, "trials": plain}, indent=1) + "\n"
+        )
+    return 0
+
+
+def measure(rows: list[str], trials: int, seed: int) -> list[Outcome]:
+    """All outcomes, the rows in turn so that a part of the trials tells about all of them."""
+    from tqdm import tqdm
+
+    from benchmarks import causes_runs
+    from benchmarks.causes_trials import ROWS, make_trial
+
+    outcomes = []
+    with tqdm(total=trials * len(rows), desc="trials", unit="trial", file=sys.stderr, disable=None) as bar:
+        for number in range(trials):
+            for name in rows:
+                trial = make_trial(ROWS[name], seed, number)
+                outcomes.append(judged(name, number, trial, causes_runs.run(trial)))
+                bar.update()
+    return outcomes
+
+
+def judged(row: str, number: int, trial: Any, told: Any) -> Outcome:
+    """Right: the cause, and the finger where it is one's; where nothing happened, that none is named."""
+    from benchmarks.causes_trials import ROWS
+    from gripmon.records import Cause
+
+    expected = ROWS[row].cause
+    named = told.cause is not Cause.UNKNOWN
+    right = told.cause is expected and told.part == trial.part if expected is not None else not named
+    return Outcome(
+        row,
+        number,
+        f"{trial.what}; {trial.rig.gripper.name}, {trial.rig.scenario.background.kind} "
+        f"{trial.rig.scenario.background.motion}",
+        told.cause.value,
+        told.part,
+        right,
+        named and not right,
+        told.causes,
+        told.text,
+    )
+
+
+def as_text(machine: dict[str, Any], seed: int, outcomes: list[Outcome]) -> str:
+    """The confusion matrix, the shares, and every wrong one."""
+    rows = list(dict.fromkeys(outcome.row for outcome in outcomes))
+    columns = list(dict.fromkeys(o.told for o in sorted(outcomes, key=lambda o: rows.index(o.row))))
+    lines = [
+        f"gripmon {machine['commit']}, {machine['date']}",
+        f"{machine['cpu']}, {machine['cpus']} cores, {machine['system']}",
+        f"seed {seed}; what went wrong (rows), what was told (columns)",
+        "",
+        _row("", *(column.replace("_", " ")[:13] for column in columns), "right", "unknown", "wrong"),
+    ]
+    for row in rows:
+        own = [o for o in outcomes if o.row == row]
+        counts = [str(sum(o.told == column for o in own) or ".") for column in columns]
+        lines.append(_row(row, *counts, *_shares(own)))
+    lines += ["", _row("all", *("" for _ in columns), *_shares(outcomes)), "", "targets", *_targets(outcomes)]
+    wrong = [o for o in outcomes if o.wrong]
+    lines += ["", f"{len(wrong)} wrong"] if wrong else []
+    for o in wrong:
+        lines.append(f"  {o.row} {o.number}: {o.what}: {o.text}")
+    return "\n".join(lines)
+
+
+def _shares(outcomes: list[Outcome]) -> tuple[str, str, str]:
+    right, wrong = sum(o.right for o in outcomes), sum(o.wrong for o in outcomes)
+    parts = right, len(outcomes) - right - wrong, wrong
+    return tuple(f"{100.0 * part / len(outcomes):.1f} %" for part in parts)  # type: ignore[return-value]
+
+
+def _targets(outcomes: list[Outcome]) -> list[str]:
+    wrong = sum(o.wrong for o in outcomes) / len(outcomes)
+    return [
+        f"  right or unknown in at least 95 %: {100.0 * (1.0 - wrong):.1f} %{_met(1.0 - wrong >= RIGHT_OR_UNKNOWN)}",
+        f"  wrong in at most 1 %: {100.0 * wrong:.1f} %{_met(wrong <= WRONG)}",
+    ]
+
+
+def _met(met: bool) -> str:
+    return "   met" if met else "   NOT MET"
+
+
+def _row(label: str, *values: str) -> str:
+    return label.ljust(10) + "".join(value.rjust(14) for value in values)

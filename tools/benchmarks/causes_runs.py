@@ -1,0 +1,80 @@
+"""One trial of ``tools/bench causes``: a monitor sees its frames, and in the end a cause is told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.causes_trials import START_SIGMA, Trial
+from gripmon.camera import make_camera
+from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.geometry import to_record
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.policy import PolicySettings
+from gripmon.records import Cause, Frame, FrameRecord, ReferenceRecord
+from gripmon.stream import StreamWatch
+
+LAST = 6
+"""Newest frames of which most decide whether images are refused, or nothing is measured."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What was told in the end: ``cause`` UNKNOWN also where nothing seems wrong, ``part`` the finger, ``causes`` as
+    in an alert, in words.
+    """
+
+    cause: Cause
+    part: str | None
+    causes: tuple[tuple[str, str | None, float], ...]
+    text: str
+
+
+def run(trial: Trial) -> Told:
+    """Show a trial to a monitor with a judge and a stream watch beside it."""
+    rig = trial.rig
+    camera = make_camera(rig.camera_settings)
+    reference = ReferenceRecord(
+        "start", 1, 0, "configuration", to_record(rig.start_cam_T_grip), tuple(np.diag(START_SIGMA**2).ravel().tolist())
+    )
+    settings = MonitorSettings(
+        jaw_sigma_m=rig.jaw_sigma_m, policy=PolicySettings(frames_per_s=rig.scenario.fps, recalibrate=False)
+    )
+    monitor = Monitor(camera, rig.gripper, settings, reference)
+    judge = CauseJudge(
+        camera, rig.gripper, CauseSettings(), START_SIGMA, settings.jaw_sigma_m, settings.jaw_offset_sigma_m
+    )
+    stream = StreamWatch()
+    records: list[FrameRecord] = []
+    faults = []
+    for index, frame in enumerate(trial.frames()):
+        # What happened at some time counts, also when it is over.
+        faults += stream.add(frame)
+        records.append(monitor.process(frame))
+        _judge(monitor, judge, rig.start_cam_T_grip, frame, index < trial.well)
+    if faults:
+        return Told(faults[0].cause, None, (), faults[0].text)
+    return _told(judge, records[-LAST:])
+
+
+def _judge(monitor: Monitor, judge: CauseJudge, ref_cam_T_grip: np.ndarray, frame: Frame, well: bool) -> None:
+    measurement = monitor._newest
+    if measurement is None or not measurement.trusted or (well and not judge.wants_baseline):
+        return
+    evidence = monitor._meter.evidence(measurement, ref_cam_T_grip, jaw_reported=frame.jaw_opening_m is not None)
+    (judge.well if well else judge.add)(evidence, ref_cam_T_grip)
+
+
+def _told(judge: CauseJudge, newest: Iterable[FrameRecord]) -> Told:
+    records = list(newest)
+    refused = [r for r in records if r.reason is not None and r.reason.split(":")[0] != r.reason]
+    unmeasured = [r for r in records if r.reason is not None]
+    if 2 * len(refused) > len(records):
+        return Told(Cause.IMAGE_BAD, None, (), refused[-1].reason or "")
+    if 2 * len(unmeasured) > len(records):
+        return Told(Cause.VIEW_BLOCKED, None, (), unmeasured[-1].reason or "")
+    explanation = judge.explanation()
+    weights = tuple((c.cause.value, c.part, c.probability) for c in explanation.causes)
+    return Told(explanation.probable.cause, explanation.probable.part, weights, explanation.text)
