@@ -3,26 +3,49 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
-import tempfile
+import secrets
 from pathlib import Path
 
 
 def write_atomically(path: Path, data: bytes) -> None:
     """Write under another name beside ``path``, then rename: a reader sees the old file or the new one, and a fault
-    leaves the old one.  OSError if it can't be written.
+    leaves the old one.  When this returns, the new one survives a power cut.  OSError if it can't be written.
     """
-    descriptor, name = tempfile.mkstemp(prefix=f".{path.name}-", suffix=".tmp", dir=path.parent)
+    name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
+    # With the mode that any new file gets: mkstemp's is narrower, and the umask can't be read without changing it.
+    descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        Path(name).chmod(0o666 & ~mask)
-        Path(name).replace(path)
+        name.replace(path)
     except BaseException:
         with contextlib.suppress(OSError):
-            Path(name).unlink()
+            name.unlink()
         raise
+    _sync_folder(path.parent)
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what processes that were killed while they wrote ``path`` have left beside it.
+
+    Only for the one process that writes this file.  OSError if it may not be done.
+    """
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}-*.tmp"):
+        leftover.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """The new name itself survives a power cut; file systems that can't do that for folders say so, and are let off."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:
+        return  # a folder that may be written but not read
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -11,14 +11,23 @@ Nothing here waits for the monitor to start: a client that comes first is connec
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Self, TypeVar
 
 import msgspec
 import zenoh
 
-from gripmon.publish import DEFAULT_ENDPOINT, Keys, PublishSettings, zenoh_config
-from gripmon.records import FrameRecord, ReferenceRecord, StateRecord
+from gripmon.publish import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
+from gripmon.records import (
+    CommandError,
+    CommandFault,
+    CommandName,
+    CommandReply,
+    FrameRecord,
+    ReferenceRecord,
+    StateRecord,
+)
 
 _T = TypeVar("_T")
 
@@ -31,6 +40,17 @@ class MonitorName(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.robot}/{self.camera}"
+
+
+class NotCarriedOut(Exception):
+    """A command got no answer of the monitor itself: none is there, or it had no time for it; ``fault`` says which.
+
+    A refusal is no exception but an answer: ``CommandReply.done`` is false.
+    """
+
+    def __init__(self, text: str, fault: CommandFault | None = None) -> None:
+        super().__init__(text)
+        self.fault = fault
 
 
 class Client:
@@ -59,7 +79,7 @@ class Client:
             settings = PublishSettings(zenoh_config=zenoh_config_file)
         else:
             settings = PublishSettings(listen=(), connect=tuple(connect))
-        self._session = zenoh.open(zenoh_config(settings))
+        self._session = open_session(zenoh_config(settings), settings)
         self._decode = msgspec.json.Decoder(FrameRecord).decode
         self._depth = depth
         self._heard: MonitorName | None = None
@@ -117,6 +137,24 @@ class Client:
         replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
         return tuple(sorted({_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
+    def send(self, name: CommandName, argument: str = "", timeout_s: float = 5.0) -> CommandReply:
+        """Tell the monitor something (:class:`gripmon.records.Command`) and wait for its answer.
+
+        A refused command has changed nothing.  Raises :class:`NotCarriedOut`; LookupError if the name is that of more
+        than one monitor.
+        """
+        monitor = self._only_one(timeout_s)
+        payload = msgspec.json.encode({"argument": argument}) if argument else b""
+        for reply in self._session.get(
+            Keys(*monitor)[f"cmd/{name.value}"], payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL
+        ):
+            if reply.ok is not None:
+                return msgspec.json.decode(reply.ok.payload.to_bytes(), type=CommandReply)
+            assert reply.err is not None
+            error = msgspec.json.decode(reply.err.payload.to_bytes(), type=CommandError)
+            raise NotCarriedOut(f"{monitor}: {error.text}", error.error)
+        raise NotCarriedOut(f"{monitor} doesn't answer; it may be told not to take commands (publish.commands)")
+
     def close(self) -> None:
         """Leave the network; iterations and callbacks end."""
         self._session.close()
@@ -142,6 +180,20 @@ class Client:
                 self._check_name(reply.ok.key_expr)
                 answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=record_type)
         return answer
+
+    def _only_one(self, timeout_s: float) -> MonitorName:
+        """The one monitor that is meant, as soon as it is seen."""
+        end_s = time.monotonic() + timeout_s
+        while not (alive := self.alive()):
+            if time.monotonic() >= end_s:
+                raise NotCarriedOut(f"no monitor {self.keys.robot}/{self.keys.camera} is on the network")
+            time.sleep(0.02)
+        if len(alive) > 1:
+            names = ", ".join(map(str, alive))
+            raise LookupError(
+                f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {names}; name the camera"
+            )
+        return alive[0]
 
     def _check_name(self, key: zenoh.KeyExpr) -> None:
         name = _name(key)

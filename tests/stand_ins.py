@@ -10,11 +10,14 @@ from loopback import frame_record, reference_record
 from gripmon.recording import Trace
 from gripmon.records import (
     AlertRecord,
+    Command,
+    CommandReply,
     CornerFault,
     CornerRecord,
     Frame,
     FrameRecord,
     MeasurementTrace,
+    MonitorState,
     Origin,
     ReferenceRecord,
     StateRecord,
@@ -38,17 +41,41 @@ class ScriptedMonitor:
         self.answers = answers
         self.frames: list[Frame] = []
         self.reference = reference_record(3)
+        self.state_revision = 0
+        self.obeyed: list[tuple[Command, int]] = []
 
     def process(self, frame: Frame) -> FrameRecord:
         self.frames.append(frame)
         answer = self.answers(frame.seq)
         if isinstance(answer, Exception):
             raise answer
-        values = {"stamp_ns": frame.stamp_ns, "alerts": (), "jaw_opening_m": frame.jaw_opening_m} | answer
+        values = {
+            "stamp_ns": frame.stamp_ns,
+            "alerts": (),
+            "jaw_opening_m": frame.jaw_opening_m,
+            "revision": self.reference.revision,
+            **answer,
+        }
         record = frame_record(frame.seq, **values)
         if record.revision != self.reference.revision:
             self.reference = reference_record(record.revision)
+            self.state_revision += 1
         return record
+
+    def command(self, command: Command, stamp_ns: int) -> CommandReply:
+        """Every command makes a new reference, but one with an argument is refused, and with "fail" it raises."""
+        if command.argument == "fail":
+            raise RuntimeError("out of order")
+        self.obeyed.append((command, stamp_ns))
+        done = not command.argument
+        if done:
+            self.reference = reference_record(self.reference.revision + 1)
+            self.state_revision += 1
+        text = "as you like" if done else "not so"
+        return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision)
+
+    def state(self) -> MonitorState:
+        return MonitorState((self.reference,))
 
     def trace(self) -> MeasurementTrace | None:
         return None

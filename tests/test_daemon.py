@@ -21,8 +21,10 @@ from stand_ins import REFUSED, ScriptedMonitor
 from gripmon.daemon import EstimatesFile, log_to_stderr
 from gripmon.records import (
     Alert,
+    AlertEvent,
     AlertKind,
     Cause,
+    CauseWeight,
     Frame,
     FrameRecord,
     Severity,
@@ -123,11 +125,15 @@ def test_only_refused_frames_are_a_failure_at_the_end():
 
 
 def test_alerts_of_the_monitor_go_out_with_their_frame():
-    alert = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm")
+    alert = Alert(
+        AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 4.5 mm", AlertEvent.RAISED, "a-7", "left",
+        (CauseWeight(Cause.CAMERA_MOUNT, 0.9),), (0.001, 0.002, 0.003), 0.02, 1e-5, 60.0, 12, True,
+    )  # fmt: skip
     bench = Bench(range(3), ScriptedMonitor(lambda seq: {"alerts": (alert,)} if seq == 1 else {}))
     bench.run()
     (said,) = bench.network.alerts
-    assert (said.seq, said.kind, said.cause, said.severity, said.text) == (1, *msgspec.structs.astuple(alert))
+    told = msgspec.structs.asdict(alert)
+    assert said.seq == 1 and {name: getattr(said, name) for name in told} == told
     assert bench.recording.alerts == []  # the frame's own record takes it there
 
 

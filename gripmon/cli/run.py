@@ -14,17 +14,26 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.daemon import JawFeed
-    from gripmon.publish import Publisher
+    from gripmon.publish import Publisher, ZenohCommands
     from gripmon.recording import Recorder
+    from gripmon.records import Alert, ReferenceRecord
+    from gripmon.statefile import StateFile
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
 interrupted (Ctrl-C or SIGTERM).  A camera that is missing or goes away is tried again for ever, and
-the state on the network says so."""
+the state on the network says so.
+
+The references, a proposal and open alerts survive a restart, also kill -9 and a power cut, in the file
+that state.file names: a live camera's in ~/.local/state/gripmon.  After a restart the monitor goes on
+from the last reference, checks in the picture that it still fits, and says so (alert restarted)."""
 
 _EXAMPLES = """\
   gripmon run configs/live_camera.yaml
   gripmon run configs/demo.yaml --duration 60 --out results
+
+  gripmon run configs/live_camera.yaml --fresh-state     begin anew; the kept state is set aside
+  gripmon send undo --robot arm1                         back to the reference before
 
 Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}.
 exit codes: 0 the source ended, the time was over, or SIGTERM; 2 wrong usage or configuration; 3 no
@@ -45,6 +54,11 @@ def add_parser(commands: Any) -> None:
         metavar="DIR",
         help="put the recording and estimates.jsonl (one JSON line a frame) here; made if it is missing",
     )
+    parser.add_argument(
+        "--fresh-state",
+        action="store_true",
+        help="start from the configured reference; a kept state is set aside as <file>.replaced-<n>",
+    )
     parser.add_argument("--verbose", action="store_true", help="say more on stderr")
 
 
@@ -52,7 +66,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
     config = common.load(arguments.config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
-    return run_daemon(config, out=out, duration_s=arguments.duration, verbose=arguments.verbose)
+    return run_daemon(
+        config,
+        out=out,
+        duration_s=arguments.duration,
+        verbose=arguments.verbose,
+        keep_state=True,
+        fresh_state=arguments.fresh_state,
+    )
 
 
 def run_daemon(
@@ -64,11 +85,15 @@ def run_daemon(
     recording_name: str | None = None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
     on_network: Callable[[], None] = lambda: None,
+    keep_state: bool = False,
+    fresh_state: bool = False,
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
     ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
     goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
+    ``keep_state``: what survives a restart is read from the configuration's state file, unless ``fresh_state``, and
+    kept there.
     """
     import cv2
 
@@ -82,12 +107,19 @@ def run_daemon(
         common.check_file(estimates)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
-    monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges)
     with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
-        publisher, jaw = _open_publisher(config)
+        kept = _open_state(config, fresh=fresh_state) if keep_state else None
+        if kept is not None:
+            opened.callback(kept.close)
+            config = dataclasses.replace(config, reference=kept.configured)
+        state = None if kept is None else kept.state
+        monitor = Monitor(
+            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
+        )
+        publisher, jaw, commands = _open_publisher(config)
         opened.callback(publisher.close)
         on_network()
-        recorder = _open_recorder(config, out, recording_name, truth_tcp_m)
+        recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
         opened.callback(recorder.close)
         try:
             source = open_source(settings.source, config.directory, scene=config.scene)
@@ -104,6 +136,9 @@ def run_daemon(
             camera=settings.camera_name,
             estimates=estimates,
             jaw=jaw,
+            keeper=daemon.StateKeeper(kept),
+            commands=commands,
+            notices=_notices(kept),
             duration_s=duration_s,
         )
 
@@ -121,14 +156,33 @@ class _FixedJaw:
         return ""
 
 
-def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None]:
-    """The publisher and where the jaw opening comes from; None: with the frames."""
+def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
+    """The file for what survives a restart; None without one."""
+    from gripmon.statefile import StateFile, StateFileError
+
+    try:
+        path = config.state_path
+        return None if path is None else StateFile(path, config.state_owner, config.reference, fresh=fresh)
+    except StateFileError as error:
+        raise common.CommandFailedError(f"{config.path}: state.file: {error}", common.EXIT_USAGE) from None
+
+
+def _notices(kept: StateFile | None) -> list[Alert]:
+    """What was found at the start, as alerts."""
+    from gripmon.records import Alert, AlertKind, Cause, Severity
+
+    texts = () if kept is None else kept.notices
+    return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
+
+
+def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None, ZenohCommands | None]:
+    """The publisher, where the jaw opening comes from (None: with the frames), and where commands come from."""
     from gripmon.publish import NullPublisher, PublishError, ZenohPublisher
 
     settings = config.settings
     fixed = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if not settings.publish.enabled:
-        return NullPublisher(), fixed
+        return NullPublisher(), fixed, None
     from_network = settings.jaw.source == "zenoh"
     try:
         publisher = ZenohPublisher(
@@ -140,11 +194,15 @@ def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None]:
         )
     except PublishError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
-    return publisher, publisher.jaw if from_network else fixed
+    return publisher, publisher.jaw if from_network else fixed, publisher.commands
 
 
 def _open_recorder(
-    config: Config, out: Path | None, name: str | None, truth_tcp_m: Callable[[int], tuple[float, float, float]] | None
+    config: Config,
+    reference: ReferenceRecord,
+    out: Path | None,
+    name: str | None,
+    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
 ) -> Recorder:
     from gripmon.recording import open_recorder
 
@@ -156,7 +214,7 @@ def _open_recorder(
             camera_name=settings.camera_name,
             camera=config.camera,
             gripper=config.gripper,
-            reference=config.reference,
+            reference=reference,
             directory=out,
             name=name,
             truth_tcp_m=truth_tcp_m,

@@ -23,6 +23,7 @@ from gripmon.geometry import from_record, to_record
 from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
 from gripmon.records import Array, ReferenceRecord, to_json
 from gripmon.sources import FolderSettings, LiveSettings, SimulatedScene, SimulatedSettings, VideoSettings
+from gripmon.statefile import AUTO, Owner, calibration_of, default_path
 
 if TYPE_CHECKING:
     from gripmon.simulator import Scenario
@@ -51,6 +52,23 @@ class Config:
     def taught_path(self) -> Path | None:
         """The file with the taught model, whether it is there or not."""
         return None if self.settings.taught is None else self.directory / self.settings.taught
+
+    @property
+    def state_path(self) -> Path | None:
+        """The file for what survives a restart; None: nothing does."""
+        settings = self.settings
+        if settings.state.file != AUTO:
+            return None if settings.state.file is None else self.directory / settings.state.file
+        # What is replayed or simulated begins anew each time, and so does the camera's motion.
+        live = isinstance(settings.source, LiveSettings)
+        return default_path(settings.robot, settings.camera_name) if live else None
+
+    @property
+    def state_owner(self) -> Owner:
+        """Whose state that is, and of which calibration."""
+        settings = self.settings
+        calibration = calibration_of(settings.camera, self.gripper.model, self.reference)
+        return Owner(settings.robot, settings.camera_name, calibration)
 
     @property
     def directory(self) -> Path:

@@ -13,6 +13,7 @@ from gripmon.monitor import MonitorSettings
 from gripmon.publish import PublishSettings
 from gripmon.recording import RecordingSettings
 from gripmon.sources import SourceSettings
+from gripmon.statefile import StateSettings
 
 Name = Annotated[
     str,
@@ -97,3 +98,4 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     publish: PublishSettings = PublishSettings()
     recording: RecordingSettings = RecordingSettings()
     daemon: DaemonSettings = DaemonSettings()
+    state: StateSettings = StateSettings()

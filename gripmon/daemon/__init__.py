@@ -13,26 +13,30 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
 
 from gripmon.daemon.estimates import EstimatesFile
-from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, Daemon, JawFeed, MonitorLike, StopRequest
+from gripmon.daemon.keeping import StateKeeper
+from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, CommandFeed, Daemon, JawFeed, MonitorLike, StopRequest
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
+from gripmon.records import Alert
 from gripmon.sources import Source
 
 __all__ = [
     "EXIT_DONE",
     "EXIT_FAILED",
     "EXIT_INTERRUPTED",
+    "CommandFeed",
     "Daemon",
     "DaemonSettings",
     "EstimatesFile",
     "JawFeed",
     "MonitorLike",
+    "StateKeeper",
     "StopRequest",
     "log_to_stderr",
     "run",
@@ -56,13 +60,17 @@ def run(
     camera: str,
     estimates: Path | None = None,
     jaw: JawFeed | None = None,
+    keeper: StateKeeper | None = None,
+    commands: CommandFeed | None = None,
+    notices: Sequence[Alert] = (),
     duration_s: float | None = None,
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
     In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
-    frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  The logger
-    ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
+    frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
+    the monitor's state for a restart; ``notices`` are alerts from the start-up.  The logger ``gripmon`` is left as the
+    caller set it up (see :func:`log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
@@ -70,13 +78,16 @@ def run(
     stop = StopRequest()
     with _signals(stop), contextlib.ExitStack() as closing:
         # Whatever happens, all of these run, the last one first; a second signal no longer disturbs them.
+        if keeper is not None:
+            closing.callback(keeper.close)
         closing.callback(publisher.close)
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(source.close)
         lines = closing.enter_context(contextlib.closing(EstimatesFile(estimates)))
         daemon = Daemon(
-            monitor, source, publisher, recorder, settings, stop, robot=robot, camera=camera, estimates=lines, jaw=jaw
-        )
+            monitor, source, publisher, recorder, settings, stop,
+            robot=robot, camera=camera, estimates=lines, jaw=jaw, keeper=keeper, commands=commands, notices=notices,
+        )  # fmt: skip
         with _steady_interpreter():
             return daemon.run(duration_s)
 

@@ -7,13 +7,14 @@ import gc
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ParamSpec, Protocol
 
 import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.watch import Watch
 from gripmon.publish import Publisher
@@ -23,9 +24,14 @@ from gripmon.records import (
     AlertKind,
     AlertRecord,
     Cause,
+    Command,
+    CommandError,
+    CommandFault,
+    CommandReply,
     Frame,
     FrameRecord,
     MeasurementTrace,
+    MonitorState,
     ReferenceRecord,
     Severity,
     State,
@@ -38,6 +44,9 @@ _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
+KEEP_LAST_EVERY_S = 60.0
+"""How old the last transform that is kept may be; references and alerts are kept when they change."""
+
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
@@ -48,6 +57,24 @@ class MonitorLike(Protocol):
     def reference(self) -> ReferenceRecord: ...
     def process(self, frame: Frame) -> FrameRecord: ...
     def trace(self) -> MeasurementTrace | None: ...
+    def command(self, command: Command, stamp_ns: int) -> CommandReply: ...
+    def state(self) -> MonitorState: ...
+    @property
+    def state_revision(self) -> int: ...
+
+
+class Asked(Protocol):
+    """A command whose asker waits for the answer."""
+
+    @property
+    def command(self) -> Command: ...
+    def answer(self, answer: CommandReply | CommandError) -> None: ...
+
+
+class CommandFeed(Protocol):
+    """Where commands come from, e.g. :class:`gripmon.publish.ZenohCommands`; ``poll`` doesn't wait."""
+
+    def poll(self) -> Asked | None: ...
 
 
 class JawFeed(Protocol):
@@ -86,6 +113,9 @@ class Daemon:
         camera: str,
         estimates: EstimatesFile,
         jaw: JawFeed | None = None,
+        keeper: StateKeeper | None = None,
+        commands: CommandFeed | None = None,
+        notices: Sequence[Alert] = (),
     ) -> None:
         self._monitor = monitor
         self._source = source
@@ -95,12 +125,17 @@ class Daemon:
         self._robot, self._camera = robot, camera
         self._estimates = estimates
         self._jaw = jaw
+        self._keeper = keeper or StateKeeper(None)
+        self._kept_revision: int | None = None
+        self._commands = commands
+        self._notices = notices
         self._reference, self._reference_due = monitor.reference, True
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
         self._said: StateRecord | None = None
         self._next_state_s = self._start_s
+        self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
         self._stop = stop
         self._source_broke = False
         self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
@@ -115,7 +150,10 @@ class Daemon:
             "watching %s/%s against %s, revision %d",
             self._robot, self._camera, self._reference.reference_id, self._reference.revision,
         )  # fmt: skip
+        self._deliver("state's keeping", self._keep_now)
         self._make_reference_known()
+        for notice in self._notices:
+            self._alert(notice, self._watch.state)
         end_s = self._start_s + duration_s if duration_s is not None else math.inf
         self._say_state(time.monotonic())
         while self._stop.exit_code is None and time.monotonic() < end_s and self._next_item():
@@ -123,6 +161,7 @@ class Daemon:
         watch = self._watch
         exit_code = self._stop.exit_code if self._stop.exit_code is not None else self._code_at_the_end()
         watch.stopped()
+        self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
         self._say_state(time.monotonic())
         _log.info(
             "stopped after %d frames, %d refused, %d dropped", watch.frames, watch.frames_refused, self._source.dropped
@@ -131,6 +170,7 @@ class Daemon:
 
     def _next_item(self) -> bool:
         """Wait for the source and handle what it gives; False if there is nothing more to do."""
+        self._obey()
         try:
             item = self._source.read()
         except Exception as error:  # noqa: BLE001  said below, and the end of the loop
@@ -159,6 +199,7 @@ class Daemon:
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
         self._deliver("transform", self._publisher.transform, record)
         # The rest is less urgent.
+        self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:
             self._alert(alert, record.state, frame.stamp_ns, recorded=True)
         for alert in self._watch.frame(record, time.monotonic()):
@@ -186,9 +227,45 @@ class Daemon:
         self._make_reference_known()
         return frame, record, ""
 
+    def _obey(self) -> None:
+        """Carry out one command, if one waits: never so many that frames wait for them."""
+        asked = None if self._commands is None else self._commands.poll()
+        if asked is None:
+            return
+        command, answer = asked.command, None
+        try:
+            answer = self._monitor.command(command, time.time_ns())
+            said = f"{'done' if answer.done else 'refused'}: {answer.text}"
+        except Exception as error:  # noqa: BLE001  said, to the asker, too
+            said = f"internal error: {_in_short(error)}"
+            _log.debug("command %s", command.name, exc_info=error)
+        _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, said)
+        self._make_reference_known()
+        # What has been answered as done must be so after a crash, too.
+        self._deliver("state's keeping", self._keep_changes, at_once=True)
+        if answer and answer.done and self._keeper.failure:
+            answer = msgspec.structs.replace(answer, text=f"{answer.text}; but {self._keeper.failure}")
+        self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
+
+    def _keep_now(self) -> None:
+        self._kept_revision = self._monitor.state_revision
+        self._keeper.now(self._monitor.state())
+
+    def _keep_changes(self, *, at_once: bool = False) -> None:
+        """Keep the monitor's state if it has changed."""
+        if self._monitor.state_revision == self._kept_revision:
+            return
+        if at_once:
+            self._keep_now()
+        else:
+            self._kept_revision = self._monitor.state_revision
+            self._keeper.soon(self._monitor.state())
+
     def _make_reference_known(self) -> None:
+        """Say a new reference, which is kept before: no other one may ever get its revision."""
         newest, known = self._monitor.reference, self._reference
         if (newest.reference_id, newest.revision) != (known.reference_id, known.revision):
+            self._deliver("state's keeping", self._keep_now)
             self._reference, self._reference_due = newest, True
             self._deliver("recording", self._recorder.reference, newest)
         if self._reference_due:
@@ -231,6 +308,16 @@ class Daemon:
             cause=alert.cause,
             severity=alert.severity,
             text=alert.text,
+            event=alert.event,
+            alert_id=alert.alert_id,
+            part=alert.part,
+            causes=alert.causes,
+            tcp_shift_m=alert.tcp_shift_m,
+            rotation_rad=alert.rotation_rad,
+            rate_m_per_min=alert.rate_m_per_min,
+            time_left_s=alert.time_left_s,
+            since_ns=alert.since_ns,
+            acknowledged=alert.acknowledged,
         )
         self._deliver("alert", self._publisher.alert, message)
         if not recorded:
@@ -245,6 +332,7 @@ class Daemon:
             self._jaw.fault() if self._jaw else "",
             self._recorder.failure,
             self._estimates.failure,
+            self._keeper.failure,
         )
         message = "; ".join(fault for fault in faults if fault)
         now = (watch.state, watch.verdict, self._source.connected, message, self._reference.revision)
@@ -280,6 +368,10 @@ class Daemon:
     def _keep_house(self) -> None:
         """Once a state period, right after a frame, when there is time until the next."""
         self._estimates.flush()
+        if (now_s := time.monotonic()) >= self._next_keeping_s:
+            # The last transform alone: where to look first after a restart.
+            self._next_keeping_s = now_s + KEEP_LAST_EVERY_S
+            self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
         if not gc.isenabled():
             gc.collect()
 

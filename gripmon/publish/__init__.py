@@ -8,6 +8,7 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 ``alert``      when there is one; an advanced subscriber with history gets the last 32
 ``alive``      liveliness token, gone as soon as the process is
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
+``cmd/<name>`` queryable: what an operator tells the monitor, see :mod:`gripmon.publish.commands`
 
 "Late joiners get the last one" holds both ways that people ask: a plain ``get`` on the key (a queryable answers it),
 and an advanced subscriber with history (``zenoh.ext``).
@@ -15,9 +16,10 @@ and an advanced subscriber with history (``zenoh.ext``).
 
 from __future__ import annotations
 
+from gripmon.publish.commands import PendingCommand, ZenohCommands
 from gripmon.publish.jaw import JawReading, ZenohJaw
 from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
-from gripmon.publish.session import zenoh_config
+from gripmon.publish.session import open_session, zenoh_config
 from gripmon.publish.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings
 
 __all__ = [
@@ -25,10 +27,13 @@ __all__ = [
     "JawReading",
     "Keys",
     "NullPublisher",
+    "PendingCommand",
     "PublishError",
     "PublishSettings",
     "Publisher",
+    "ZenohCommands",
     "ZenohJaw",
     "ZenohPublisher",
+    "open_session",
     "zenoh_config",
 ]

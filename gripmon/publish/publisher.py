@@ -10,6 +10,7 @@ from typing import Protocol
 
 import zenoh
 
+from gripmon.publish.commands import ZenohCommands
 from gripmon.publish.jaw import ZenohJaw
 from gripmon.publish.session import in_short, open_session, zenoh_config
 from gripmon.publish.settings import Keys, PublishSettings, check_name
@@ -68,6 +69,7 @@ class ZenohPublisher:
         check_name("camera", camera)
         self.keys = Keys(robot, camera)
         self.jaw = ZenohJaw(settings.jaw_max_age_s)
+        self.commands = ZenohCommands(self.keys)
         self.unsent = 0
         self._settings = settings
         self._subscribe_jaw = subscribe_jaw
@@ -125,6 +127,7 @@ class ZenohPublisher:
     def close(self) -> None:
         """Withdraw the liveliness token, close the session and free its port.  Calling it twice does nothing more."""
         self._closing.set()
+        self.commands.close()
         if self._opener is not None:
             self._opener.join(timeout=1.0)  # an attempt under way closes its own session when it returns
         with self._lock:
@@ -137,6 +140,8 @@ class ZenohPublisher:
         wire = _Wire(session, self.keys)
         if self._subscribe_jaw:
             self.jaw.attach(session, self.keys["jaw"])
+        if self._settings.commands:
+            self.commands.attach(session)
         with self._lock:
             self._wire = wire
             if self._reference is not None:

@@ -33,6 +33,9 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         DEFAULT_ENDPOINT,
     )
     connect: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="peers or routers to connect to")] = ()
+    commands: Annotated[
+        bool, msgspec.Meta(description="true: whoever reaches the network may send commands (gripmon send)")
+    ] = True
     multicast_scouting: Annotated[bool, msgspec.Meta(description="look for others by UDP multicast")] = False
     zenoh_config: Annotated[
         str | None, msgspec.Meta(description="path of a file of Zenoh's (json5, yaml) instead of the keys above")

@@ -13,7 +13,7 @@ exp(omega) R``.
 from __future__ import annotations
 
 from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
-from gripmon.records.commands import Command, CommandName, CommandReply
+from gripmon.records.commands import Command, CommandError, CommandFault, CommandName, CommandReply
 from gripmon.records.evidence import EdgeEvidence
 from gripmon.records.frames import (
     CornerFault,
@@ -40,6 +40,8 @@ __all__ = [
     "Cause",
     "CauseWeight",
     "Command",
+    "CommandError",
+    "CommandFault",
     "CommandName",
     "CommandReply",
     "CornerFault",

@@ -42,3 +42,24 @@ class CommandReply(msgspec.Struct, frozen=True):
     reference_id: str
     revision: int
     monitor: MonitorState | None = None
+
+
+class CommandFault(enum.StrEnum):
+    """Why a command did not reach the monitor, or nothing is known of what became of it."""
+
+    UNKNOWN = "unknown_command"
+    MALFORMED = "malformed"
+    SEVERAL = "several_monitors"
+    BUSY = "busy"
+    TIMEOUT = "timeout"
+    STOPPING = "stopping"
+    INTERNAL = "internal_error"
+
+
+class CommandError(msgspec.Struct, frozen=True):
+    """The answer in place of a :class:`CommandReply` to a command that was not carried out, or perhaps was: see
+    ``text``.
+    """
+
+    error: CommandFault
+    text: str

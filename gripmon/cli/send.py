@@ -1,0 +1,126 @@
+"""``gripmon send``: what an operator tells a running monitor."""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import sys
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.records import CommandReply, MonitorState, ReferenceRecord
+
+_DESCRIPTION = """\
+Tell a running monitor something, and print its answer.
+
+  recalibrate       measure the reference anew from what the camera sees
+  accept [ID]       take the proposed reference
+  reject [ID]       forget the proposed reference
+  undo [ID]         go back to the reference before, or to the one named: a new revision with that
+                    transform
+  reset             go back to the configured reference, likewise
+  acknowledge [ID]  take note of an open alert, or of all
+  state             print the references, a proposal and the open alerts
+
+What can't be done is refused with a reason, and nothing changes."""
+
+_EXAMPLES = """\
+  gripmon send state --robot arm1
+  gripmon send undo --robot arm1
+  gripmon send undo recalibration-3-1f0c9a2b --robot arm1 --camera wrist
+
+exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
+
+_WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
+_NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state")
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands, "send", send, "tell a running monitor something: undo, accept, state, …", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument("name", metavar="COMMAND", choices=_NAMES, help=", ".join(_NAMES))
+    parser.add_argument(
+        "id", metavar="ID", nargs="?", default="", help="the reference, proposal or alert that is meant"
+    )
+    parser.add_argument("--robot", required=True, metavar="NAME", help="the robot's name in the configuration")
+    parser.add_argument("--camera", metavar="NAME", help="the camera's name; needed if the robot has several")
+    parser.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="the monitor's or a router's Zenoh endpoint, several times if need be; default: tcp/127.0.0.1:7447",
+    )
+    parser.add_argument("--zenoh-config", metavar="FILE", help="a configuration file of Zenoh's instead of --connect")
+    parser.add_argument(
+        "--timeout", type=common.positive_number, default=5.0, metavar="S", help="how long to wait (s); default: 5"
+    )
+    parser.add_argument("--json", action="store_true", help="print the whole answer as one line of JSON")
+
+
+def send(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon send``."""
+    if arguments.id and arguments.name not in _WITH_ARGUMENT:
+        raise common.CommandFailedError(
+            f"send: {arguments.name} takes no ID, but {arguments.id} is given; leave it out", common.EXIT_USAGE
+        )
+    if arguments.connect and arguments.zenoh_config:
+        raise common.CommandFailedError("send: --connect has no effect beside --zenoh-config; one of them", 2)
+    reply = _ask(arguments)
+    if arguments.json:
+        from gripmon.records import to_json
+
+        print(to_json(reply).decode())
+    elif not reply.done:
+        print(f"refused: {reply.text}", file=sys.stderr)
+    else:
+        print(reply.text)
+        if reply.monitor is not None:
+            print(_table(reply.monitor))
+    return common.EXIT_DONE if reply.done else common.EXIT_FAILED
+
+
+def _ask(arguments: argparse.Namespace) -> CommandReply:
+    from gripmon.client import Client, NotCarriedOut
+    from gripmon.publish import DEFAULT_ENDPOINT
+    from gripmon.records import CommandName
+
+    try:
+        client = Client(
+            arguments.robot,
+            arguments.camera,
+            connect=arguments.connect or (DEFAULT_ENDPOINT,),
+            zenoh_config_file=arguments.zenoh_config,
+        )
+    except ValueError as error:
+        raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
+    with client:
+        try:
+            return client.send(CommandName(arguments.name), arguments.id, arguments.timeout)
+        except LookupError as error:
+            raise common.CommandFailedError(f"send: {error.args[0]} (--camera)", common.EXIT_USAGE) from None
+        except NotCarriedOut as error:
+            raise common.CommandFailedError(f"send: {error}", common.EXIT_FAILED) from None
+
+
+def _table(state: MonitorState) -> str:
+    """References, the newest last, a proposal, and the open alerts, a line each."""
+    lines = ["references, the last one in force:", *(f"  {_line(reference)}" for reference in state.references)]
+    lines += ["proposed:", f"  {_line(state.proposal)}"] if state.proposal is not None else []
+    lines += ["open alerts:"] if state.alerts else []
+    for kept in state.alerts:
+        taken = ", acknowledged" if kept.alert.acknowledged else ""
+        lines.append(f"  {kept.alert.alert_id}  {kept.alert.severity.value}{taken}: {kept.alert.text}")
+    return "\n".join(lines)
+
+
+def _line(reference: ReferenceRecord) -> str:
+    when = datetime.datetime.fromtimestamp(1e-9 * reference.stamp_ns).astimezone().isoformat(" ", "seconds")
+    origin = f"restores {reference.restores}" if reference.restores else f"by {reference.accepted_by}"
+    step = ""
+    if reference.inputs is not None:
+        step = f", moved by {1e3 * reference.inputs.step_m:.3f} mm, cause {reference.cause.value}"
+    return f"{reference.revision:5d}  {reference.reference_id}  {when if reference.stamp_ns else '-'}  {origin}{step}"

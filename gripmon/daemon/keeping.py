@@ -1,0 +1,99 @@
+"""Keeping the monitor's state: at once what others will rest on, soon what only has to be remembered."""
+
+from __future__ import annotations
+
+import threading
+from typing import Protocol
+
+from gripmon.records import MonitorState
+
+RETRY_S = 1.0
+"""Pause before a state that could not be written is tried again."""
+
+_CLOSE_WITHIN_S = 1.0
+
+
+class StateSink(Protocol):
+    """Where states go, e.g. :class:`gripmon.statefile.StateFile`; ``failure`` is empty while all is well."""
+
+    @property
+    def failure(self) -> str: ...
+    def write(self, state: MonitorState) -> bool: ...
+    def close(self) -> None: ...
+
+
+class StateKeeper:
+    """Writes states, the newest wins.  ``None`` in place of a sink: keeps nothing."""
+
+    def __init__(self, sink: StateSink | None) -> None:
+        self._sink = sink
+        self._writing = threading.Lock()  # held while a state is written: an older one never replaces a newer one
+        self._changed = threading.Condition()  # guards what follows
+        self._waiting: MonitorState | None = None
+        self._closing = False
+        self._thread: threading.Thread | None = None
+
+    @property
+    def failure(self) -> str:
+        """Why the state is not kept just now; empty if it is."""
+        return "" if self._sink is None else self._sink.failure
+
+    def now(self, state: MonitorState) -> None:
+        """Keep a state before this returns: it takes as long as the disk does.  A fault is in :attr:`failure`, and the
+        state is tried again.
+        """
+        if self._sink is None:
+            return
+        with self._writing:
+            with self._changed:
+                self._waiting = None
+            done = self._sink.write(state)
+        if not done:
+            self.soon(state)
+
+    def soon(self, state: MonitorState) -> None:
+        """Keep a state in another thread."""
+        if self._sink is None:
+            return
+        with self._changed:
+            self._waiting = state
+            self._changed.notify()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="gripmon-state", daemon=True)
+                self._thread.start()
+
+    def close(self) -> None:
+        """Keep what still waits, once, and let go of the sink."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        if self._thread is not None:
+            self._thread.join(_CLOSE_WITHIN_S)
+        if self._sink is not None:
+            self._sink.close()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting is not None or self._closing)
+                if self._waiting is None:
+                    return
+            done = self._write_waiting()
+            with self._changed:
+                if self._closing and not done:
+                    return
+                if not done:
+                    self._changed.wait_for(lambda: self._closing, RETRY_S)
+
+    def _write_waiting(self) -> bool:
+        assert self._sink is not None
+        with self._writing:
+            with self._changed:
+                state, self._waiting = self._waiting, None
+            if state is None:  # overtaken by a newer one that was written at once
+                return True
+            done = self._sink.write(state)
+            if not done:
+                with self._changed:
+                    self._waiting = self._waiting or state
+        return done

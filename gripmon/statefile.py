@@ -1,0 +1,296 @@
+"""What survives a restart, in a file: written whole or not at all, read whole or not at all.
+
+A file holds one :class:`gripmon.records.MonitorState` with the robot, the camera and the calibration that it belongs
+to, under a checksum.  One that is damaged, or that belongs to another calibration, is renamed aside and never used;
+one of another robot is left alone, and so is one that another process uses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import logging
+import os
+import stat
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from gripmon.atomic import remove_leftovers, write_atomically
+from gripmon.camera import LensSettings
+from gripmon.gripper import GripperModel
+from gripmon.records import MonitorState, ReferenceRecord
+from gripmon.references import state_fault
+
+_log = logging.getLogger(__name__)
+
+FORMAT = 1
+LARGEST_BYTES = 64 << 20
+"""A file larger than this is none of ours: a thousand references take less than 3 MB."""
+
+AUTO = "auto"
+
+
+class StateSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Where ``gripmon run`` keeps what survives a restart."""
+
+    file: (
+        Annotated[
+            str,
+            msgspec.Meta(
+                min_length=1,
+                description="file for references and open alerts, relative to this file; auto: for a live camera "
+                "$XDG_STATE_HOME/gripmon/<robot>-<camera>.json (~/.local/state/…), else none; null: none",
+            ),
+        ]
+        | None
+    ) = AUTO
+
+
+class StateFileError(ValueError):
+    """The monitor can't start with this file: "file: what is wrong; what would be right"."""
+
+
+class Calibration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Digests of what a state is about: references of another camera, gripper or start are worth nothing here."""
+
+    camera: str
+    gripper: str
+    reference: str
+
+
+class Owner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Whose state it is."""
+
+    robot: str
+    camera: str
+    calibration: Calibration
+
+
+class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The content of a file."""
+
+    format: int
+    owner: Owner
+    state: MonitorState
+
+
+class _Envelope(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    sha256: str
+    content: msgspec.Raw
+
+
+class _Format(msgspec.Struct, frozen=True):
+    format: int
+
+
+def default_path(robot: str, camera: str) -> Path:
+    """Where the state of a live camera is kept unless the configuration says otherwise.
+
+    Raises :class:`StateFileError` for a user without a home.
+    """
+    base = os.environ.get("XDG_STATE_HOME", "")
+    try:
+        # The standard wants relative paths there to be ignored.
+        folder = Path(base) if Path(base).is_absolute() else Path("~/.local/state").expanduser()
+    except RuntimeError:
+        raise StateFileError("auto, but this user has no home folder; the path of a file, or null") from None
+    return folder / "gripmon" / f"{robot}-{camera}.json"
+
+
+def calibration_of(lens: LensSettings, gripper: GripperModel, reference: ReferenceRecord) -> Calibration:
+    """Digests of the values, not of the files: a comment more or less changes nothing."""
+    start = msgspec.structs.replace(reference, revision=0, stamp_ns=0)
+    return Calibration(*(hashlib.sha256(msgspec.json.encode(part)).hexdigest()[:16] for part in (lens, gripper, start)))
+
+
+def pack(owner: Owner, state: MonitorState) -> bytes:
+    """The bytes of a file."""
+    content = msgspec.json.encode(Kept(FORMAT, owner, state))
+    return b'{"sha256":"%s","content":%s}\n' % (hashlib.sha256(content).hexdigest().encode(), content)
+
+
+def unpack(data: bytes) -> Kept:
+    """The content of a file.  Raises ValueError, which says what is wrong, for all but a whole and sound one."""
+    try:
+        envelope = msgspec.json.decode(data, type=_Envelope)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        raise ValueError("it is cut off, or no state file at all") from None
+    content = bytes(envelope.content)
+    if hashlib.sha256(content).hexdigest() != envelope.sha256:
+        raise ValueError("its checksum is wrong")
+    try:
+        version = msgspec.json.decode(content, type=_Format).format
+        if version != FORMAT:
+            raise ValueError(f"it has format {version}, and this version of gripmon reads format {FORMAT}")
+        kept = msgspec.json.decode(content, type=Kept)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ValueError(f"its content is no state: {error}") from None
+    if fault := state_fault(kept.state):
+        raise ValueError(f"its content contradicts itself: {fault}")
+    return kept
+
+
+class StateFile:
+    """One monitor's file, which no other process may use while this object is open.
+
+    ``state`` is what to go on from, None for a new start; ``configured`` the reference of a new start: its revision
+    follows on those of a file that was set aside, where they are known.  ``notices`` are for people: what was found.
+    ``failure`` says why nothing can be kept now, empty while all is well.
+    """
+
+    def __init__(self, path: Path, owner: Owner, configured: ReferenceRecord, *, fresh: bool = False) -> None:
+        """Lock the file and read it.  ``fresh``: set a state aside even if it could be used.
+
+        Raises :class:`StateFileError` if the file is another robot's, in use, or none.  What else goes wrong, such as a
+        folder that may not be written, is said in ``failure`` and stops nothing.
+        """
+        self.state: MonitorState | None = None
+        self.configured = configured
+        self.notices: tuple[str, ...] = ()
+        self.failure = ""
+        self._path, self._owner = path, owner
+        self._usable = True
+        self._lock = self._take_lock()
+        try:
+            self._read(fresh)
+        except BaseException:
+            self.close()
+            raise
+
+    def write(self, state: MonitorState) -> bool:
+        """Keep a state in place of the last one; False, with ``failure`` set, if that can't be done."""
+        if not self._usable:
+            return False
+        try:
+            data = pack(self._owner, state)
+            # What can't be read again must not replace what can: NaN, say, is null in JSON.
+            if unpack(data).state != state:
+                raise ValueError("it is not what comes back")
+            write_atomically(self._path, data)
+        except OSError as error:
+            self._fail(f"{self._path} can't be written: {error.strerror or error}")
+            return False
+        except Exception as error:  # noqa: BLE001  said, and none of the monitor's business
+            self._fail(f"internal error in the state, the last sound one is kept: {error}")
+            return False
+        if self.failure:
+            _log.info("%s is written again", self._path)
+        self.failure = ""
+        return True
+
+    def close(self) -> None:
+        """Let other processes use the file."""
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
+
+    def _take_lock(self) -> int | None:
+        """A descriptor that holds the lock.  A file of its own: the state's is another one after each writing."""
+        path = self._path.with_name(self._path.name + ".lock")
+        descriptor = None
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            os.ftruncate(descriptor, 0)
+            os.write(descriptor, b"%d\n" % os.getpid())
+        except BlockingIOError:
+            assert descriptor is not None
+            holder = os.read(descriptor, 20).decode(errors="replace").strip()
+            os.close(descriptor)
+            by = f"process {holder}" if holder.isdecimal() else "another process"
+            right = "stop that one, or give this monitor a file of its own"
+            raise StateFileError(f"{self._path} is in use by {by}; {right}") from None
+        except OSError as error:
+            if descriptor is not None:
+                os.close(descriptor)
+            self._give_up(f"{path} can't be locked: {error.strerror or error}")
+            return None
+        return descriptor
+
+    def _read(self, fresh: bool) -> None:
+        if self._usable:
+            with contextlib.suppress(OSError):  # untidy, no more
+                remove_leftovers(self._path)
+        try:
+            data = self._bytes()
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            self._give_up(f"{self._path} can't be read: {error.strerror or error}")
+            self._notice(f"{self.failure}; started from the configured reference")
+            return
+        try:
+            kept = unpack(data)
+        except ValueError as error:
+            aside = self._set_aside("damaged")
+            self._notice(
+                f"the state file {self._path} is damaged: {error}; {aside}; started from the configured reference, "
+                "revisions count from the start again"
+            )
+            return
+        if (kept.owner.robot, kept.owner.camera) != (self._owner.robot, self._owner.camera):
+            raise StateFileError(
+                f"{self._path} is the state of {kept.owner.robot}/{kept.owner.camera}, not of {self._owner.robot}/"
+                f"{self._owner.camera}; a file of its own for each monitor"
+            )
+        changed = self._what_changed(kept.owner.calibration)
+        if not changed and not fresh:
+            self.state = kept.state
+            return
+        why = f"of another calibration ({changed} changed since)" if changed else "not wanted"
+        aside = self._set_aside("replaced")
+        revision = 1 + kept.state.references[-1].revision
+        self.configured = msgspec.structs.replace(self.configured, revision=revision)
+        self._notice(
+            f"the state file {self._path} is {why}; {aside}; started from the configured reference as revision "
+            f"{revision}"
+        )
+
+    def _bytes(self) -> bytes:
+        """The file's content.  A pipe or a folder is no state file, and a pipe would be waited for."""
+        mode = self._path.stat().st_mode
+        if not stat.S_ISREG(mode):
+            kind = "a folder" if stat.S_ISDIR(mode) else "no regular file"
+            raise StateFileError(f"{self._path} is {kind}; a file")
+        with self._path.open("rb") as file:
+            return file.read(LARGEST_BYTES)
+
+    def _what_changed(self, kept: Calibration) -> str:
+        now = self._owner.calibration
+        parts = (
+            ("the camera model", kept.camera == now.camera),
+            ("the gripper file", kept.gripper == now.gripper),
+            ("the configured reference", kept.reference == now.reference),
+        )
+        return ", ".join(name for name, same in parts if not same)
+
+    def _set_aside(self, why: str) -> str:
+        """Rename the file beside itself; says what became of it."""
+        if not self._usable:
+            return "not used"
+        number = 1
+        while (target := self._path.with_name(f"{self._path.name}.{why}-{number}")).exists() or target.is_symlink():
+            number += 1
+        try:
+            self._path.rename(target)
+        except OSError as error:
+            self._give_up(f"{self._path} can't be set aside: {error.strerror or error}")
+            return "not used"
+        return f"set aside as {target.name}"
+
+    def _notice(self, text: str) -> None:
+        self.notices = (*self.notices, text)
+
+    def _give_up(self, failure: str) -> None:
+        self._usable = False
+        self._fail(failure)
+
+    def _fail(self, failure: str) -> None:
+        failure = f"state not kept: {failure}"
+        if failure != self.failure:
+            self.failure = failure
+            _log.error("%s", failure)

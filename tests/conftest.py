@@ -1,0 +1,13 @@
+"""For all tests."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _state_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test finds what another one, or the user's own monitor, keeps over restarts."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state-home"))
