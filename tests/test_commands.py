@@ -1,0 +1,229 @@
+"""Commands over a real Zenoh session: a publisher in this process, plain sessions and the client as askers."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import zenoh
+from loopback import free_endpoint, plain_session, wait_until
+
+from gripmon.client import Client, NotCarriedOut
+from gripmon.publish import Keys, PublishSettings, ZenohPublisher
+from gripmon.publish.commands import ZenohCommands
+from gripmon.records import Command, CommandFault, CommandName, CommandReply
+
+CMD = "gripmon/arm/wrist/cmd"
+
+
+def reply_to(command: Command) -> CommandReply:
+    return CommandReply(command.name, command.argument != "no", f"heard {command.argument!r}", "plate-2", 7)
+
+
+class Loop:
+    """Takes commands as the daemon's loop does; ``None`` as answer: never answers."""
+
+    def __init__(self, commands: ZenohCommands, answer: Callable[[Command], CommandReply | None]) -> None:
+        self.commands, self._answer = commands, answer
+        self.heard: list[Command] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.002):
+            pending = self.commands.poll()
+            if pending is not None:
+                self.heard.append(pending.command)
+                answer = self._answer(pending.command)
+                if answer is not None:
+                    pending.answer(answer)
+
+    def end(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint: str) -> Iterator[ZenohPublisher]:
+    made = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def loop(publisher: ZenohPublisher) -> Iterator[Loop]:
+    made = Loop(publisher.commands, reply_to)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def session(publisher: ZenohPublisher, endpoint: str) -> Iterator[zenoh.Session]:
+    with plain_session(connect=endpoint) as made:
+        yield made
+
+
+def answers(session: zenoh.Session, key: str, payload: bytes | None = None) -> list[tuple[bool, dict[str, object]]]:
+    """All answers, each with whether it is a reply or an error."""
+    got = []
+    for reply in session.get(key, payload=payload, timeout=20.0, target=zenoh.QueryTarget.ALL):
+        content = reply.ok if reply.ok is not None else reply.err
+        assert content is not None
+        if content.encoding == zenoh.Encoding.TEXT_PLAIN:  # another queryable that matches, without a value yet
+            continue
+        assert content.encoding == zenoh.Encoding.APPLICATION_JSON
+        got.append((reply.ok is not None, json.loads(content.payload.to_bytes())))
+    return got
+
+
+@pytest.mark.parametrize("name", list(CommandName))
+def test_every_command_arrives_once_and_its_answer_comes_back(session: zenoh.Session, loop: Loop, name: CommandName):
+    [(is_reply, reply)] = answers(session, f"{CMD}/{name.value}", b'{"argument": "p-1"}')
+    told = {"name": name.value, "done": True, "text": "heard 'p-1'", "reference_id": "plate-2", "revision": 7}
+    assert is_reply and reply == told | {"monitor": None}
+    assert loop.heard == [Command(name, "p-1")]
+
+
+@pytest.mark.parametrize("payload", [None, b"", b"{}", b'{"argument": ""}'])
+def test_an_argument_may_be_left_out(session: zenoh.Session, loop: Loop, payload: bytes | None):
+    [(is_reply, _)] = answers(session, f"{CMD}/undo", payload)
+    assert is_reply and loop.heard == [Command(CommandName.UNDO)]
+
+
+@pytest.mark.parametrize(
+    ("key", "payload", "fault", "said"),
+    [
+        (f"{CMD}/explode", None, "unknown_command", "there is no command explode; one of recalibrate, accept, reject"),
+        (f"{CMD}/undo", b"reference-3", "malformed", 'the payload is not {"argument": "…"}, in JSON'),
+        (f"{CMD}/undo", b'{"argument": 3}', "malformed", "Expected `str`, got `int`"),
+        (f"{CMD}/undo", b'{"id": "x"}', "malformed", "unknown field `id`"),
+        (f"{CMD}/undo", b"\xff\x00", "malformed", "the payload is not"),
+        (f"{CMD}/*", None, "several_monitors", "is a pattern; name the monitor: gripmon/arm/wrist/cmd/<name>"),
+        ("gripmon/*/*/cmd/undo", None, "several_monitors", "gripmon/*/*/cmd/undo is a pattern"),
+        ("gripmon/**", None, "several_monitors", "gripmon/** is a pattern"),
+    ],
+)
+def test_what_is_no_command_is_answered_by_an_error(
+    session: zenoh.Session, loop: Loop, key: str, payload: bytes | None, fault: str, said: str
+):
+    errors = [answer for is_reply, answer in answers(session, key, payload) if not is_reply]
+    assert [error["error"] for error in errors] == [fault]
+    assert said in str(errors[0]["text"])
+    assert loop.heard == []
+
+
+def test_without_an_answer_in_time_the_asker_is_told_and_the_command_is_dropped(endpoint: str):
+    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.1)
+    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
+        commands.attach(host)
+        [(is_reply, error)] = answers(session, f"{CMD}/undo")
+        assert not is_reply and error["error"] == "timeout"
+        assert error["text"] == "the monitor has not answered within 0.1 s; it is not carried out"
+        assert commands.poll() is None, "nobody may carry it out later"
+
+
+def test_a_command_that_takes_too_long_may_still_be_carried_out(endpoint: str):
+    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.3)
+    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
+        commands.attach(host)
+        loop = Loop(commands, lambda _: None)
+        [(is_reply, error)] = answers(session, f"{CMD}/undo")
+        loop.end()
+    assert not is_reply and error["text"] == (
+        "the monitor has not answered within 0.3 s; it may still be carried out, ask for the state"
+    )
+    assert loop.heard == [Command(CommandName.UNDO)]
+
+
+def test_an_answer_that_comes_too_late_goes_nowhere(endpoint: str):
+    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.05)
+    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
+        commands.attach(host)
+
+        def slow(command: Command) -> CommandReply:
+            time.sleep(0.3)
+            return reply_to(command)
+
+        loop = Loop(commands, slow)
+        got = answers(session, f"{CMD}/undo")
+        loop.end()
+    assert [is_reply for is_reply, _ in got] == [False]
+
+
+def test_too_many_at_once_are_told_to_wait(publisher: ZenohPublisher, endpoint: str):
+    """Nobody takes them: those that don't fit are answered at once, those that wait when the monitor stops."""
+    with plain_session(connect=endpoint) as session:
+        replies = [session.get(f"{CMD}/undo", timeout=20.0) for _ in range(20)]
+        busy = []
+        wait_until(lambda: (busy.extend(r for r in map(try_one, replies) if r), len(busy) >= 4)[1], "the first answers")
+        assert {json.loads(reply.err.payload.to_bytes())["error"] for reply in busy} == {"busy"}
+        publisher.commands.close()
+        rest = [json.loads(reply.err.payload.to_bytes())["error"] for waiting in replies for reply in waiting]
+    assert len(busy) == 4 and rest == ["stopping"] * 16
+
+
+def try_one(replies: object) -> zenoh.Reply | None:
+    try:
+        return replies.try_recv()  # type: ignore[attr-defined,no-any-return]
+    except zenoh.ZError:
+        return None
+
+
+def test_commands_can_be_turned_off(endpoint: str):
+    deaf = ZenohPublisher(PublishSettings(listen=(endpoint,), commands=False), "arm", "wrist")
+    try:
+        with plain_session(connect=endpoint) as session:
+            assert answers(session, f"{CMD}/undo") == []
+        with Client("arm", connect=[endpoint]) as client, pytest.raises(NotCarriedOut, match=r"publish\.commands"):
+            client.send(CommandName.UNDO)
+    finally:
+        deaf.close()
+
+
+# --- the client ---
+
+
+def test_the_client_finds_the_camera_and_brings_the_answer(publisher: ZenohPublisher, loop: Loop, endpoint: str):
+    with Client("arm", connect=[endpoint]) as client:
+        assert client.send(CommandName.UNDO, "r-1") == reply_to(Command(CommandName.UNDO, "r-1"))
+        assert not client.send(CommandName.ACCEPT, "no").done
+    assert loop.heard == [Command(CommandName.UNDO, "r-1"), Command(CommandName.ACCEPT, "no")]
+
+
+def test_the_client_says_who_is_missing(endpoint: str):
+    with (
+        Client("arm", "wrist", connect=[endpoint]) as client,
+        pytest.raises(NotCarriedOut, match="no monitor arm/wrist is on the network"),
+    ):
+        client.send(CommandName.UNDO, timeout_s=0.2)
+
+
+def test_the_client_does_not_choose_between_two_cameras(publisher: ZenohPublisher, loop: Loop, endpoint: str):
+    second = free_endpoint()
+    other = ZenohPublisher(PublishSettings(listen=(second,)), "arm", "elbow")
+    try:
+        with Client("arm", connect=[endpoint, second]) as client:
+            wait_until(lambda: len(client.alive()) == 2, "both monitors")
+            with pytest.raises(LookupError, match="more than one monitor: arm/elbow, arm/wrist; name the camera"):
+                client.send(CommandName.UNDO)
+        with Client("arm", "wrist", connect=[endpoint, second]) as client:
+            assert client.send(CommandName.UNDO).done
+    finally:
+        other.close()
+    assert loop.heard == [Command(CommandName.UNDO)]
+
+
+def test_the_client_tells_a_stopping_monitor_from_a_refusal(publisher: ZenohPublisher, endpoint: str):
+    publisher.commands.close()
+    with Client("arm", connect=[endpoint]) as client, pytest.raises(NotCarriedOut, match="the monitor stops") as caught:
+        client.send(CommandName.UNDO)
+    assert caught.value.fault is CommandFault.STOPPING

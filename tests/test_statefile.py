@@ -1,0 +1,429 @@
+"""The state file: whole or set aside, whoever damages it; and nobody else's."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simulated import BOX_FINGERS
+from test_references import adopt, book_of, broken, configured, propose
+
+from gripmon.camera import PaperLens
+from gripmon.gripper import GripperModel
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Cause,
+    CauseWeight,
+    MonitorState,
+    OpenAlert,
+    Severity,
+    Transform,
+)
+from gripmon.references import KEPT, ReferenceBook
+from gripmon.statefile import (
+    Calibration,
+    Owner,
+    StateFile,
+    StateFileError,
+    calibration_of,
+    default_path,
+    pack,
+    unpack,
+)
+
+OWNER = Owner("arm", "wrist", Calibration("c", "g", "r"))
+
+
+def state_of(*steps: str, probability: float = 0.75) -> MonitorState:
+    """Everything that a state can have."""
+    book = book_of(*steps)
+    propose(book, 9)
+    alert = Alert(
+        AlertKind.DRIFT, Cause.CAMERA_MOUNT, Severity.WARNING, "moved „3 µm“", alert_id="drift-2", since_ns=5,
+        causes=(CauseWeight(Cause.CAMERA_MOUNT, probability),), tcp_shift_m=(1e-5, -2e-5, 1 / 3),
+    )  # fmt: skip
+    last = Transform((0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8))
+    return MonitorState(book.history, book.proposal, (OpenAlert("drift", alert),), 2, last)
+
+
+STATE = state_of("a", "a", "u")
+DATA = pack(OWNER, STATE)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "state" / "arm.json"
+
+
+def opened(path: Path, owner: Owner = OWNER, *, fresh: bool = False) -> StateFile:
+    return StateFile(path, owner, configured(), fresh=fresh)
+
+
+def write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+
+
+def beside(path: Path) -> list[str]:
+    """All files in the folder but the lock."""
+    return sorted(other.name for other in path.parent.iterdir() if other.name != path.name + ".lock")
+
+
+def read_once(path: Path, owner: Owner = OWNER) -> StateFile:
+    file = opened(path, owner)
+    file.close()
+    return file
+
+
+def test_what_was_written_is_read(path: Path):
+    file = opened(path)
+    assert (file.state, file.notices, file.failure, file.configured) == (None, (), "", configured())
+    for state in (MonitorState((configured(),)), STATE):
+        assert file.write(state)
+        assert file.failure == ""
+    file.close()
+    again = read_once(path)
+    assert (again.state, again.notices, again.failure) == (STATE, (), "")
+    assert beside(path) == ["arm.json"]
+    assert oct(path.stat().st_mode & 0o777 & ~_umask()) == oct(0o666 & ~_umask())
+
+
+def _umask() -> int:
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
+
+
+def test_the_file_is_json_with_a_checksum_that_others_can_check():
+    outer = json.loads(DATA)
+    content = DATA[DATA.index(b'"content":') + len(b'"content":') : -2]
+    assert outer["sha256"] == hashlib.sha256(content).hexdigest()
+    assert outer["content"]["format"] == 1 and outer["content"]["owner"]["robot"] == "arm"
+    assert [r["revision"] for r in outer["content"]["state"]["references"]] == [0, 1, 2, 3]
+
+
+# --- damage ---
+
+
+def test_every_cut_and_every_flipped_bit_is_found():
+    """What still counts as sound is the whole state: a line feed that became another blank."""
+    assert unpack(DATA).state == STATE
+    survivors = 0
+    for i in range(len(DATA) - 1):
+        with pytest.raises(ValueError):
+            unpack(DATA[:i])
+        for bit in range(8):
+            flipped = bytearray(DATA)
+            flipped[i] ^= 1 << bit
+            try:
+                assert unpack(bytes(flipped)) == unpack(DATA)
+            except ValueError:
+                continue
+            survivors += 1
+    assert survivors < 5
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_whatever_happens_to_the_bytes_all_or_nothing_is_used(data: st.DataObject):
+    start = data.draw(st.integers(0, len(DATA) - 1))
+    end = data.draw(st.integers(start, min(start + 200, len(DATA))))
+    other = data.draw(st.one_of(st.just(DATA), st.just(pack(OWNER, state_of("a")))))
+    patch = data.draw(st.one_of(st.binary(max_size=200), st.just(other[start:end]), st.just(b"\0" * (end - start))))
+    damaged = DATA[:start] + patch + DATA[end:]
+    try:
+        state = unpack(damaged).state
+    except ValueError:
+        return
+    assert state == STATE
+
+
+DAMAGED = {
+    "empty": b"",
+    "cut off": DATA[:-40],
+    "nothing but zeros": bytes(len(DATA)),
+    "no text": b"\xff\xfe" + DATA,
+    "two of them": DATA + DATA,
+    "another JSON file": b'{"robot": "arm"}\n',
+    "a list": b"[]",
+    "a wrong checksum": DATA.replace(b'"revision":2', b'"revision":7'),
+    "more than is known": DATA.replace(b'{"sha256"', b'{"more":1,"sha256"'),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGED)
+def test_a_damaged_file_is_set_aside_and_told(path: Path, what: str):
+    write(path, DAMAGED[what])
+    file = opened(path)
+    assert (file.state, file.configured, file.failure) == (None, configured(), "")
+    (notice,) = file.notices
+    assert f"{path} is damaged" in notice and "set aside as arm.json.damaged-1" in notice
+    assert beside(path) == ["arm.json.damaged-1"]
+    assert (path.parent / "arm.json.damaged-1").read_bytes() == DAMAGED[what]
+    assert file.write(STATE)
+    file.close()
+    assert read_once(path).state == STATE
+
+
+def packed(**changes: object) -> bytes:
+    """A file whose checksum is right, whatever it holds."""
+    content = json.loads(DATA)["content"]
+    for where, value in changes.items():
+        *steps, last = [int(step) if step.isdigit() else step for step in where.split("__")]
+        place = content
+        for step in steps:
+            place = place[step]
+        place[last] = value
+    text = json.dumps(content).encode()
+    return b'{"sha256":"%s","content":%s}\n' % (hashlib.sha256(text).hexdigest().encode(), text)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"state__references__2__covariance__0": None}, "Expected `float`, got `null`"),  # NaN, as others write it
+        ({"state__references__2__covariance__0": float("nan")}, "damaged"),
+        ({"state__references__1__cam_T_grip__rotation_xyzw": [0.5, 0.5, 0.5, 0.6]}, "no pose"),
+        ({"state__references__1__cam_T_grip__translation_m": [0.1, 0.2]}, "Expected `array` of length 3"),
+        ({"state__references__1__revision": 7}, "revision 2 follows revision 7"),
+        ({"state__references__1__cause": "magic"}, "Invalid enum value 'magic'"),
+        ({"state__references": []}, "no reference at all"),
+        ({"state__proposal__revision": 3}, "revision 3 follows revision 3"),
+        ({"state__alerts_raised": 0}, "1 open alerts of 0 that were raised"),
+        ({"state__hidden": 1}, "unknown field `hidden`"),
+        ({"format": 2}, "it has format 2, and this version of gripmon reads format 1"),
+        ({"owner": {"robot": "arm"}}, "missing required field"),
+    ],
+)
+def test_a_right_checksum_over_what_can_not_be_is_damage_too(path: Path, changes: dict[str, object], reason: str):
+    write(path, packed(**changes))
+    file = read_once(path)
+    assert file.state is None and reason in file.notices[0]
+    assert beside(path) == ["arm.json.damaged-1"]
+
+
+def test_the_helper_changes_only_what_it_is_told():
+    assert unpack(packed()).state == STATE
+
+
+@pytest.mark.parametrize("what", ["swapped", "missing", "twice", "parent", "restores", "short", "turned", "last"])
+def test_a_chain_that_does_not_hold_together_is_never_used(path: Path, what: str):
+    write(path, pack(OWNER, broken(what)))
+    assert read_once(path).state is None
+    assert beside(path) == ["arm.json.damaged-1"]
+
+
+def test_what_was_set_aside_is_never_overwritten(path: Path):
+    for i in range(1, 4):
+        write(path, b"damage %d" % i)
+        read_once(path)
+    assert beside(path) == [f"arm.json.damaged-{i}" for i in (1, 2, 3)]
+    (path.parent / "arm.json.damaged-4").symlink_to("nowhere")
+    write(path, b"damage 5")
+    read_once(path)
+    contents = [(path.parent / f"arm.json.damaged-{i}").read_bytes() for i in (1, 2, 3, 5)]
+    assert contents == [b"damage 1", b"damage 2", b"damage 3", b"damage 5"]
+
+
+# --- whose it is ---
+
+
+@pytest.mark.parametrize("field", ["robot", "camera"])
+def test_the_state_of_another_robot_is_refused_and_left_alone(path: Path, field: str):
+    write(path, DATA)
+    other = msgspec.structs.replace(OWNER, **{field: "other"})
+    with pytest.raises(StateFileError) as caught:
+        opened(path, other)
+    assert str(caught.value) == (
+        f"{path} is the state of arm/wrist, not of {other.robot}/{other.camera}; a file of its own for each monitor"
+    )
+    assert path.read_bytes() == DATA and beside(path) == ["arm.json"]
+    assert read_once(path).state == STATE, "and the lock is free again"
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [("camera", "the camera model"), ("gripper", "the gripper file"), ("reference", "the configured reference")],
+)
+def test_the_state_of_another_calibration_is_set_aside_and_revisions_go_on(path: Path, part: str, said: str):
+    write(path, DATA)
+    calibration = msgspec.structs.replace(OWNER.calibration, **{part: "new"})
+    file = read_once(path, Owner("arm", "wrist", calibration))
+    assert file.state is None and beside(path) == ["arm.json.replaced-1"]
+    assert f"of another calibration ({said} changed since); set aside as arm.json.replaced-1" in file.notices[0]
+    assert file.configured == configured(4), "no revision names two references"
+
+
+def test_a_fresh_start_sets_aside_what_could_be_used(path: Path):
+    write(path, DATA)
+    file = opened(path, fresh=True)
+    file.close()
+    assert file.state is None and file.configured == configured(4)
+    assert (
+        "not wanted; set aside as arm.json.replaced-1; started from the configured reference as revision 4"
+        in (file.notices[0])
+    )
+    assert (path.parent / "arm.json.replaced-1").read_bytes() == DATA
+    assert opened(path, fresh=True).notices == ()  # nothing there
+
+
+def test_the_calibration_is_that_of_the_values():
+    lens = PaperLens(width_px=8, height_px=6, fx_px=9.0, fy_px=9.0, cx_px=3.5, cy_px=2.5, kappa_per_px2=0.0)
+    model = msgspec.convert(yaml.safe_load(BOX_FINGERS.read_text()), GripperModel)
+    first = calibration_of(lens, model, configured())
+    assert calibration_of(lens, model, configured(7)) == first, "whatever its revision"
+    focus = calibration_of(msgspec.structs.replace(lens, fx_px=9.1), model, configured())
+    assert focus.camera != first.camera and (focus.gripper, focus.reference) == (first.gripper, first.reference)
+    moved = msgspec.structs.replace(configured(), cam_T_grip=Transform((0.0, 0.002, 0.121), (0.0, 0.0, 0.0, 1.0)))
+    assert calibration_of(lens, model, moved).reference != first.reference
+    renamed = msgspec.structs.replace(model, faces=())
+    assert calibration_of(lens, renamed, configured()).gripper != first.gripper
+
+
+def test_two_monitors_can_not_use_one_file(path: Path):
+    with_lock = opened(path)
+    with pytest.raises(StateFileError, match=rf"arm.json is in use by process {os.getpid()}; stop that one, or"):
+        opened(path)
+    with_lock.close()
+    read_once(path)
+
+
+def test_the_lock_goes_with_its_process(path: Path):
+    code = (
+        "import sys; from pathlib import Path; sys.path[:0] = sys.argv[2:]\n"
+        "from test_statefile import opened\n"
+        "file = opened(Path(sys.argv[1])); print('locked', flush=True); sys.stdin.read()"
+    )
+    tests = Path(__file__).resolve().parent
+    holder = subprocess.Popen(
+        [sys.executable, "-c", code, str(path), str(tests), str(tests.parent)],
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert holder.stdout is not None and holder.stdout.readline() == "locked\n"
+        with pytest.raises(StateFileError, match=f"in use by process {holder.pid}"):
+            opened(path)
+    finally:
+        holder.kill()
+        holder.communicate()
+    read_once(path)
+
+
+# --- a disk that doesn't play along ---
+
+
+def test_a_folder_that_can_not_be_made_is_said_and_nothing_is_kept(tmp_path: Path):
+    (tmp_path / "a-file").write_text("x")
+    path = tmp_path / "a-file" / "state" / "arm.json"
+    file = opened(path)
+    assert file.state is None and file.failure.startswith("state not kept: ")
+    assert not file.write(STATE) and "Not a directory" in file.failure
+    file.close()
+
+
+def test_a_folder_without_the_right_to_write_still_gives_its_state(path: Path, monkeypatch: pytest.MonkeyPatch):
+    """As on a disk that the kernel has made read-only after an error."""
+    write(path, DATA)
+    real = os.open
+
+    def read_only(name: object, flags: int, *rest: int, **named: object) -> int:
+        if flags & os.O_CREAT:
+            raise OSError(errno.EROFS, "Read-only file system")
+        return real(name, flags, *rest, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr("gripmon.statefile.os.open", read_only)
+    file = opened(path)
+    assert file.state == STATE
+    assert file.failure == f"state not kept: {path}.lock can't be locked: Read-only file system"
+    assert not file.write(STATE)
+    assert path.read_bytes() == DATA
+
+
+def test_a_damaged_file_that_can_not_be_set_aside_is_not_overwritten(path: Path, monkeypatch: pytest.MonkeyPatch):
+    write(path, b"damage")
+
+    def forbidden(self: Path, target: object) -> Path:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "rename", forbidden)
+    file = opened(path)
+    assert "damaged" in file.notices[0] and "not used" in file.notices[0]
+    assert not file.write(STATE) and "can't be set aside: Operation not permitted" in file.failure
+    assert path.read_bytes() == b"damage"
+
+
+def test_a_full_disk_leaves_the_last_state_and_is_over_when_it_is_over(path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = opened(path)
+    assert file.write(STATE)
+    with monkeypatch.context() as patched:
+
+        def full(_: int) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        patched.setattr("gripmon.atomic.os.fsync", full)
+        assert not file.write(state_of("a"))
+        assert file.failure == f"state not kept: {path} can't be written: No space left on device"
+        assert unpack(path.read_bytes()).state == STATE and beside(path) == ["arm.json"]
+    assert file.write(state_of("a")) and file.failure == ""
+    assert unpack(path.read_bytes()).state == state_of("a")
+
+
+@pytest.mark.parametrize("what", ["a pipe", "a folder"])
+def test_what_is_no_file_is_refused_and_not_waited_for(path: Path, what: str):
+    path.parent.mkdir()
+    os.mkfifo(path) if what == "a pipe" else path.mkdir()
+    with pytest.raises(StateFileError, match=r"arm\.json is (no regular file|a folder); a file"):
+        opened(path)
+    assert path.exists()
+
+
+def test_what_could_not_be_read_again_is_not_written(path: Path):
+    """NaN is null in JSON: a state with one would be lost as a whole."""
+    file = opened(path)
+    assert file.write(STATE)
+    assert not file.write(state_of("a", probability=float("nan")))
+    assert "internal error in the state, the last sound one is kept" in file.failure
+    assert not file.write(broken("parent"))
+    assert unpack(path.read_bytes()).state == STATE
+
+
+def test_leftovers_of_killed_writers_are_cleared_but_nothing_else(path: Path):
+    write(path, DATA)
+    others = [".arm.json-0a1b2c3d.tmp.keep", ".arms.json-0a1b2c3d.tmp", "arm.json-1.tmp", "arm.json.damaged-1"]
+    for name in (".arm.json-0a1b2c3d.tmp", *others):
+        (path.parent / name).write_text("x")
+    read_once(path)
+    assert beside(path) == sorted(["arm.json", *others])
+
+
+def test_thousands_of_references_are_kept_whole(path: Path):
+    book = ReferenceBook(configured())
+    for i in range(KEPT + 5):
+        adopt(book, i % 7)
+    file = opened(path)
+    assert file.write(MonitorState(book.history))
+    file.close()
+    assert path.stat().st_size < 3_000_000
+    again = read_once(path).state
+    assert again is not None
+    assert ReferenceBook.restored(again.references).current == book.current
+
+
+def test_the_default_place_follows_the_standard(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "/var/state")
+    assert default_path("arm1", "wrist") == Path("/var/state/gripmon/arm1-wrist.json")
+    monkeypatch.setenv("HOME", "/home/robot")
+    for unusable in ("", "relative/path"):
+        monkeypatch.setenv("XDG_STATE_HOME", unusable)
+        assert default_path("arm1", "wrist") == Path("/home/robot/.local/state/gripmon/arm1-wrist.json")
