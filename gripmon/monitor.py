@@ -22,6 +22,7 @@ from gripmon.corners import (
     Patience,
     TaughtEdges,
     agreeing_fingers,
+    edge_sums,
     finger_shares,
     trace_of,
 )
@@ -38,7 +39,7 @@ from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
 from gripmon.jaw import JawKnowledge
 from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
-from gripmon.recalibrate import RecalibrationRefused, recalibrate
+from gripmon.recalibrate import RecalibrationSettings, Recalibrator, Refusal, StillFrame
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -63,7 +64,7 @@ from gripmon.records import (
     unmeasured_record,
 )
 from gripmon.references import CommandRefused, ReferenceBook
-from gripmon.smoothing import GATE, PoseAverage, SmoothingSettings
+from gripmon.smoothing import PoseAverage, SmoothingSettings
 
 USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before anything is known about this gripper."""
@@ -128,6 +129,7 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     corners: MeasurementSettings = MeasurementSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
     policy: PolicySettings = PolicySettings()
+    recalibration: RecalibrationSettings = RecalibrationSettings()
 
 
 class Monitor:
@@ -157,6 +159,8 @@ class Monitor:
         self._policy = Policy(settings.policy, reference_sigma)
         self._average = PoseAverage(settings.smoothing)
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        most_corners = CORNER_COUNTS[settings.recalibrate_corners]
+        self._recalibrator = Recalibrator(settings.recalibration, gripper, self._floor, most_corners)
         self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
         last = None if state is None else state.cam_T_grip
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
@@ -208,7 +212,7 @@ class Monitor:
         if name is CommandName.RECALIBRATE:
             if self._newest is None or not self._newest.trusted:
                 raise CommandRefused("nothing was measured in the newest frame")
-            before, told = self.reference, self._recalibrate(self._newest, stamp_ns)
+            before, told = self.reference, self._recalibrate(stamp_ns)
             if self.reference is before:
                 raise CommandRefused("not calibrated anew now" if told is None else told.text)
             return f"calibrated anew: {self.reference.reference_id}"
@@ -249,9 +253,13 @@ class Monitor:
         if self._restarted and judgement.state is not State.ACQUIRING:
             self._restarted = False
             alerts = (self._after_restart(evidence), *alerts)
+        if judgement.state is not State.RECALIBRATING or self._policy.still_frames <= 1:
+            self._recalibrator.forget()
+        if judgement.state is State.RECALIBRATING:
+            self._recalibrator.add(self._still(measurement, frame))
         if judgement.recalibrate:
             revision = self.reference.revision
-            told = self._recalibrate(measurement, frame.stamp_ns)
+            told = self._recalibrate(frame.stamp_ns)
             alerts = alerts if told is None else (*alerts, told)
             if self.reference.revision != revision:
                 origin, drift = Origin.RECALIBRATION, self._drift()
@@ -389,32 +397,49 @@ class Monitor:
             return Cause.JAW_OPENING
         return Cause.CAMERA_MOUNT if len(known) and known.max() < 0.6 else Cause.UNKNOWN
 
-    def _recalibrate(self, measurement: Measurement, stamp_ns: int) -> Alert | None:
-        """PnP from the corners alone; if it agrees, the average since the camera came to rest becomes the reference.
-
-        Returns what there is to say of it.  With too few corners, or corners that contradict the edges, the reference
-        stays, and a later frame may try again.
-        """
-        taken = self._taken(measurement, self._settings.recalibrate_corners)
+    def _still(self, measurement: Measurement, frame: Frame) -> StillFrame:
+        """What this frame has to say of a new reference."""
+        assert self._covariance is not None
+        corners = measurement.corners
         points_grip_m = self._gripper.points_grip_m(measurement.jaw_opening_m)[self._gripper.corner_points]
-        covariance_xy = measurement.corners.joint_covariance_xy(taken)
-        try:
-            pnp = recalibrate(points_grip_m[taken], measurement.corners.xy[taken], covariance_xy, self._cam_T_grip)
-        except RecalibrationRefused as refusal:
-            return self._policy.not_recalibrated(str(refusal))
-        new_T, new_covariance = self._average.cam_T_grip, self._average.claimed_covariance
-        if new_T is None:
+        return StillFrame(
+            frame.seq,
+            frame.stamp_ns,
+            self._cam_T_grip,
+            self._covariance,
+            points_grip_m,
+            corners.usable,
+            corners.xy,
+            corners.joint_covariance_xy(corners.usable),
+            edge_sums(measurement, self._gripper, self._cam_T_grip, measurement.jaw_opening_m),
+        )
+
+    def _recalibrate(self, stamp_ns: int) -> Alert | None:
+        """The frames since the camera came to rest become the reference, or a proposal, or neither.
+
+        Returns what there is to say of it; later frames may try again.
+        """
+        outcome = self._recalibrator.outcome(self.reference)
+        if isinstance(outcome, Refusal):
+            return None if outcome.wait else self._policy.not_recalibrated(outcome.text)
+        if outcome.wait:
             return None
-        difference = perturbation_between(new_T, pnp.cam_T_grip)
-        if difference @ np.linalg.solve(pnp.covariance + new_covariance + self._floor, difference) > GATE:
-            return self._policy.not_recalibrated("the corners contradict the edges")
         before = self._drift()
-        self._book.adopt(self._book.draft(new_T, new_covariance + self._floor, stamp_ns))
-        self._ref_cam_T_grip = new_T
+        moved = (
+            f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} degrees"
+        )
+        draft = self._book.draft(outcome.cam_T_grip, outcome.covariance, stamp_ns, inputs=outcome.inputs)
+        if outcome.needs_person is not None:
+            if self._book.proposal is not None:
+                return None
+            self._book.propose(draft)
+            text = f"{moved}; a new reference waits to be accepted: {outcome.needs_person}"
+            return Alert(AlertKind.PROPOSED, Cause.UNKNOWN, Severity.WARNING, text)
+        self._book.adopt(draft)
+        self._ref_cam_T_grip = outcome.cam_T_grip
         return self._policy.recalibrated(
-            f"the camera moved by {1e3 * before.translation_m:.2f} mm and {np.degrees(before.rotation_rad):.2f} "
-            f"degrees; it was calibrated anew from {np.count_nonzero(taken)} corners: "
-            f"revision {self.reference.revision}"
+            f"{moved}; it was calibrated anew from {len(outcome.inputs.corners)} corners in {outcome.inputs.frames} "
+            f"frames: revision {self.reference.revision}"
         )
 
     def _after_restart(self, evidence: Evidence) -> Alert:

@@ -260,6 +260,11 @@ class Policy:
         return Alert(AlertKind.DRIFT, self._drift_cause, Severity.ERROR, text)
 
     @property
+    def still_frames(self) -> int:
+        """Frames since the transform last left the place where it came to rest."""
+        return self._still
+
+    @property
     def wants_cause(self) -> bool:
         """Whether the next judgement may have to name the cause of a drift."""
         return not self._drift_alerted and self.test.suspicious

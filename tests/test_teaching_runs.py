@@ -17,6 +17,7 @@ from gripmon.config import builtin_config, load_config
 from gripmon.corners import MeasurementSettings, TaughtEdges
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.policy import PolicySettings
+from gripmon.recalibrate import RecalibrationSettings
 from gripmon.records import AlertKind, Frame
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import FingerLook, Scenario, Sensor
@@ -34,7 +35,9 @@ def test_a_recalibrated_monitor_keeps_what_was_taught():
     sections = {name: even.get(name, getattr(bump, name)) for name in Scenario.__struct_fields__}
     simulator = Simulator(CAMERA, bevelled(BEVEL_M), POSE, Scenario(**sections), 1)
     taught = arrays(taught_from(image_of(BEVEL_M)))
-    settings = MonitorSettings(policy=PolicySettings(frames_per_s=20.0))
+    settings = MonitorSettings(
+        policy=PolicySettings(frames_per_s=20.0), recalibration=RecalibrationSettings(sure_sigma_m=2e-4)
+    )
     monitor = Monitor(CAMERA, box_gripper(), settings, reference_of(POSE), taught)
     errors_m, recalibrated = [], []
     for index in range(simulator.frame_count):

@@ -1,7 +1,9 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
+from gripmon.corners.evidence import edge_evidence
 from gripmon.corners.measure import FingertipMeter, Patience
 from gripmon.corners.settling import Effort, Measurement, MeasurementSettings
+from gripmon.corners.sums import edge_sums
 from gripmon.corners.taught import TaughtEdges, TaughtModel
 from gripmon.corners.views import agreeing_fingers, finger_shares, trace_of
 
@@ -14,6 +16,8 @@ __all__ = [
     "TaughtEdges",
     "TaughtModel",
     "agreeing_fingers",
+    "edge_evidence",
+    "edge_sums",
     "finger_shares",
     "trace_of",
 ]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
 from gripmon.records.commands import Command, CommandError, CommandFault, CommandName, CommandReply
-from gripmon.records.evidence import EdgeEvidence
+from gripmon.records.evidence import EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
     CornerFault,
     CornerRecord,
@@ -48,6 +48,7 @@ __all__ = [
     "CornerRecord",
     "Drift",
     "EdgeEvidence",
+    "EdgeSums",
     "Frame",
     "FrameRecord",
     "Image",

@@ -39,3 +39,25 @@ class EdgeEvidence:
     across: Array
     finger_share: Array
     reach_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeSums:
+    """The agreed edge points of one frame in stretches of neighbours, arrays over the stretches; n points each.
+
+    ``edge`` (s,) of the gripper and its ``finger`` (s,), ``stretch`` (s,) counts along the edge;
+    ``weight`` (s,) sum of the points' weights, 1/px²; ``residual_px`` (s,) weighted mean of what is left of their
+    offsets at the frame's pose; ``jacobian`` (s, 6) weighted mean of px by ``xi = (rho, omega)``; ``moment`` (s, 6)
+    and ``information`` (s, 6, 6): sums of weight times Jacobian times residual, and times Jacobian; ``spread_px``
+    (s,) standard deviation that all points of the edge may share.
+    """
+
+    edge: NDArray[np.intp]
+    finger: NDArray[np.intp]
+    stretch: NDArray[np.intp]
+    weight: Array
+    residual_px: Array
+    jacobian: Array
+    moment: Array
+    information: Array
+    spread_px: Array

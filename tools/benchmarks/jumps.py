@@ -210,17 +210,27 @@ def _jump_frame(index: int) -> int:
 def _scripts(xis: FloatArray, pivot_m: FloatArray, tcp_m: FloatArray) -> Iterator[Tilt]:
     """Each jump, and the way back half a trial later."""
     for index, xi in enumerate(xis):
-        lever = tcp_m - pivot_m
-        shift = xi[:3] - (Rotation.from_rotvec(xi[3:]).apply(lever) - lever)
         for sign, frame in ((1.0, _jump_frame(index)), (-1.0, _jump_frame(index) + round(0.5 * TRIAL_S * FPS))):
-            motion = _turn(sign * xi[3:], pivot_m, tcp_m)
-            yield Tilt(
-                start_s=(frame - 0.5) / FPS,
-                time_s=0.0,
-                tcp_shift_m=motion.tcp_shift_m,
-                roll_deg=motion.roll_deg,
-                translation_m=tuple((sign * shift).tolist()),
-            )
+            yield tilt(xi, pivot_m, tcp_m, (frame - 0.5) / FPS, sign)
+
+
+def tilt(xi: FloatArray, pivot_m: FloatArray, tcp_m: FloatArray, start_s: float, sign: float = 1.0) -> Tilt:
+    """The scenario's words for a jump ``xi`` (6,) of the gripper whose TCP is at ``tcp_m``; ``sign`` -1 undoes it."""
+    lever = tcp_m - pivot_m
+    shift = xi[:3] - (Rotation.from_rotvec(xi[3:]).apply(lever) - lever)
+    motion = _turn(sign * xi[3:], pivot_m, tcp_m)
+    return Tilt(
+        start_s=start_s,
+        time_s=0.0,
+        tcp_shift_m=motion.tcp_shift_m,
+        roll_deg=motion.roll_deg,
+        translation_m=tuple((sign * shift).tolist()),
+    )
+
+
+def background(name: str) -> Background:
+    """One of :data:`BACKGROUNDS`."""
+    return _BACKGROUNDS[name]
 
 
 def _turn(omega: FloatArray, pivot_m: FloatArray, tcp_m: FloatArray) -> MountMotion:

@@ -29,6 +29,10 @@ likely by a factor of exp(8) at most.
 """
 
 
+SAME = 1.0
+"""Squared distance of two refined poses, in units of their covariance, below which they are the same one."""
+
+
 class RecalibrationRefused(ValueError):
     """The corners don't determine a pose; the text says why."""
 
@@ -53,16 +57,45 @@ def recalibrate(
     (2n, 2n) of all together.  ``expected_cam_T_grip`` only decides between the two poses of a plane that the residuals
     don't tell apart.  Raises :class:`RecalibrationRefused` for too few or collinear corners.
     """
+    every = solutions(points_grip_m, measured_xy, covariance_xy, iterations)
+    return _choose(every, expected_cam_T_grip, len(points_grip_m))
+
+
+def solutions(
+    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, iterations: int = 10
+) -> list[Recalibration]:
+    """All poses that corners allow, each refined, the best fit first; two for many planes.
+
+    Arguments and refusals as those of :func:`recalibrate`.
+    """
     why = refusal(points_grip_m)
     if why is not None:
         raise RecalibrationRefused(why)
     starts = _closed_forms(points_grip_m, measured_xy, coplanar(points_grip_m))
     weight_xy: Array = np.linalg.inv(covariance_xy if covariance_xy.ndim == 2 else block_diag(*covariance_xy))
     refined = [_refine(start, points_grip_m, measured_xy, weight_xy, iterations) for start in starts]
-    sound = [r for r in refined if r is not None]
-    if not sound:
+    sound = sorted((r for r in refined if r is not None), key=lambda r: r.weighted_rms)
+    different: list[Recalibration] = []
+    for pose in sound:
+        if all(_apart(pose, other) for other in different):
+            different.append(pose)
+    if not different:
         raise RecalibrationRefused("the corners' images don't determine a pose with all of them in front of the camera")
-    return _choose(sound, expected_cam_T_grip, len(points_grip_m))
+    return different
+
+
+def rivals(every: list[Recalibration], corners: int) -> list[Recalibration]:
+    """Those of some :func:`solutions` that n ``corners`` can't tell from the best."""
+    squares, freedom = 2 * corners * every[0].weighted_rms ** 2, 2 * corners - 6
+    # Where even the best pose fits badly, the corners' covariances are too small and so are differences in their units.
+    largest = squares + AMBIGUITY * max(1.0, squares / freedom)
+    return [pose for pose in every if 2 * corners * pose.weighted_rms**2 <= largest]
+
+
+def _apart(one: Recalibration, other: Recalibration) -> bool:
+    """Whether two refined poses are not the same minimum."""
+    xi = perturbation_between(one.cam_T_grip, other.cam_T_grip)
+    return bool(xi @ np.linalg.solve(one.covariance, xi) > SAME)
 
 
 def coplanar(points_grip_m: Array) -> bool:
@@ -128,14 +161,8 @@ def _refine(
     return Recalibration(cam_T_grip, np.linalg.inv(normal), float(np.sqrt(error / residual.size)))
 
 
-def _choose(refined: list[Recalibration], expected_cam_T_grip: Array, corners: int) -> Recalibration:
-    best = min(refined, key=lambda r: r.weighted_rms)
-    squares, freedom = 2 * corners * best.weighted_rms**2, 2 * corners - 6
-    # Where even the best pose fits badly, the corners' covariances are too small and so are differences in their units.
-    largest = squares + AMBIGUITY * max(1.0, squares / freedom)
-    rivals = [r for r in refined if 2 * corners * r.weighted_rms**2 <= largest]
-
+def _choose(every: list[Recalibration], expected_cam_T_grip: Array, corners: int) -> Recalibration:
     def turn(candidate: Recalibration) -> float:
         return float(np.linalg.norm(perturbation_between(expected_cam_T_grip, candidate.cam_T_grip)[3:]))
 
-    return min(rivals, key=turn)
+    return min(rivals(every, corners), key=turn)

@@ -1,0 +1,34 @@
+"""A new reference from the fingertip corners alone, and from many frames: when to believe it, when to ask a person."""
+
+from gripmon.recalibrate.pnp import (
+    FEWEST_COPLANAR,
+    FEWEST_GENERAL,
+    Recalibration,
+    RecalibrationRefused,
+    coplanar,
+    recalibrate,
+    refusal,
+    rivals,
+    solutions,
+)
+from gripmon.recalibrate.recalibrator import Proposal, Recalibrator, Refusal, RefusalReason
+from gripmon.recalibrate.settings import RecalibrationSettings
+from gripmon.recalibrate.stills import StillFrame
+
+__all__ = [
+    "FEWEST_COPLANAR",
+    "FEWEST_GENERAL",
+    "Proposal",
+    "Recalibration",
+    "RecalibrationRefused",
+    "RecalibrationSettings",
+    "Recalibrator",
+    "Refusal",
+    "RefusalReason",
+    "StillFrame",
+    "coplanar",
+    "recalibrate",
+    "refusal",
+    "rivals",
+    "solutions",
+]

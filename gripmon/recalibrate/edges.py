@@ -1,0 +1,138 @@
+"""What the edges of many frames together say against the tracked pose: single edges, and fingers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as fisher
+
+from gripmon.geometry import perturbation_between
+from gripmon.recalibrate.stills import StillFrame
+from gripmon.records import Array, EdgeSums
+
+POINT_PX = 0.03
+"""Standard deviation of a stretch's mean that lasts and that nothing explains, px."""
+
+LOST = 1.0
+"""Variance of a pose that isn't determined without one of its edges, m² and rad²."""
+
+WORST_CONDITION = 1e10
+"""Condition of an information matrix, its unknowns scaled alike, from which it determines nothing."""
+
+_INDEX: tuple[type, tuple[int, ...]] = (np.intp, ())
+_NUMBER: tuple[type, tuple[int, ...]] = (float, ())
+_SHAPES = (_INDEX, _INDEX, _INDEX, _NUMBER, _NUMBER, (float, (6,)), (float, (6,)), (float, (6, 6)), _NUMBER)
+_SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m by rad: equal pixels, about
+
+
+@dataclass(frozen=True, slots=True)
+class PooledEdges:
+    """Stretches of edges summed over all frames, with residuals about one pose; fields as in
+    :class:`~gripmon.records.EdgeSums`.
+    """
+
+    edge: NDArray[np.intp]
+    finger: NDArray[np.intp]
+    residual_px: Array
+    jacobian: Array
+    sigma_px: Array
+    moment: Array
+    information: Array
+
+
+def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
+    """The stretches that at least half of the frames show, about the mean pose."""
+    nothing = EdgeSums(*(np.zeros((0, *shape), kind) for kind, shape in _SHAPES))
+    shown = [nothing, *(_about(f, f.edges, cam_T_grip) for f in frames if f.edges is not None)]
+
+    def all_of(field: str) -> Array:
+        return np.concatenate([getattr(e, field) for e in shown])
+
+    names = np.stack([all_of("edge"), all_of("finger"), all_of("stretch")], axis=1)
+    keys, place, count = np.unique(names, axis=0, return_inverse=True, return_counts=True)
+    often = count >= 0.5 * len(frames)
+
+    def total(values: Array) -> Array:
+        sums = np.zeros((len(keys), *values.shape[1:]))
+        np.add.at(sums, place, values)
+        return sums[often]
+
+    weights = all_of("weight")
+    weight, spread_px = total(weights), total(all_of("spread_px")) / count[often]
+    return PooledEdges(
+        keys[often, 0].astype(np.intp),
+        keys[often, 1].astype(np.intp),
+        total(weights * all_of("residual_px")) / weight,
+        total(weights[:, None] * all_of("jacobian")) / weight[:, None],
+        # What lasts of a stretch's error is that of one frame, however many there are.
+        np.sqrt(POINT_PX**2 + spread_px**2 + count[often] / weight),
+        total(all_of("moment")),
+        total(all_of("information")),
+    )
+
+
+def _about(frame: StillFrame, evidence: EdgeSums, cam_T_grip: Array) -> EdgeSums:
+    """A frame's evidence with residuals about another pose near its own."""
+    xi = perturbation_between(frame.cam_T_grip, cam_T_grip)
+    return replace(
+        evidence,
+        residual_px=evidence.residual_px - evidence.jacobian @ xi,
+        moment=evidence.moment - evidence.information @ xi,
+    )
+
+
+def leave_one_out(pooled: PooledEdges) -> Array:
+    """Covariance (6, 6) of the pose as the edges show it: by how much it moves when each of them is left out (the
+    jackknife, Tukey 1958).  :data:`LOST` where the others don't determine a pose.
+    """
+    edges = np.unique(pooled.edge)
+    information = pooled.information * np.outer(_SCALE, _SCALE)
+    moment = pooled.moment * _SCALE
+    total, pull = information.sum(axis=0), moment.sum(axis=0)
+    if len(edges) < 2 or not np.linalg.cond(total) < WORST_CONDITION:
+        return np.eye(6) * LOST
+    whole = np.linalg.solve(total, pull)
+    covariance = np.zeros((6, 6))
+    for edge in edges.tolist():
+        own = pooled.edge == edge
+        rest = total - information[own].sum(axis=0)
+        if not np.linalg.cond(rest) < WORST_CONDITION:
+            return np.eye(6) * LOST
+        moved = _SCALE * (np.linalg.solve(rest, pull - moment[own].sum(axis=0)) - whole)
+        covariance += np.outer(moved, moved)
+    return covariance * (len(edges) - 1) / len(edges)
+
+
+def fingers_disagree(pooled: PooledEdges) -> float | None:
+    """Probability that fingers which belong together would show residuals which setting one of them free explains so
+    much better (F-test: six more unknowns, each); None where fewer than two fingers, or too few stretches, are seen.
+
+    Only the ratio of residuals counts: it doesn't matter how well their size is known.
+    """
+    fingers = np.unique(pooled.finger)
+    if len(fingers) < 2:
+        return None
+    worst = None
+    weight = 1.0 / pooled.sigma_px[:, None]
+    together = pooled.jacobian * _SCALE * weight
+    residual = pooled.residual_px * weight[:, 0]
+    left, rank = _left(together, residual)
+    for finger in fingers[1:].tolist():
+        apart = np.hstack([together, together * (pooled.finger == finger)[:, None]])
+        less, more = _left(apart, residual)
+        free = len(residual) - more
+        if free < 3 or more == rank:
+            continue
+        ratio = ((left - less) / (more - rank)) / max(less / free, 1e-12)
+        chance = float(fisher.sf(ratio, more - rank, free))
+        worst = chance if worst is None else min(worst, chance)
+    return worst
+
+
+def _left(unknowns: Array, values: Array) -> tuple[float, int]:
+    """Squares that a least-squares fit leaves, and the unknowns that it determines."""
+    fit, _, rank, _ = np.linalg.lstsq(unknowns, values, rcond=1e-6)
+    rest = values - unknowns @ fit
+    return float(rest @ rest), int(rank)

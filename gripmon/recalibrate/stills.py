@@ -1,0 +1,193 @@
+"""Frames of a camera that stands still, taken together: the tracked poses' average, and the corners' mean places.
+
+Both kinds of error are in every frame: one that changes from frame to frame, as noise and a moving background do, and
+one that doesn't, as texture, light and a background that stands still.  What the frames' covariances claim holds both;
+what their scatter shows is the first, and only that becomes less by averaging.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.records import Array, EdgeSums
+
+LASTING = 0.25
+"""Part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""
+
+NEIGHBOURS = 2.0
+"""Frames in a row that count as one: their changing errors are alike, too."""
+
+GATE = 22.46
+"""Squared normalised error that six normal errors exceed once in a thousand times (chi-square)."""
+
+OUTLYING = 37.7
+"""The same for once in a million times: from there on one frame doesn't belong to the others."""
+
+FEWEST_SEEN = 0.2
+"""Part of the frames in which a corner must be usable."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillFrame:
+    """What one measured frame gives: the tracked ``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error; the
+    corners' places ``points_grip_m`` (c, 3) at the frame's jaw opening; ``usable`` (c,) those that were measured, at
+    ``xy`` (c, 2) in ideal coordinates, with the joint covariance ``covariance_xy`` (2k, 2k) of the k usable ones; what
+    the ``edges`` say, None where nobody asked.
+    """
+
+    seq: int
+    stamp_ns: int
+    cam_T_grip: Array
+    covariance: Array
+    points_grip_m: Array
+    usable: NDArray[np.bool_]
+    xy: Array
+    covariance_xy: Array
+    edges: EdgeSums | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Average:
+    """Mean ``cam_T_grip`` (4, 4) of the tracked poses with the honest ``covariance`` (6, 6) of its error;
+    ``covariance_at_last`` the same once ``most_frames`` were averaged.  ``way`` (6,) from the mean of the first half to
+    that of the second, and its squared size ``trend`` over the frames' own scatter; ``outlying``: part of the frames
+    whose pose doesn't belong to the others'.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    covariance_at_last: Array
+    way: Array
+    trend: float
+    outlying: float
+
+
+def average(frames: list[StillFrame], most_frames: int) -> Average:
+    """Weighted mean of the tracked poses of at least four frames, without those that lie far from the middle."""
+    middle_T = _middle(frames)
+    xis = np.array([perturbation_between(middle_T, f.cam_T_grip) for f in frames])
+    weights = np.array([np.linalg.inv(f.covariance) for f in frames])
+    centre = np.median(xis, axis=0)
+    far = np.einsum("ni,nij,nj->n", xis - centre, weights, xis - centre) > OUTLYING
+    outlying = float(far.mean())
+    if np.count_nonzero(~far) >= 4:
+        xis, weights = xis[~far], weights[~far]
+    claimed = np.linalg.inv(weights.mean(axis=0))
+    mean = claimed @ np.einsum("nij,nj->i", weights, xis) / len(xis)
+    scatter = np.cov(xis.T)
+    half = len(xis) // 2
+    way = xis[-half:].mean(axis=0) - xis[:half].mean(axis=0)
+    trend = float(way @ np.linalg.solve(scatter * (2.0 * NEIGHBOURS / half) + 1e-6 * claimed, way))
+    return Average(
+        perturb(middle_T, mean),
+        averaged_covariance(claimed, scatter, len(xis)),
+        averaged_covariance(claimed, scatter, max(most_frames, len(xis))),
+        way,
+        trend,
+        outlying,
+    )
+
+
+def averaged_covariance(claimed: Array, scatter: Array, count: int) -> Array:
+    """Covariance (m, m) of the mean of ``count`` values whose error has the ``claimed`` covariance each, and that show
+    the covariance ``scatter`` about their mean.
+
+    Along each common axis of the two, with v the scatter in units of what is claimed: what doesn't scatter, 1 - v, but
+    at least :data:`LASTING`, stays as it is, and v becomes less as the mean of ``count / NEIGHBOURS`` independent
+    values.
+    """
+    factor = np.linalg.cholesky(claimed)
+    inverse = np.linalg.inv(factor)
+    part, axes = np.linalg.eigh(inverse @ scatter @ inverse.T)
+    part = np.maximum(part, 0.0)
+    left = np.maximum(1.0 - part, LASTING) + part * (NEIGHBOURS / count)
+    axes = factor @ axes
+    return np.asarray((axes * left) @ axes.T)
+
+
+def _middle(frames: list[StillFrame]) -> Array:
+    """The frame's pose whose TCP is nearest to the median of all."""
+    tcp_m = np.array([f.cam_T_grip[:3, 3] for f in frames])
+    distance = np.linalg.norm(tcp_m - np.median(tcp_m, axis=0), axis=1)
+    return frames[int(np.argmin(distance))].cam_T_grip
+
+
+@dataclass(frozen=True, slots=True)
+class MeanCorners:
+    """The k corners that most frames show: their indices ``corner`` (k,), mean ``points_grip_m`` (k, 3), mean ``xy``
+    (k, 2) with the joint covariance (2k, 2k) of its error.
+    """
+
+    corner: NDArray[np.intp]
+    points_grip_m: Array
+    xy: Array
+    covariance_xy: Array
+
+    def of(self, taken: NDArray[np.bool_]) -> MeanCorners:
+        """Only those ``taken`` (k,)."""
+        both = np.repeat(taken, 2)
+        return MeanCorners(
+            self.corner[taken], self.points_grip_m[taken], self.xy[taken], self.covariance_xy[np.ix_(both, both)]
+        )
+
+
+def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
+    """Corners averaged over the frames: their mean distance from where ``cam_T_grip`` puts them at each frame's own jaw
+    opening, added to where it puts their mean points.  A corner's frames that lie far from its median don't count.
+
+    The pose only carries the corners from one opening to the others: an error of it cancels to first order.
+    """
+    off_xy = np.array([f.xy - _image(f.points_grip_m, cam_T_grip) for f in frames])
+    usable = np.array([f.usable for f in frames])
+    off_xy[~usable] = 0.0
+    usable &= ~_astray(frames, off_xy)
+    usable[:, usable.mean(axis=0) < FEWEST_SEEN] = False
+    corner = np.flatnonzero(usable.any(axis=0))
+    middle = np.zeros(off_xy.shape[1:])
+    for c in corner:
+        middle[c] = np.median(off_xy[usable[:, c], c], axis=0)
+    information, pull = np.zeros((middle.size, middle.size)), np.zeros(middle.size)
+    squares, values = 0.0, 0
+    for frame, off, taken in zip(frames, off_xy, usable, strict=True):
+        rows = np.flatnonzero(np.repeat(taken, 2))
+        among = np.repeat(taken[frame.usable], 2)
+        weight = np.linalg.inv(frame.covariance_xy[np.ix_(among, among)])
+        information[np.ix_(rows, rows)] += weight
+        pull[rows] += weight @ off.ravel()[rows]
+        rest = (off - middle).ravel()[rows]
+        squares, values = squares + float(rest @ weight @ rest), values + len(rows)
+    both = np.flatnonzero(np.repeat(usable.any(axis=0), 2))
+    information = information[np.ix_(both, both)]
+    mean = np.linalg.solve(information, pull[both])
+    # As if each corner had been seen once, in the frame that it is usually seen in.
+    times = np.sqrt(np.repeat(usable[:, corner].sum(axis=0), 2))
+    claimed = np.linalg.inv(information / np.outer(times, times))
+    part = squares / max(values, 1)
+    left = max(1.0 - part, LASTING) + part * NEIGHBOURS / max(usable.sum(axis=0)[corner].min(initial=len(frames)), 1)
+    seen = usable[:, corner, None]
+    points = np.array([f.points_grip_m[corner] for f in frames])
+    points_grip_m = (points * seen).sum(axis=0) / seen.sum(axis=0)
+    xy = _image(points_grip_m, cam_T_grip) + mean.reshape(-1, 2)
+    return MeanCorners(corner, points_grip_m, xy, claimed * left)
+
+
+def _astray(frames: list[StillFrame], off_xy: Array) -> NDArray[np.bool_]:
+    """(n, c) corners that lie further from their median over the frames than five standard deviations."""
+    astray = np.zeros(off_xy.shape[:2], dtype=bool)
+    usable = np.array([f.usable for f in frames])
+    for c in np.flatnonzero(usable.any(axis=0)):
+        middle = np.median(off_xy[usable[:, c], c], axis=0)
+        for n in np.flatnonzero(usable[:, c]):
+            k = 2 * int(np.count_nonzero(frames[n].usable[:c]))
+            off = off_xy[n, c] - middle
+            astray[n, c] = off @ np.linalg.solve(frames[n].covariance_xy[k : k + 2, k : k + 2], off) > 25.0
+    return astray
+
+
+def _image(points_grip_m: Array, cam_T_grip: Array) -> Array:
+    points = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+    return np.asarray(points[:, :2] / points[:, 2:])
