@@ -1,0 +1,68 @@
+"""Configurations on still pictures, and states as they lie there when a monitor starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+from gripmon.config import builtin_config, load_config
+from gripmon.geometry import from_record
+from gripmon.records import MonitorState
+from gripmon.references import ReferenceBook
+from gripmon.simulator import Simulator, make_scenario
+from gripmon.statefile import StateFile
+
+FRAMES = 3000
+
+
+def make_pictures(folder: Path) -> Path:
+    """A folder of many frames: the demo's camera, which stands still."""
+    folder.mkdir()
+    config = load_config(builtin_config("demo.yaml"))
+    scenario = make_scenario("static", duration_s=0.2, fps=20.0)
+    simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, 1)
+    for i in range(4):
+        image = simulator.frame(i).image
+        assert image is not None and cv2.imwrite(str(folder / f"original{i}.bmp"), image)
+    frames = folder / "frames"
+    frames.mkdir()
+    for i in range(FRAMES):
+        (frames / f"{i:05d}.bmp").symlink_to(folder / f"original{i % 4}.bmp")
+    return frames
+
+
+def configuration(folder: Path, pictures: Path, endpoint: str, **more: object) -> Path:
+    """The demo's camera and gripper on these pictures, a state file ``kept.json``, a client of a router."""
+    demo = builtin_config("demo.yaml")
+    settings = yaml.safe_load(demo.read_text())
+    settings |= {
+        "gripper": str(demo.parent / settings["gripper"]),
+        "source": {"kind": "folder", "path": str(pictures), "fps": 60.0},
+        "jaw": {"source": "fixed"},
+        "publish": {"mode": "client", "connect": [endpoint]},
+        "recording": {"enabled": False},
+        "state": {"file": "kept.json"},
+        **more,
+    }
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(settings))
+    return path
+
+
+def keep(path: Path, *moved_m: float) -> MonitorState:
+    """A state as it may lie there: after the configured reference others, whose TCP lies beside it in x."""
+    config = load_config(path)
+    book = ReferenceBook(config.reference)
+    for i, x_m in enumerate(moved_m):
+        pose = from_record(config.reference.cam_T_grip)
+        pose[0, 3] += x_m
+        book.adopt(book.draft(pose, np.diag([1e-9] * 3 + [1e-7] * 3), 1_000_000_000 * (i + 1)))
+    assert config.state_path is not None
+    file = StateFile(config.state_path, config.state_owner, config.reference)
+    state = MonitorState(book.history)
+    assert file.write(state)
+    file.close()
+    return state

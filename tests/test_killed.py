@@ -1,0 +1,158 @@
+"""kill -9 at any moment: what a monitor has said or answered is on the disk, and no revision is ever used twice."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import zenoh
+from kept_states import configuration, keep, make_pictures
+from loopback import free_endpoint, plain_session, wait_until
+
+from gripmon.records import CommandReply, FrameRecord, ReferenceRecord
+from gripmon.references import state_fault
+from gripmon.statefile import unpack
+
+HERE = Path(__file__).resolve().parent
+PREFIX = "gripmon/demo/wrist"
+KILLS = 50
+
+
+class Witness:
+    """Hears all that monitors say, and asks for an undo as soon as the last one was answered."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self.faults: list[str] = []
+        self.published: dict[int, ReferenceRecord] = {}
+        self.named: dict[int, str] = {}
+        self.answered = 0
+        self.transforms = 0
+        self._lock = threading.Lock()
+        self._session = session
+        self._subscribers = [
+            session.declare_subscriber(f"{PREFIX}/reference", self._reference),
+            session.declare_subscriber(f"{PREFIX}/transform", self._transform),
+        ]
+
+    @property
+    def newest(self) -> int:
+        with self._lock:
+            return max(self.named, default=-1)
+
+    def name(self, revision: int, reference_id: str) -> None:
+        with self._lock:
+            known = self.named.setdefault(revision, reference_id)
+        if known != reference_id:
+            self.faults.append(f"revision {revision} is {known}, and {reference_id}")
+
+    def ask_until(self, stop: threading.Event, references: list[str]) -> None:
+        """Undo to and fro between the last two references, without a pause."""
+        while not stop.is_set():
+            payload = msgspec.json.encode({"argument": references[-2]})
+            for reply in self._session.get(f"{PREFIX}/cmd/undo", payload=payload, timeout=1.0):
+                if reply.ok is not None:
+                    answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=CommandReply)
+                    if not answer.done:
+                        self.faults.append(answer.text)
+                    self.name(answer.revision, answer.reference_id)
+                    references.append(answer.reference_id)
+                    self.answered += 1
+
+    def _reference(self, sample: zenoh.Sample) -> None:
+        record = msgspec.json.decode(sample.payload.to_bytes(), type=ReferenceRecord)
+        if self.published.setdefault(record.revision, record) != record:
+            self.faults.append(f"two references of revision {record.revision}")
+        self.name(record.revision, record.reference_id)
+
+    def _transform(self, sample: zenoh.Sample) -> None:
+        record = msgspec.json.decode(sample.payload.to_bytes(), type=FrameRecord)
+        self.transforms += 1
+        self.name(record.revision, record.reference_id)
+
+
+class Forks:
+    """Processes of ``gripmon run``, one after the other."""
+
+    def __init__(self, config: Path) -> None:
+        environment = os.environ | {"PYTHONPATH": str(HERE.parent), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        self._parent = subprocess.Popen(
+            [sys.executable, str(HERE / "forked_daemons.py"), str(config)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=(config.parent / "log.txt").open("wb"),
+            text=True, env=environment,
+        )  # fmt: skip
+
+    def start(self) -> int:
+        assert self._parent.stdin is not None and self._parent.stdout is not None
+        self._parent.stdin.write("\n")
+        self._parent.stdin.flush()
+        return int(self._parent.stdout.readline())
+
+    def kill(self, pid: int) -> None:
+        """And wait until it is gone."""
+        os.kill(pid, signal.SIGKILL)
+        assert self._parent.stdout is not None and self._parent.stdout.readline() == "ended\n"
+
+    def close(self) -> None:
+        self._parent.communicate()
+
+
+@contextmanager
+def forks(config: Path) -> Iterator[Forks]:
+    made = Forks(config)
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+def test_killed_at_fifty_moments_it_goes_on_from_what_it_said_last(tmp_path: Path):
+    """Frames as fast as they can be measured, a change of reference with nearly every one of them, and so many
+    references that the monitor spends much of its time writing them.
+    """
+    endpoint = free_endpoint()
+    config = configuration(tmp_path, make_pictures(tmp_path / "pictures"), endpoint)
+    state = keep(config, *[2e-5, -1e-5] * 400)
+    chance = random.Random(5)
+    lives: list[int] = []
+    with plain_session(listen=endpoint, mode="router") as session, forks(config) as monitors:
+        witness = Witness(session)
+        for reference in state.references:
+            witness.name(reference.revision, reference.reference_id)
+        for life in range(KILLS):
+            stop = threading.Event()
+            recent = [reference.reference_id for reference in state.references[-2:]]
+            asker = threading.Thread(target=witness.ask_until, args=(stop, recent))
+            before = witness.answered
+            pid = monitors.start()
+            asker.start()
+            if life % 2:
+                wait_until(lambda before=before: witness.answered > before + 1, "the monitor to answer")
+            # Any moment of the start and the first frames, or any moment of the work.
+            time.sleep(chance.uniform(0.0, 0.3 if life % 2 else 0.9))
+            monitors.kill(pid)
+            stop.set()
+            asker.join()
+            kept, said = unpack((tmp_path / "kept.json").read_bytes()).state, witness.newest
+            assert state_fault(kept) == ""
+            for reference in kept.references:
+                witness.name(reference.revision, reference.reference_id)
+                assert witness.published.get(reference.revision, reference) == reference
+            assert witness.faults == []
+            assert said <= kept.references[-1].revision, "what was said is kept"
+            state = kept
+            lives.append(witness.answered - before)
+    log = (tmp_path / "log.txt").read_text()
+    assert "damaged" not in log and "Traceback" not in log
+    assert not list(tmp_path.glob("kept.json.*-*")), "nothing was set aside"
+    assert len(list(tmp_path.glob(".kept.json-*.tmp"))) <= 1, "each start clears what the last life left"
+    assert sum(answers > 0 for answers in lives) > KILLS // 3, "many were killed at work"
+    assert witness.transforms > KILLS and witness.answered > KILLS
