@@ -39,7 +39,7 @@ from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
 from gripmon.jaw import JawKnowledge
 from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
-from gripmon.recalibrate import RecalibrationSettings, Recalibrator, Refusal, StillFrame
+from gripmon.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, StillFrame
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -161,6 +161,7 @@ class Monitor:
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
         most_corners = CORNER_COUNTS[settings.recalibrate_corners]
         self._recalibrator = Recalibrator(settings.recalibration, gripper, self._floor, most_corners)
+        self._outcome: Proposal | Refusal | None = None
         self._ref_cam_T_grip = from_record(self.reference.cam_T_grip)
         last = None if state is None else state.cam_T_grip
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
@@ -180,6 +181,16 @@ class Monitor:
     def reference(self) -> ReferenceRecord:
         """The calibration that drift is measured against now."""
         return self._book.current
+
+    @property
+    def proposal(self) -> ReferenceRecord | None:
+        """A new reference that waits for an operator."""
+        return self._book.proposal
+
+    @property
+    def recalibration(self) -> Proposal | Refusal | None:
+        """What came of the newest attempt at a new reference; None before the first one."""
+        return self._outcome
 
     @property
     def state_revision(self) -> int:
@@ -419,7 +430,7 @@ class Monitor:
 
         Returns what there is to say of it; later frames may try again.
         """
-        outcome = self._recalibrator.outcome(self.reference)
+        outcome = self._outcome = self._recalibrator.outcome(self.reference)
         if isinstance(outcome, Refusal):
             return None if outcome.wait else self._policy.not_recalibrated(outcome.text)
         if outcome.wait:

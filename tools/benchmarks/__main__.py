@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, causes, latency, recovery, series
+from benchmarks import accuracy, causes, latency, recalibration, recovery, series
 
-_BENCHMARKS = (accuracy, causes, latency, recovery, series)
+_BENCHMARKS = (accuracy, causes, latency, recalibration, recovery, series)
 
 
 def main() -> int:

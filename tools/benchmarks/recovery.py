@@ -231,7 +231,7 @@ def as_text(machine: dict[str, Any], plan: Plan, rows: dict[str, list[Outcome]])
         absent = rows["absent"]
         shown = len(absent) * plan.after
         measured, valid = sum(o.astray for o in absent), sum(o.valid for o in absent)
-        most = 100 * _at_most(measured, len(absent))
+        most = 100 * at_most(measured, len(absent))
         lines.append(
             f"without a gripper: something was measured in {measured} of {len(absent)} views of {plan.after} frames"
         )
@@ -272,7 +272,7 @@ def _outcome_row(name: str, outcomes: list[Outcome]) -> str:
         f"{100 * back / count:.1f} %",
         f"{100 * _at_least(back, count):.1f} %",
         str(lies),
-        f"{100 * _at_most(lies, count):.2f} %",
+        f"{100 * at_most(lies, count):.2f} %",
         f"{100 * inexact / max(valid, 1):.1f} %",
         f"{np.median(times):.0f}",
         f"{np.percentile(times, 99.0):.0f}",
@@ -286,7 +286,7 @@ def _at_least(successes: int, trials: int) -> float:
     return float(betaincinv(successes, trials - successes + 1, 1.0 - CONFIDENCE)) if successes else 0.0
 
 
-def _at_most(events: int, trials: int) -> float:
+def at_most(events: int, trials: int) -> float:
     """Upper bound of the probability of an event."""
     return 1.0 - _at_least(trials - events, trials)
 
