@@ -6,79 +6,56 @@ before and after alike.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array, EdgeEvidence
-
-SETTLED = 4
-"""Frames from which the baseline counts, and"""
-
-ENOUGH = 24
-"""frames at which it is complete: what changes later is news, not baseline."""
+from gripmon.causes.pooling import PIECES, Pooled
+from gripmon.causes.state import JAW, POSE, State
+from gripmon.gripper import Gripper
+from gripmon.records import Array
 
 
+@dataclass(frozen=True, slots=True)
 class Baseline:
-    """Means over frames in which all was well: ``motion`` (m,) of the unknowns from the reference, ``bias_px`` (e,) of
-    each edge beyond that, ``blur_px2`` of the edges.
+    """``motion`` (m,) of the unknowns from the reference; ``bias_px`` of each piece of an edge beyond that, and
+    ``sigma_px`` of it, both (pieces,), NaN where none was seen; ``jaw_reported_m`` at the time; blur and noise as in
+    :class:`Pooled`.
     """
 
-    def __init__(self, unknowns: int, edges: int):
-        self.frames = 0
-        self.motion = np.zeros(unknowns)
-        self._sum = np.zeros(edges)
-        self._count = np.zeros(edges)
-        self._blurs_px2: list[float] = []
+    motion: Array
+    bias_px: Array
+    sigma_px: Array
+    jaw_reported_m: float | None
+    blur_px2: float | None
+    noise: float
 
-    @property
-    def known(self) -> bool:
-        return self.frames >= SETTLED
+    @classmethod
+    def of(cls, pooled: Pooled, motion: Array, residual_px: Array, edges: int) -> Baseline:
+        bias_px, sigma_px = np.full(edges * PIECES, np.nan), np.full(edges * PIECES, np.nan)
+        bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
+        reported_m = pooled.evidence.jaw_reported_m
+        return cls(motion, bias_px, sigma_px, reported_m, pooled.blur_px2, pooled.noise)
 
-    @property
-    def complete(self) -> bool:
-        return self.frames >= ENOUGH
+    def start(self, state: State, reported: bool, gripper: Gripper) -> State:
+        """Where everything stands if nothing has moved; ``state``: if the reference and the report are right."""
+        motion = np.zeros_like(self.motion)
+        motion[POSE] = self.motion[POSE]
+        if reported:
+            motion[JAW] = self.motion[JAW]
+        return state.moved(motion, gripper)
 
-    @property
-    def blur_px2(self) -> float | None:
-        """None where too few frames told."""
-        return float(np.median(self._blurs_px2)) if len(self._blurs_px2) >= SETTLED else None
+    def known(self, piece: NDArray[np.intp]) -> NDArray[np.bool_]:
+        """(s,) whether pieces were seen."""
+        return np.isfinite(self.bias_px[piece])
 
-    def add(self, motion: Array, edge: NDArray[np.intp], residual_px: Array, blur_px2: float | None) -> None:
-        self.frames += 1
-        self.motion = self.motion + (motion - self.motion) / self.frames
-        count = np.bincount(edge, minlength=len(self._sum))
-        total = np.bincount(edge, residual_px, len(self._sum))
-        seen = count > 0
-        self._sum[seen] += total[seen] / count[seen]
-        self._count += seen
-        if blur_px2 is not None:
-            self._blurs_px2.append(blur_px2)
-
-    @property
-    def bias_px(self) -> Array:
-        """(e,) zero for edges that were not seen."""
-        return self._sum / np.maximum(self._count, 1)
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(e,) whether an edge was seen in enough frames."""
-        return np.asarray(self._count >= SETTLED)
-
-
-def isotropic_blur_px2(evidence: EdgeEvidence) -> float | None:
-    """The least variance of the edges' blur over all directions in the image; None with too few directions.
-
-    Motion smears edges along one direction only; a lens out of focus blurs all of them.
-    """
-    if len(evidence.edge) < 6:
-        return None
-    angle = 2.0 * np.arctan2(evidence.across[:, 1], evidence.across[:, 0])
-    design = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
-    if np.linalg.cond(design) > 10.0:
-        return None
-    weight = np.ones(len(angle))
-    for _ in range(8):  # towards least absolute deviations: an edge beside another one looks wide
-        terms = np.linalg.lstsq(design * weight[:, None], evidence.blur_px2 * weight, rcond=None)[0]
-        rest = np.abs(evidence.blur_px2 - design @ terms)
-        weight = 1.0 / np.sqrt(np.maximum(rest, 0.02))
-    return max(float(terms[0] - np.hypot(terms[1], terms[2])), 0.0)
+    def bias_of(self, piece: NDArray[np.intp]) -> tuple[Array, Array]:
+        """(s,) bias and its standard deviation in px; of a piece that wasn't seen that of its edge, else zero."""
+        bias_px, sigma_px = self.bias_px[piece], self.sigma_px[piece]
+        by_edge = self.bias_px.reshape(-1, PIECES)
+        for k in np.flatnonzero(~np.isfinite(bias_px)):
+            own = by_edge[piece[k] // PIECES]
+            own = own[np.isfinite(own)]
+            bias_px[k], sigma_px[k] = (float(np.median(own)), 0.0) if len(own) else (0.0, 0.0)
+        return bias_px, sigma_px

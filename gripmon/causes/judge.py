@@ -4,49 +4,35 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from gripmon.camera import Camera
-from gripmon.causes.baseline import Baseline, isotropic_blur_px2
-from gripmon.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
-from gripmon.causes.state import JAW, POSE, EdgeView, State, fingers_of
-from gripmon.causes.weighing import Weighed, covariance_px2, weigh
+from gripmon.causes.baseline import Baseline
+from gripmon.causes.comparing import Comparison, Key, Report, compare
+from gripmon.causes.pooling import Pooled, pool
 from gripmon.causes.words import sentence
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Cause, CauseWeight, EdgeEvidence
 
-FEWEST_STRETCHES, FEWEST_SHARE = 3, 0.25
-"""Stretches of a finger, and share of its profiles, with which it counts as seen."""
+FEWEST_PIECES = 4
+"""Pieces of edges without which nothing is told about motions."""
 
-ABSENT = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
-"""How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
-several things happened; with every other cause it is a ``STRAY``."""
-STRAY = 0.02
+ENOUGH, SETTLED = 20, 6
+"""Frames in which all was well that make a baseline, and with which a first one is made if it is asked for earlier."""
 
-BLOCKED = 0.1
-"""Probability of a blocked view beforehand, where a finger isn't seen."""
+CONTRADICTED = 6.0
+"""Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
 
-FLOOR_PX = 0.015
-"""Standard deviation of a stretch's place that nothing else explains."""
-
-SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
-"""Of the pose that a baseline knows, m and rad."""
-SETTLED_JAW_M = 5e-6
-
-WITH_BASELINE = 0.5
-"""Part of what a whole edge is off by that is left when it is compared with itself before."""
-
-BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
-"""Scatter of the blur while the lens stays as it is, and how far it goes when it doesn't."""
-
-WORST = -40.0
-"""Log likelihood ratio that a single frame's blur is worth at most."""
+BLIND = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
+"""Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
+NOISY = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
+"""And in one with more than that: so many times the usual, at least a share of the full scale."""
+MUCH_NOISE, LEAST_NOISE = 4.0, 0.02
 
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -55,13 +41,14 @@ class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     probable: Annotated[
         float, Meta(gt=0.5, lt=1.0, description="probability from which a cause is named, else it is unknown")
     ] = 0.9
-    frames: Annotated[int, Meta(ge=1, le=1000, description="newest frames that the evidence is taken from")] = 20
+    frames: Annotated[int, Meta(ge=1, le=1000, description="newest frames that the evidence is taken from")] = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
     """``causes``: all that were weighed, the most probable first; ``probable`` the one to name, UNKNOWN where none is
-    probable enough; ``text`` a sentence, with what this camera can't separate.  No evidence: UNKNOWN alone.
+    probable enough, or nothing has moved; ``text`` a sentence, with what this camera can't separate.  No evidence:
+    UNKNOWN alone.
     """
 
     causes: tuple[CauseWeight, ...]
@@ -69,21 +56,11 @@ class Explanation:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """One frame's log evidence by (cause, finger), and what each would have moved by."""
-
-    log_evidence: dict[tuple[Cause | None, int | None], float]
-    fits: dict[tuple[Cause | None, int | None], Weighed]
-    absent: tuple[int, ...]
-    blur_change_px: float | None
-
-
 class CauseJudge:
-    """Compares models of what moved on the same stretches of edges, over some frames.
+    """Compares models of what moved on the same pieces of edges, over some frames.
 
-    It is asked when something looks wrong; shown frames from a time when all was well (:meth:`well`) it tells much
-    smaller changes.  A pure function of what it was shown.
+    Frames from a time when all is well (:meth:`well`) let it tell much smaller changes.  A pure function of what it was
+    shown.  Frames cost nothing; an explanation takes some milliseconds.
     """
 
     def __init__(
@@ -96,18 +73,18 @@ class CauseJudge:
         jaw_offset_sigma_m: float,
     ):
         """``reference_sigma`` (6,): standard deviations of the reference, m and rad; of the reported opening's error
-        the part that changes as the jaw moves, and the part that doesn't.
+        the part that changes as the jaw moves (zero: the report is exact), and the part that doesn't.
         """
         self._camera, self._gripper, self._settings = camera, gripper, settings
-        self._jaw_sigma_m, self._jaw_offset_sigma_m = jaw_sigma_m, jaw_offset_sigma_m
-        self._frames: deque[_Frame] = deque(maxlen=settings.frames)
+        self._report = Report(jaw_sigma_m, jaw_offset_sigma_m)
+        self._frames: deque[EdgeEvidence] = deque(maxlen=settings.frames)
         self.rebase(reference_sigma)
 
     def rebase(self, reference_sigma: Array) -> None:
         """There is a new reference (``reference_sigma`` as above): evidence and baseline are forgotten."""
         self._reference_sigma = reference_sigma
-        self._baseline = Baseline(8 + 6 * len(self._gripper.finger_ids), len(self._gripper.edge_ids))
-        self._baseline_jaw_m: float | None = None
+        self._well: list[EdgeEvidence] = []
+        self._baseline: Baseline | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -117,182 +94,77 @@ class CauseJudge:
     @property
     def wants_baseline(self) -> bool:
         """Whether frames in which all is well still teach anything."""
-        return not self._baseline.complete
+        return len(self._well) < ENOUGH
 
-    def well(self, evidence: EdgeEvidence, ref_cam_T_grip: Array) -> None:
-        """A frame in which all seems well.  One that contradicts the gripper's model within what is known of reference
-        and jaw teaches nothing: a finger that is bent from the start must not pass for normal.
-        """
-        if self._baseline.complete or self._absent(evidence):
-            return
-        frame = self._judged(evidence, ref_cam_T_grip)
-        if frame is None or max(frame.log_evidence, key=lambda k: frame.log_evidence[k])[0] is not None:
-            return
-        fit = frame.fits[None, None]
-        start = self._start(evidence, ref_cam_T_grip, settled=False)
-        motion = fit.state.since(start)
-        view = EdgeView(self._camera, self._gripper, evidence)
-        self._baseline.add(motion, evidence.edge, view.residual(fit.state)[0], isotropic_blur_px2(evidence))
-        self._baseline_jaw_m = evidence.jaw_reported_m
+    def well(self, evidence: EdgeEvidence) -> None:
+        """A frame in which all seems well."""
+        if self.wants_baseline:
+            self._well.append(evidence)
+            self._baseline = None
 
-    def add(self, evidence: EdgeEvidence, ref_cam_T_grip: Array) -> None:
-        """One frame's evidence of what moved since ``ref_cam_T_grip`` (4, 4)."""
-        frame = self._judged(evidence, ref_cam_T_grip)
-        if frame is not None:
-            self._frames.append(frame)
+    def add(self, evidence: EdgeEvidence) -> None:
+        """A frame in which something may be wrong, measured or not."""
+        self._frames.append(evidence)
 
-    def explanation(self) -> Explanation:
-        """What the frames since the last reset say together."""
-        names = self._gripper.finger_ids
+    def explanation(self, ref_cam_T_grip: Array) -> Explanation:
+        """What the frames since the last reset say together about what moved since ``ref_cam_T_grip`` (4, 4)."""
         if not self._frames:
-            unknown = CauseWeight(Cause.UNKNOWN, 1.0)
-            return Explanation((unknown,), unknown, "nothing was seen that tells a cause")
-        log = self._together()
-        top = max(log.values())
-        total = sum(math.exp(value - top) for value in log.values())
-        weights: dict[tuple[Cause, int | None], float] = {}
-        for (cause, part), value in log.items():
-            named = (Cause.UNKNOWN if cause is None else cause, part)
-            weights[named] = weights.get(named, 0.0) + math.exp(value - top) / total
-        causes = sorted(
-            (CauseWeight(c, p, None if f is None else names[f]) for (c, f), p in weights.items()),
-            key=lambda weight: -weight.probability,
+            return _explained({(Cause.UNKNOWN, None): 1.0}, self._gripper, 1.0, "nothing was seen that tells a cause")
+        baseline = self._learnt(ref_cam_T_grip)
+        pooled = pool(self._frames, self._camera, self._gripper)
+        if len(pooled.piece) < FEWEST_PIECES:
+            return self._blind(pooled, baseline)
+        comparison = self._compared(pooled, ref_cam_T_grip, baseline)
+        top = max(comparison.log.values())
+        total = sum(math.exp(value - top) for value in comparison.log.values())
+        shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
+        text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
+        return _explained(shares, self._gripper, self._settings.probable, text)
+
+    def _compared(self, pooled: Pooled, ref_cam_T_grip: Array, baseline: Baseline | None) -> Comparison:
+        return compare(
+            pooled, self._camera, self._gripper, ref_cam_T_grip, self._reference_sigma, self._report, baseline
         )
-        probable = causes[0]
-        if probable.cause is Cause.UNKNOWN or probable.probability < self._settings.probable:
-            unknown = next((c for c in causes if c.cause is Cause.UNKNOWN), CauseWeight(Cause.UNKNOWN, 0.0))
-            probable = unknown
-        best = max(log, key=lambda key: log[key])
-        newest = self._frames[-1]
-        text = sentence(probable, causes, best, newest.fits, newest.absent, newest.blur_change_px, self._gripper)
-        return Explanation(tuple(causes), probable, text)
 
-    def _together(self) -> dict[tuple[Cause | None, int | None], float]:
-        """Log evidence of each model, all frames together: the middle one of the frames, relative to each frame's best.
+    def _learnt(self, ref_cam_T_grip: Array) -> Baseline | None:
+        """The baseline of the frames in which all was well; None with too few.
 
-        Before a background that stands still they err together, so that all of them say no more than one; and one whose
-        edges were mistaken must not outweigh the others.
+        Frames that contradict the gripper's model within what is known of reference and jaw teach nothing: a finger
+        that is bent from the start must not pass for normal.
         """
-        keys = {key: None for frame in self._frames for key in frame.log_evidence}
-        rows = []
-        for frame in self._frames:
-            top = max(frame.log_evidence.values())
-            rows.append([frame.log_evidence.get(key, WORST + top) - top for key in keys])
-        return dict(zip(keys, np.median(rows, axis=0).tolist(), strict=True))
-
-    def _absent(self, evidence: EdgeEvidence) -> tuple[int, ...]:
-        """Fingers that should be in view and are not seen."""
-        stretches = fingers_of(evidence, self._gripper)
-        sampled = np.isfinite(evidence.finger_share)
-        seen = (stretches >= FEWEST_STRETCHES) & (np.nan_to_num(evidence.finger_share) >= FEWEST_SHARE)
-        return tuple(np.flatnonzero(sampled & ~seen).tolist())
-
-    def _judged(self, evidence: EdgeEvidence, ref_cam_T_grip: Array) -> _Frame | None:
-        """None if no finger is seen."""
-        absent = self._absent(evidence)
-        evidence = _without(evidence, absent, self._gripper)
-        if len(evidence.edge) < FEWEST_STRETCHES:
+        if self._baseline is not None or len(self._well) < SETTLED:
+            return self._baseline
+        pooled = pool(self._well, self._camera, self._gripper)
+        if len(pooled.piece) < FEWEST_PIECES or pooled.absent:
             return None
-        start = self._start(evidence, ref_cam_T_grip, settled=self._baseline.known)
-        held = self._knowledge(evidence)
-        models = suspects(self._gripper, float(ref_cam_T_grip[2, 3]), held)
-        view = EdgeView(self._camera, self._gripper, evidence)
-        bias_px = self._baseline.bias_px[evidence.edge] if self._baseline.known else np.zeros(len(evidence.edge))
-        shared_px = 0.0
-        fits: dict[tuple[Cause | None, int | None], Weighed] = {}
-        log: dict[tuple[Cause | None, int | None], float] = {}
-        # The freest model first: what even that leaves, all stretches share as an error.
-        for suspect in reversed(models):
-            first = self._first(suspect, start, evidence)
-            for _ in range(2 if suspect is models[-1] else 1):
-                covariance = covariance_px2(
-                    evidence.edge, evidence.sigma_px, self._spread_px(evidence), shared_px, FLOOR_PX
-                )
-                fit = weigh(view, self._gripper, suspect.model, start, first, bias_px, np.linalg.inv(covariance))
-                if suspect is models[-1]:
-                    shared_px = _shared_px(evidence, fit.residual_px)
-            fits[suspect.cause, suspect.part] = fit
-            log[suspect.cause, suspect.part] = fit.log_evidence + math.log(suspect.prior)
-        change_px = self._blur_change_px(evidence)
-        if change_px is not None:
-            for key in log:
-                log[key] += _blur_log_likelihood(change_px, may=key[0] in (Cause.LENS, Cause.UNKNOWN))
-        if absent:
-            log[Cause.VIEW_BLOCKED, None] = log[None, None] + math.log(BLOCKED)
-            fits[Cause.VIEW_BLOCKED, None] = fits[None, None]
-            for cause, part in log:
-                chance = ABSENT.get(cause, STRAY) if cause is not None else STRAY
-                log[cause, part] += math.log(STRAY if part is not None and part not in absent else chance)
-        return _Frame(log, fits, absent, change_px)
-
-    def _start(self, evidence: EdgeEvidence, ref_cam_T_grip: Array, *, settled: bool) -> State:
-        """Where everything stands if nothing has moved."""
-        reported_m = evidence.jaw_reported_m
-        opening_m = evidence.jaw_opening_m if reported_m is None else reported_m
-        start = State(ref_cam_T_grip, opening_m, 0.0, np.zeros((len(self._gripper.finger_ids), 6)))
-        if not settled:
-            return start
-        motion = np.zeros_like(self._baseline.motion)
-        motion[POSE] = self._baseline.motion[POSE]
-        if reported_m is not None:
-            motion[JAW] = self._baseline.motion[JAW]
-        return start.moved(motion, self._gripper)
-
-    @staticmethod
-    def _first(suspect: Suspect, start: State, evidence: EdgeEvidence) -> State:
-        """Where a model's fit begins: a camera that moved is followed at once, however far."""
-        if suspect.cause in (Cause.CAMERA_MOUNT, Cause.UNKNOWN):
-            return replace(start, cam_T_grip=evidence.cam_T_grip)
-        return start
-
-    def _knowledge(self, evidence: EdgeEvidence) -> Knowledge:
-        reported = evidence.jaw_reported_m is not None
-        if not self._baseline.known:
-            jaw_m = math.hypot(self._jaw_sigma_m, self._jaw_offset_sigma_m if self._jaw_sigma_m > 0.0 else 0.0)
-            return Knowledge(self._reference_sigma, max(jaw_m, SETTLED_JAW_M), reported)
-        jaw_m = SETTLED_JAW_M
-        if reported and self._baseline_jaw_m is not None and self._jaw_sigma_m > 0.0:
-            # The part of the report's error that changes is another one some way on.
-            way_m = abs(evidence.jaw_reported_m - self._baseline_jaw_m)  # type: ignore[operator]
-            jaw_m = math.hypot(
-                jaw_m, self._jaw_sigma_m * math.sqrt(2.0 - 2.0 * math.exp(-way_m / (2.0 * self._jaw_sigma_m)))
-            )
-        return Knowledge(SETTLED_SIGMA, jaw_m if reported else JAW_UNREPORTED_SIGMA_M, reported)
-
-    def _spread_px(self, evidence: EdgeEvidence) -> Array:
-        """What an edge is off by; less where the baseline knows it."""
-        seen = self._baseline.seen[evidence.edge]
-        return np.where(seen, WITH_BASELINE, 1.0) * evidence.spread_px
-
-    def _blur_change_px(self, evidence: EdgeEvidence) -> float | None:
-        now_px2, before_px2 = isotropic_blur_px2(evidence), self._baseline.blur_px2
-        if now_px2 is None or before_px2 is None:
+        comparison = self._compared(pooled, ref_cam_T_grip, None)
+        nothing = comparison.fits[None, None]
+        if max(comparison.log.values()) - comparison.log[None, None] > CONTRADICTED:
             return None
-        return math.sqrt(now_px2) - math.sqrt(before_px2)
+        edges = len(self._gripper.edge_ids)
+        self._baseline = Baseline.of(pooled, nothing.motion, nothing.residual_px, edges)
+        return self._baseline
+
+    def _blind(self, pooled: Pooled, baseline: Baseline | None) -> Explanation:
+        """No finger is seen."""
+        usual = 0.0 if baseline is None else baseline.noise
+        if pooled.noise > max(MUCH_NOISE * usual, LEAST_NOISE):
+            shares, text = NOISY, f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
+        else:
+            shares, text = BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place"
+        return _explained({(c, None): p for c, p in shares.items()}, self._gripper, self._settings.probable, text)
 
 
-def _without(evidence: EdgeEvidence, absent: Sequence[int], gripper: Gripper) -> EdgeEvidence:
-    """The evidence less what was taken for fingers that are not there."""
-    if not absent:
-        return evidence
-    kept = ~np.isin(gripper.edge_finger[evidence.edge], absent)
-    names = ("edge", "fraction", "xy", "per_px", "sigma_px", "spread_px", "blur_px2", "across")
-    return replace(evidence, **{name: getattr(evidence, name)[kept] for name in names})
-
-
-def _shared_px(evidence: EdgeEvidence, residual_px: Array) -> float:
-    """Standard deviation that the points of a stretch share, from what the freest model leaves (moment estimator of a
-    random effect, DerSimonian and Laird 1986; the degrees of freedom are shared out evenly).
-    """
-    weight = 1.0 / (evidence.sigma_px**2 + FLOOR_PX**2)
-    excess = float(weight @ residual_px**2) - 0.5 * len(residual_px)
-    return math.sqrt(max(excess, 0.0) / float(weight.sum()))
-
-
-def _blur_log_likelihood(change_px: float, *, may: bool) -> float:
-    """Of a change of the blur where the lens stays as it is, or may have changed."""
-    stays = -0.5 * (change_px / BLUR_SIGMA_PX) ** 2
-    if not may:
-        return max(stays, WORST)
-    changes = math.log(BLUR_SIGMA_PX * math.sqrt(2.0 * math.pi) / BLUR_RANGE_PX)
-    return float(np.logaddexp(stays, changes)) - math.log(2.0)
+def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:
+    """``shares``: probabilities of the models; that nothing moved counts as unknown."""
+    weights: dict[tuple[Cause, int | None], float] = {}
+    for (cause, part), share in shares.items():
+        named = (Cause.UNKNOWN if cause is None else cause, part)
+        weights[named] = weights.get(named, 0.0) + share
+    names = gripper.finger_ids
+    causes = sorted(
+        (CauseWeight(c, p, None if f is None else names[f]) for (c, f), p in weights.items()),
+        key=lambda weight: -weight.probability,
+    )
+    unknown = CauseWeight(Cause.UNKNOWN, weights.get((Cause.UNKNOWN, None), 0.0))
+    return Explanation(tuple(causes), causes[0] if causes[0].probability >= probable else unknown, text)

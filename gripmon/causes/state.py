@@ -6,7 +6,7 @@ length (1), and six for each finger.  A model of what moved frees some of them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,8 +56,33 @@ class State:
             ]
         )
 
-    def without_fingers(self) -> State:
-        return replace(self, finger=np.zeros_like(self.finger))
+
+def points_cam(gripper: Gripper, state: State) -> tuple[Array, Array, Array]:
+    """All points (p, 3) in the camera frame, their derivative by the opening (p, 3), and the middles of the fingers'
+    points (f, 3) before their own motion.
+    """
+    rotation = state.cam_T_grip[:3, :3]
+    opening_m = state.jaw_opening_m if gripper.has_jaw else None
+    points = gripper.points_grip_m(opening_m) @ rotation.T + state.cam_T_grip[:3, 3]
+    rate = gripper.point_motion(state.jaw_opening_m) @ rotation.T
+    middle = np.zeros((len(gripper.finger_ids), 3))
+    for finger, motion in enumerate(state.finger):
+        own = gripper.point_finger == finger
+        middle[finger] = points[own].mean(axis=0)
+        if motion.any():
+            lever = points[own] - middle[finger]
+            points[own] += lever @ (exp_rotation(motion[3:]) - np.eye(3)).T + motion[:3]
+    return points, rate, middle
+
+
+def edge_places(gripper: Gripper, state: State, edge: NDArray[np.intp], fraction: Array) -> tuple[Array, Array]:
+    """Ideal image coordinates (s, 2) of places on edges with the calibrated focal length, and the direction (s, 2)
+    across them in which offsets count as positive.
+    """
+    points, _, _ = points_cam(gripper, state)
+    a, b = points[gripper.edge_points[edge, 0]], points[gripper.edge_points[edge, 1]]
+    spot = a + fraction[:, None] * (b - a)
+    return spot[:, :2] / spot[:, 2:], _across(a, b)
 
 
 class EdgeView:
@@ -75,38 +100,21 @@ class EdgeView:
         """(s,) measured minus predicted place of each stretch across its edge, px, and (s, m) the derivative of the
         predicted one by all unknowns.
         """
-        points, rate = self._points(state)
+        points, rate, middle = points_cam(self._gripper, state)
         a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
         xy, by_focal = self._ideal(state.log_focal)
         line = np.cross(a, b)
-        # The side on which offsets count as positive: to the left of the way from a to b in ideal coordinates.
-        along = b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:]
-        along /= np.sqrt(np.einsum("si,si->s", along, along))[:, None]
-        perp = np.column_stack([-along[:, 1], along[:, 0]])
+        perp = _across(a, b)
         size = np.einsum("si,si->s", line[:, :2], perp)
         off = (np.einsum("si,si->s", line[:, :2], xy) + line[:, 2]) / size
         per_px = self._evidence.per_px
-        spot = _on_edge(a, b, xy, along)
+        spot = _on_edge(a, b, xy, np.column_stack([perp[:, 1], -perp[:, 0]]))
         gradient = np.empty((len(xy), 3))
         gradient[:, :2] = perp / spot[:, 2:]
         gradient[:, 2] = -np.einsum("si,si->s", perp, spot[:, :2]) / spot[:, 2] ** 2
         gradient /= per_px[:, None]
-        return off / per_px, self._jacobian(state, spot, gradient, rate, np.einsum("si,si->s", perp, by_focal) / per_px)
-
-    def _points(self, state: State) -> tuple[Array, Array]:
-        """All points (p, 3) in the camera frame, and their derivative by the opening (p, 3)."""
-        gripper, rotation = self._gripper, state.cam_T_grip[:3, :3]
-        opening_m = state.jaw_opening_m if gripper.has_jaw else None
-        points = gripper.points_grip_m(opening_m) @ rotation.T + state.cam_T_grip[:3, 3]
-        rate = gripper.point_motion(state.jaw_opening_m) @ rotation.T
-        self._middle = np.zeros((len(gripper.finger_ids), 3))
-        for finger, motion in enumerate(state.finger):
-            own = gripper.point_finger == finger
-            self._middle[finger] = points[own].mean(axis=0)
-            if motion.any():
-                lever = points[own] - self._middle[finger]
-                points[own] += lever @ (exp_rotation(motion[3:]) - np.eye(3)).T + motion[:3]
-        return points, rate
+        focal = np.einsum("si,si->s", perp, by_focal) / per_px
+        return off / per_px, self._jacobian(state, spot, gradient, rate, middle, focal)
 
     def _ideal(self, log_focal: float) -> tuple[Array, Array]:
         """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
@@ -116,19 +124,28 @@ class EdgeView:
         xy, d_xy = self._camera.undistort_with_jacobian(self._centre_px + from_centre * np.exp(-log_focal))
         return xy, np.einsum("sij,sj->si", d_xy, from_centre) * np.exp(-log_focal)
 
-    def _jacobian(self, state: State, spot: Array, gradient: Array, rate: Array, by_focal: Array) -> Array:
+    def _jacobian(
+        self, state: State, spot: Array, gradient: Array, rate: Array, middle: Array, by_focal: Array
+    ) -> Array:
         out = np.zeros((len(spot), FINGERS + state.finger.size))
         out[:, :3] = gradient
         out[:, 3:6] = np.cross(spot - state.cam_T_grip[:3, 3], gradient)
         out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._ends[:, 0]])
         out[:, FOCAL] = by_focal
-        about_middle = np.cross(spot - self._middle[self._finger] - state.finger[self._finger, :3], gradient)
+        about_middle = np.cross(spot - middle[self._finger] - state.finger[self._finger, :3], gradient)
         for finger in range(len(state.finger)):
             own = (self._finger == finger)[:, None]
             start = FINGERS + 6 * finger
             out[:, start : start + 3] = own * gradient
             out[:, start + 3 : start + 6] = own * about_middle
         return out
+
+
+def _across(a: Array, b: Array) -> Array:
+    """(s, 2) across the images of edges from a to b, ideal coordinates: as the normal of a profile points."""
+    along = b[:, :2] / b[:, 2:] - a[:, :2] / a[:, 2:]
+    along /= np.sqrt(np.einsum("si,si->s", along, along))[:, None]
+    return np.column_stack([-along[:, 1], along[:, 0]])
 
 
 def _on_edge(a: Array, b: Array, xy: Array, along: Array) -> Array:
@@ -150,8 +167,3 @@ def finger_lever_m(gripper: Gripper) -> Array:
         own = points[gripper.point_finger == finger]
         levers.append(float(np.sqrt(((own - own.mean(axis=0)) ** 2).sum(axis=1).mean())))
     return np.array(levers)
-
-
-def fingers_of(evidence: EdgeEvidence, gripper: Gripper) -> NDArray[np.intp]:
-    """(f,) stretches seen on each finger."""
-    return np.bincount(gripper.edge_finger[evidence.edge], minlength=len(gripper.finger_ids))

@@ -97,11 +97,8 @@ def _log_evidence(jacobian: Array, weight: Array, residual: Array, motion: Array
     return -0.5 * (height + occam)
 
 
-def covariance_px2(
-    edge: NDArray[np.intp], sigma_px: Array, spread_px: Array, shared_px: float, floor_px: float
-) -> Array:
-    """(s, s) of the stretches' places: their own scatter, what the points of a stretch share, and what an edge does."""
-    same = edge[:, None] == edge[None, :]
-    out = same * np.outer(spread_px, spread_px)
-    out[np.diag_indices(len(edge))] += sigma_px**2 + shared_px**2 + floor_px**2
+def covariance_px2(edge: NDArray[np.intp], sigma_px: Array, spread_px: Array) -> Array:
+    """(s, s) of the pieces' places: their own scatter, and what a whole edge is off by."""
+    out = (edge[:, None] == edge[None, :]) * np.outer(spread_px, spread_px)
+    out[np.diag_indices(len(edge))] += sigma_px**2
     return np.asarray(out)

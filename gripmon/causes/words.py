@@ -7,38 +7,35 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from gripmon.causes.comparing import Comparison, Key
 from gripmon.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.causes.weighing import Weighed
 from gripmon.gripper import Gripper
-from gripmon.records import Cause, CauseWeight
-
-Key = tuple[Cause | None, int | None]
+from gripmon.records import Cause
 
 
 def sentence(
-    probable: CauseWeight,
-    causes: Sequence[CauseWeight],
-    best: Key,
-    fits: Mapping[Key, Weighed],
-    absent: Sequence[int],
-    blur_change_px: float | None,
-    gripper: Gripper,
+    shares: Mapping[Key, float], comparison: Comparison, absent: Sequence[int], probable: float, gripper: Gripper
 ) -> str:
-    """One sentence for the alert; ``best`` is the model that explains most."""
+    """One sentence for the alert; ``shares``: probability of each model."""
+    ranked = sorted(shares, key=lambda key: -shares[key])
+    best = ranked[0]
     names = gripper.finger_ids
     gone = f"finger {', '.join(names[f] for f in absent)} is not seen near where it should be" if absent else ""
-    if probable.cause is not Cause.UNKNOWN:
-        text = _of(best, fits[best], blur_change_px, gripper)
-        return f"{text}; {gone}" if gone and probable.cause is not Cause.VIEW_BLOCKED else text
+    named = best[0] not in (None, Cause.UNKNOWN)
+    if named and shares[best] >= probable:
+        text = _of(best, comparison.fits[best], comparison.blur_change_px, gripper)
+        return f"{text}; {gone}" if gone and best[0] is not Cause.VIEW_BLOCKED else text
     if gone:
         return f"{gone}: hidden, or bent by more than edges are looked for; one image doesn't tell which"
-    if best[0] is None:
-        return "every finger and the camera stand where they did; what looked wrong isn't seen in the edges"
-    named = [c for c in causes if c.cause is not Cause.UNKNOWN and c.probability >= 0.05][:2]
-    if best[0] is Cause.UNKNOWN or not named:
+    if best[0] is None and shares[best] >= 0.5:
+        return "every finger and the camera stand where they did"
+    if best[0] is Cause.UNKNOWN and shares[best] >= 0.5:
         return "no single cause explains what is seen: several things may have changed at once"
-    said = " or ".join(f"{_name(c)} ({100.0 * c.probability:.0f} %)" for c in named)
-    return f"this camera can't tell the causes apart: {said} would show alike"
+    said = " or ".join(
+        f"{_name(key, gripper)} ({100.0 * shares[key]:.0f} %)" for key in ranked[:3] if shares[key] > 0.05
+    )
+    return f"this camera can't tell the causes apart: {said}"
 
 
 def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) -> str:
@@ -78,12 +75,16 @@ def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) 
             return "the view of the gripper is blocked"
 
 
-def _name(weight: CauseWeight) -> str:
+def _name(key: Key, gripper: Gripper) -> str:
+    cause, part = key
+    if cause is None:
+        return "nothing moved"
     named = {
         Cause.CAMERA_MOUNT: "the camera moved",
-        Cause.FINGER_BENT: f"finger {weight.part} is bent",
+        Cause.FINGER_BENT: f"finger {'' if part is None else gripper.finger_ids[part]} is bent",
         Cause.JAW_OPENING: "the opening is reported wrong",
         Cause.LENS: "focal length or focus changed",
         Cause.VIEW_BLOCKED: "the view is blocked",
+        Cause.UNKNOWN: "several things at once",
     }
-    return named.get(weight.cause, str(weight.cause))
+    return named.get(cause, str(cause))

@@ -7,169 +7,237 @@ moved, one finger bent, jaw elsewhere) are special cases of that.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
-from gripmon.corners.settling import Measurement
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.records import Array, EdgeEvidence
+from gripmon.corners.consensus import Consensus, Prior, Votes, agree
+from gripmon.corners.settling import Expected, Measurement, Settler
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.records import Array, EdgeEvidence, Image
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
-"""How far a finger may stand from where all of them together show, m and rad: only keeps weak views solvable."""
+"""How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
 
 CLEARLY_BETTER = 1.2
 """Factor by which more profiles of a finger must agree elsewhere than where the gripper as a whole shows."""
+
+SEEN = 0.5
+"""Share of a finger's profiles below which it is looked for farther away."""
+
+WIDE_ZOOMS = (2, 4)
+"""Zooms with which it is looked for there."""
 
 FEWEST_POINTS, FEWEST_SHARE = 4, 0.4
 """Points of a stretch, and part of its profiles, that must agree for it to count as seen."""
 
 _STEP_PX = 2.0
 _REFINED = 3
+_FIXED = 1e12  # information of an opening that stays
 
 
-class _Finger(NamedTuple):
-    """A finger's own fit: which candidates belong to it, and the share of its profiles that agree."""
+class _Place(NamedTuple):
+    """A finger's own fit on some votes, and the share of its profiles that agree."""
 
+    votes: Votes
     fit: Consensus
     share: float
 
 
-def edge_evidence(
-    measurement: Measurement,
-    votes: Votes,
-    gripper: Gripper,
-    settings: ConsensusSettings,
-    elsewhere: tuple[Array, ...],
-    jaw_reported: bool,
-    kernel_px: float,
-    reach_px: float,
-) -> EdgeEvidence:
-    """What the fingers show one by one.
+class FingerMeter(Settler):
+    """Looks at the fingers one by one, in a frame that was measured."""
 
-    ``votes``: all candidates of the measurement with their weights.  ``elsewhere``: poses (4, 4) that a finger may
-    have stayed at, the reference for one.  ``kernel_px``: standard deviation of the filter that the edges were
-    found with, ``reach_px`` that of the profiles.  No finger found gives evidence without stretches.
-    """
-    prediction, candidates = measurement.prediction, measurement.candidates
-    fingers = len(gripper.finger_ids)
-    share = np.full(fingers, np.nan)
-    taken = np.zeros(len(candidates.sample), dtype=bool)
-    finger_of = gripper.edge_finger[prediction.layout.edge]
-    for finger in range(fingers):
-        sampled = int(np.count_nonzero(finger_of[prediction.ok] == finger))
+    def evidence(
+        self, image: Image, measurement: Measurement, *elsewhere: Array, jaw_reported: bool = True
+    ) -> EdgeEvidence:
+        """What the fingers show one by one in a measured frame; takes about as long as the measurement, some times
+        longer where a finger has to be looked for.
+
+        ``elsewhere``: poses (4, 4) that a finger may have stayed at while the others moved, the reference for one.
+        ``jaw_reported``: the robot reported the opening of this frame.  A frame in which nothing agrees gives evidence
+        without stretches.
+        """
+        votes = self._votes(measurement.candidates, measurement.prediction)
+        places = [
+            self._finger_place(image, measurement, votes, finger, elsewhere)
+            for finger in range(len(self._gripper.finger_ids))
+        ]
+        found = [place for place in places if place is not None]
+        kernel_px = self._settings.edges.blur_px
+        stretches = [_Stretches.of(place, kernel_px) for place in found]
+        zoom = measurement.candidates.zoom
+        return EdgeEvidence(
+            cam_T_grip=measurement.cam_T_grip,
+            jaw_opening_m=measurement.jaw_opening_m,
+            jaw_reported_m=measurement.jaw_reported_m if jaw_reported and self._gripper.has_jaw else None,
+            **{
+                name: np.concatenate([getattr(s, name) for s in stretches]) if stretches else empty
+                for name, empty in _EMPTY._asdict().items()
+            },
+            finger_share=np.array([np.nan if place is None else place.share for place in places]),
+            noise=measurement.candidates.noise / measurement.candidates.full_scale,
+            reach_px=zoom * self._settings.sampling.reach_px,
+        )
+
+    def _finger_place(
+        self, image: Image, measurement: Measurement, votes: Votes, finger: int, elsewhere: tuple[Array, ...]
+    ) -> _Place | None:
+        """The finger's best place: where all fingers together show unless another is clearly better; None if none of
+        its edges is in view.
+        """
+        prediction, joint = measurement.prediction, measurement.consensus.xi
+        poses = [perturbation_between(prediction.cam_T_grip, pose) for pose in elsewhere]
+        starts = [joint, *(np.concatenate([xi, np.zeros(len(joint) - 6)]) for xi in poses)]
+        starts = [s for s in starts if prediction.moved_px(s) < 2.0 * self._reach_px] or [np.zeros(len(joint))]
+        best = self._best(votes, finger, [*starts, *_shifted(votes, finger_of(self, votes) == finger, starts[-1])])
+        if best is None or best.share >= SEEN:
+            return best
+        opening_m = prediction.jaw_opening_m
+        for zoom in WIDE_ZOOMS:
+            if zoom <= measurement.candidates.zoom:
+                continue
+            for pose in (measurement.cam_T_grip, *elsewhere):
+                other = self._farther(image, Expected(pose, opening_m, opening_m), zoom, finger)
+                if other is not None and other.share > CLEARLY_BETTER * best.share:
+                    best = other
+            if best.share >= SEEN:
+                break
+        return best
+
+    def _farther(self, image: Image, expected: Expected, zoom: int, finger: int) -> _Place | None:
+        """Looked for with a coarser zoom, then measured with the present one."""
+        present = self._zoom
+        with self._zoomed(zoom):
+            votes = self._look(image, self._predict(self._lay_out(expected), expected))
+            own = finger_of(self, votes) == finger
+            start = np.zeros(len(self._prior))
+            rough = self._best(votes, finger, [start, *_shifted(votes, own, start)])
+        if rough is None:
+            return None
+        there = replace(expected, cam_T_grip=perturb(expected.cam_T_grip, rough.fit.xi[:6]))
+        with self._zoomed(present):
+            votes = self._look(image, self._predict(self._lay_out(there), there))
+            return self._best(votes, finger, [start])
+
+    @contextmanager
+    def _zoomed(self, zoom: int) -> Iterator[None]:
+        before, self._zoom = self._zoom, zoom
+        try:
+            yield
+        finally:
+            self._zoom = before
+
+    def _best(self, votes: Votes, finger: int, starts: Iterable[Array]) -> _Place | None:
+        """The best fit of one finger from starts (m,), the first unless another is clearly better."""
+        own = finger_of(self, votes)
+        sampled = int(np.count_nonzero(own[votes.prediction.ok] == finger))
         if not sampled:
-            continue
-        own = np.where(finger_of[candidates.sample] == finger, votes.weight, 0.0)
-        best = _fit(replace(votes, weight=own), measurement, elsewhere, sampled, settings, reach_px)
-        share[finger] = best.share
-        taken |= best.fit.weight > 0.0
-    jaw_reported_m = measurement.jaw_reported_m if jaw_reported and gripper.has_jaw else None
-    return _stretches(measurement, votes, taken, share, jaw_reported_m, kernel_px, reach_px)
+            return None
+        votes = replace(votes, weight=np.where(own[votes.candidates.sample] == finger, votes.weight, 0.0))
+        best: _Place | None = None
+        for start in starts:
+            information = np.full(len(start), _FIXED)
+            information[:6] = FINGER_SIGMA**-2
+            fit = agree(votes, Prior(start, information), start, self._settings.consensus)
+            share = np.count_nonzero(fit.supported) / sampled
+            if best is None or share > CLEARLY_BETTER * best.share:
+                best = _Place(votes, fit, share)
+        return best
 
 
-def _fit(
-    votes: Votes,
-    measurement: Measurement,
-    elsewhere: tuple[Array, ...],
-    sampled: int,
-    settings: ConsensusSettings,
-    reach_px: float,
-) -> _Finger:
-    """The finger's best place: where all fingers together show unless another is clearly better."""
-    prediction, joint = measurement.prediction, measurement.consensus.xi
-    information = np.full(len(joint), 1e12)
-    information[:6] = FINGER_SIGMA**-2
-    prior = Prior(joint, information)
-
-    def fitted(start: Array) -> _Finger:
-        fit = agree(votes, prior, start, settings)
-        return _Finger(fit, np.count_nonzero(fit.supported) / sampled)
-
-    best = fitted(joint)
-    starts = [np.concatenate([perturbation_between(prediction.cam_T_grip, T), joint[6:]]) for T in elsewhere]
-    starts = [s for s in starts if prediction.moved_px(s) < 2.0 * reach_px]
-    starts += _shifted(votes, measurement, reach_px, settings)
-    for start in starts:
-        other = fitted(start)
-        if other.share > CLEARLY_BETTER * best.share:
-            best = other
-    return best
+def finger_of(meter: FingerMeter, votes: Votes) -> NDArray[np.intp]:
+    """(n,) the finger of each profile."""
+    return np.asarray(meter._gripper.edge_finger[votes.prediction.layout.edge])
 
 
-def _shifted(votes: Votes, measurement: Measurement, reach_px: float, settings: ConsensusSettings) -> list[Array]:
-    """The most promising starts that shift the finger in the image."""
-    prediction, joint, candidates = measurement.prediction, measurement.consensus.xi, votes.candidates
-    if not prediction.pixels_per_m > 0.0:
+def _shifted(votes: Votes, own: NDArray[np.bool_], base: Array) -> list[Array]:
+    """The most promising starts that shift a finger, of which the profiles ``own`` (n,) are, in the image."""
+    prediction, candidates = votes.prediction, votes.candidates
+    active = np.flatnonzero((votes.weight > 0.0) & own[candidates.sample])
+    if not prediction.pixels_per_m > 0.0 or not len(active):
         return []
-    count = round(reach_px / _STEP_PX)
-    ticks = np.arange(-count, count + 1) * _STEP_PX / prediction.pixels_per_m
-    starts = np.tile(joint, (len(ticks) ** 2, 1))
+    reach_px = float(np.abs(candidates.offset_px[active]).max())
+    step_px = _STEP_PX * candidates.zoom
+    count = round(reach_px / step_px)
+    ticks = np.arange(-count, count + 1) * step_px / prediction.pixels_per_m
+    starts = np.tile(base, (len(ticks) ** 2, 1))
     starts[:, 0] += np.repeat(ticks, len(ticks))
     starts[:, 1] += np.tile(ticks, len(ticks))
-    active = np.flatnonzero(votes.weight > 0.0)
-    sample = candidates.sample[active]
-    distance = (candidates.offset_px[active] - starts @ prediction.jacobian_by_unknown[:, sample]) / (
-        settings.start_width_px
-    )
+    predicted = starts @ prediction.jacobian_by_unknown[:, candidates.sample[active]]
+    distance = (candidates.offset_px[active] - predicted) / (1.25 * step_px)
     score = np.maximum(1.0 - distance**2, 0.0).sum(axis=1)
     return [starts[i] for i in np.argsort(-score, kind="stable")[:_REFINED]]
 
 
-def _stretches(
-    measurement: Measurement,
-    votes: Votes,
-    taken: NDArray[np.bool_],
-    share: Array,
-    jaw_reported_m: float | None,
-    kernel_px: float,
-    reach_px: float,
-) -> EdgeEvidence:
-    """Means over the points taken, one of each profile at most, on each stretch that shows enough of them."""
-    prediction, candidates = measurement.prediction, measurement.candidates
-    layout = prediction.layout
-    index = np.flatnonzero(taken)
-    # Of two candidates of one profile that belong to the fit the heavier one counts.
-    index = index[np.lexsort((-votes.weight[index], candidates.sample[index]))]
+class _Stretches(NamedTuple):
+    """Means over the points that belong to a fit, on each stretch that shows enough of them; see ``EdgeEvidence``."""
+
+    edge: NDArray[np.intp]
+    fraction: Array
+    xy: Array
+    per_px: Array
+    sigma_px: Array
+    spread_px: Array
+    blur_px2: Array
+    across: Array
+
+    @classmethod
+    def of(cls, place: _Place, kernel_px: float) -> _Stretches:
+        votes, prediction, candidates = place.votes, place.votes.prediction, place.votes.candidates
+        index = _points(place)
+        sample = candidates.sample[index]
+        if not len(sample):
+            return _EMPTY
+        stretch = np.unique(prediction.layout.stretch[sample], return_inverse=True)[1]
+        weight = votes.weight[index]
+        total = np.bincount(stretch, weight)
+
+        def mean(values: Array) -> Array:
+            return np.asarray(np.bincount(stretch, weight * values) / total)
+
+        edge = prediction.layout.edge[sample]
+        direction = prediction.line_direction[edge]
+        off = prediction.gain[sample] * candidates.offset_px[index]
+        xy = prediction.line_origin[edge] + prediction.along[sample][:, None] * direction
+        xy = xy + off[:, None] * np.column_stack([-direction[:, 1], direction[:, 0]])
+        first = np.flatnonzero(np.diff(stretch, prepend=-1))
+        normal = prediction.normal[sample]
+        return cls(
+            edge=edge[first],
+            fraction=mean(prediction.layout.fraction[sample]),
+            xy=np.column_stack([mean(xy[:, 0]), mean(xy[:, 1])]),
+            per_px=mean(prediction.gain[sample]),
+            sigma_px=1.0 / np.sqrt(total),
+            spread_px=np.hypot(votes.edge_spread_px, votes.cut_off_px)[edge[first]],
+            blur_px2=mean(candidates.width_px[index] ** 2) - (candidates.zoom * kernel_px) ** 2,
+            across=np.column_stack([mean(normal[:, 0]), mean(normal[:, 1])]),
+        )
+
+
+_EMPTY = _Stretches(
+    np.zeros(0, dtype=np.intp),
+    np.zeros(0),
+    np.zeros((0, 2)),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros((0, 2)),
+)
+
+
+def _points(place: _Place) -> NDArray[np.intp]:
+    """Candidates of a fit on well seen stretches: of two in one profile the heavier counts."""
+    prediction, candidates = place.votes.prediction, place.votes.candidates
+    index = np.flatnonzero(place.fit.weight)
+    index = index[np.lexsort((-place.votes.weight[index], candidates.sample[index]))]
     index = index[np.diff(candidates.sample[index], prepend=-1) > 0]
-    sample = candidates.sample[index]
-    number = layout.stretch
+    number = prediction.layout.stretch
     profiles = np.bincount(number[prediction.ok], minlength=int(number.max(initial=0)) + 1)
-    points = np.bincount(number[sample], minlength=len(profiles))
+    points = np.bincount(number[candidates.sample[index]], minlength=len(profiles))
     good = (points >= FEWEST_POINTS) & (points >= FEWEST_SHARE * profiles)
-    index = index[good[number[sample]]]
-    sample = candidates.sample[index]
-    stretch = np.unique(number[sample], return_inverse=True)[1]
-    count = int(stretch.max(initial=-1)) + 1
-    weight = votes.weight[index]
-    total = np.bincount(stretch, weight, count)
-
-    def mean(values: Array) -> Array:
-        return np.bincount(stretch, weight * values, count) / total
-
-    edge = layout.edge[sample]
-    direction = prediction.line_direction[edge]
-    off = prediction.gain[sample] * candidates.offset_px[index]
-    xy = prediction.line_origin[edge] + prediction.along[sample][:, None] * direction
-    xy = xy + off[:, None] * np.column_stack([-direction[:, 1], direction[:, 0]])
-    first = np.flatnonzero(np.diff(stretch, prepend=-1))
-    normal = prediction.normal[sample]
-    return EdgeEvidence(
-        cam_T_grip=measurement.cam_T_grip,
-        jaw_opening_m=measurement.jaw_opening_m,
-        jaw_reported_m=jaw_reported_m,
-        edge=edge[first],
-        fraction=mean(layout.fraction[sample]),
-        xy=np.column_stack([mean(xy[:, 0]), mean(xy[:, 1])]),
-        per_px=mean(prediction.gain[sample]),
-        sigma_px=1.0 / np.sqrt(total),
-        spread_px=np.hypot(votes.edge_spread_px, votes.cut_off_px)[edge[first]],
-        blur_px2=mean(candidates.width_px[index] ** 2) - (candidates.zoom * kernel_px) ** 2,
-        across=np.column_stack([mean(normal[:, 0]), mean(normal[:, 1])]),
-        finger_share=share,
-        reach_px=reach_px,
-    )
+    return index[good[number[candidates.sample[index]]]]

@@ -17,12 +17,12 @@ from gripmon.corners.consensus import (
     agree_from_grid,
     grid_of_starts,
 )
-from gripmon.corners.evidence import edge_evidence
+from gripmon.corners.evidence import FingerMeter
 from gripmon.corners.look import unevenness
 from gripmon.corners.prediction import EdgeLayout, Prediction
 from gripmon.corners.search import search_poses
-from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement, Settler
-from gripmon.records import Array, EdgeEvidence, Image
+from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement
+from gripmon.records import Array, Image
 
 FOUND_EDGES = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""
@@ -67,7 +67,7 @@ class _Place:
     expected: Expected
 
 
-class FingertipMeter(Settler):
+class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
 
     def measure(
@@ -106,24 +106,6 @@ class FingertipMeter(Settler):
         best = self._from_elsewhere(image, expected, best, usual_share)
         best.looked_far = True
         return best
-
-    def evidence(self, measurement: Measurement, *elsewhere: Array, jaw_reported: bool = True) -> EdgeEvidence:
-        """What the fingers show one by one in a measured frame; takes as long as the measurement.
-
-        ``elsewhere``: poses (4, 4) that a finger may have stayed at while the others moved, the reference for one.
-        """
-        votes = self._votes(measurement.candidates, measurement.prediction)
-        zoom = measurement.candidates.zoom
-        return edge_evidence(
-            measurement,
-            votes,
-            self._gripper,
-            self._settings.consensus,
-            elsewhere,
-            jaw_reported,
-            self._settings.edges.blur_px,
-            zoom * self._settings.sampling.reach_px,
-        )
 
     def _from_elsewhere(self, image: Image, expected: Expected, best: Measurement, usual_share: float) -> Measurement:
         """The best of the places farther away, if one is better than the expected one."""

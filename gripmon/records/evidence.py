@@ -23,7 +23,8 @@ class EdgeEvidence:
     and ``across`` (s, 2) that direction in the image.
 
     ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where none
-    was sampled; ``reach_px``: how far from the measured pose edges were looked for.
+    was sampled; ``noise``: of a pixel, part of the full scale; ``reach_px``: how far from the measured pose edges were
+    looked for at first.
     """
 
     cam_T_grip: Array
@@ -38,6 +39,7 @@ class EdgeEvidence:
     blur_px2: Array
     across: Array
     finger_share: Array
+    noise: float
     reach_px: float
 
 

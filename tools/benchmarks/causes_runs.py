@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +12,11 @@ from gripmon.causes import CauseJudge, CauseSettings
 from gripmon.geometry import to_record
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.policy import PolicySettings
-from gripmon.records import Cause, Frame, FrameRecord, ReferenceRecord
+from gripmon.records import Array, Cause, Frame, FrameRecord, ReferenceRecord
 from gripmon.stream import StreamWatch
 
 LAST = 6
-"""Newest frames of which most decide whether images are refused, or nothing is measured."""
+"""Newest frames of which most decide whether images are refused."""
 
 
 @dataclass(frozen=True)
@@ -56,25 +55,23 @@ def run(trial: Trial) -> Told:
         _judge(monitor, judge, rig.start_cam_T_grip, frame, index < trial.well)
     if faults:
         return Told(faults[0].cause, None, (), faults[0].text)
-    return _told(judge, records[-LAST:])
+    return _told(judge, rig.start_cam_T_grip, records[-LAST:])
 
 
-def _judge(monitor: Monitor, judge: CauseJudge, ref_cam_T_grip: np.ndarray, frame: Frame, well: bool) -> None:
+def _judge(monitor: Monitor, judge: CauseJudge, ref_cam_T_grip: Array, frame: Frame, well: bool) -> None:
     measurement = monitor._newest
-    if measurement is None or not measurement.trusted or (well and not judge.wants_baseline):
+    if measurement is None or (well and not (measurement.trusted and judge.wants_baseline)):
         return
-    evidence = monitor._meter.evidence(measurement, ref_cam_T_grip, jaw_reported=frame.jaw_opening_m is not None)
-    (judge.well if well else judge.add)(evidence, ref_cam_T_grip)
+    assert frame.image is not None
+    reported = frame.jaw_opening_m is not None
+    evidence = monitor._meter.evidence(frame.image, measurement, ref_cam_T_grip, jaw_reported=reported)
+    (judge.well if well else judge.add)(evidence)
 
 
-def _told(judge: CauseJudge, newest: Iterable[FrameRecord]) -> Told:
-    records = list(newest)
-    refused = [r for r in records if r.reason is not None and r.reason.split(":")[0] != r.reason]
-    unmeasured = [r for r in records if r.reason is not None]
-    if 2 * len(refused) > len(records):
+def _told(judge: CauseJudge, ref_cam_T_grip: Array, newest: list[FrameRecord]) -> Told:
+    refused = [r for r in newest if r.reason is not None and ": " in r.reason]
+    if 2 * len(refused) > len(newest):
         return Told(Cause.IMAGE_BAD, None, (), refused[-1].reason or "")
-    if 2 * len(unmeasured) > len(records):
-        return Told(Cause.VIEW_BLOCKED, None, (), unmeasured[-1].reason or "")
-    explanation = judge.explanation()
+    explanation = judge.explanation(ref_cam_T_grip)
     weights = tuple((c.cause.value, c.part, c.probability) for c in explanation.causes)
     return Told(explanation.probable.cause, explanation.probable.part, weights, explanation.text)

@@ -1,0 +1,169 @@
+"""All models on the same pooled evidence."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gripmon.camera import Camera
+from gripmon.causes.baseline import Baseline
+from gripmon.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
+from gripmon.causes.pooling import Pooled
+from gripmon.causes.state import EdgeView, State
+from gripmon.causes.weighing import Weighed, covariance_px2, weigh
+from gripmon.gripper import Gripper
+from gripmon.records import Array, Cause
+
+Key = tuple[Cause | None, int | None]
+"""A cause and the finger that it is about; None for the cause: nothing moved."""
+
+FLOOR_PX = 0.015
+"""Standard deviation of a piece's place that nothing else explains."""
+
+WITH_BASELINE = 0.1
+"""Part of what a whole edge is off by that is left when it is compared with itself before."""
+
+EDGE_PX = 0.02
+"""What a whole edge is off by at least."""
+
+OUTLIER = 2.5
+"""Standard deviations from which a piece that even the freest model doesn't explain counts for less."""
+
+SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
+SETTLED_JAW_M = 5e-6
+"""Of the pose (m and rad) and the opening that a baseline knows."""
+
+BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
+"""Scatter of the blur while the lens stays as it is, and how far it goes when it doesn't."""
+
+WORST = -40.0
+"""Log likelihood ratio that a change of the blur is worth at most."""
+
+ABSENT = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
+"""How probable it is that a finger isn't seen at all: in a blocked view, for the finger itself that is bent, and when
+several things happened; with every other cause it is a ``STRAY``."""
+STRAY = 0.02
+
+BLOCKED = 0.1
+"""Probability of a blocked view beforehand, where a finger isn't seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """What is told of the reported opening beforehand, m: the part of its error that changes, and that doesn't."""
+
+    sigma_m: float
+    offset_sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """``log`` evidence of each model with its prior, how each fits, and by how much the blur has changed (None: it
+    can't be told).
+    """
+
+    log: Mapping[Key, float]
+    fits: Mapping[Key, Weighed]
+    blur_change_px: float | None
+
+
+def compare(
+    pooled: Pooled,
+    camera: Camera,
+    gripper: Gripper,
+    ref_cam_T_grip: Array,
+    reference_sigma: Array,
+    report: Report,
+    baseline: Baseline | None,
+) -> Comparison:
+    """``reference_sigma`` (6,): standard deviations of ``ref_cam_T_grip`` (4, 4), m and rad, which count as long as
+    there is no ``baseline``.  ``pooled`` has at least some pieces.
+    """
+    evidence = pooled.evidence
+    reported = evidence.jaw_reported_m is not None
+    opening_m = evidence.jaw_opening_m if evidence.jaw_reported_m is None else evidence.jaw_reported_m
+    start = State(ref_cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
+    sigma_px: Array = np.hypot(evidence.sigma_px, FLOOR_PX)
+    bias_px: Array = np.zeros(len(evidence.edge))
+    spread_px: Array = np.hypot(evidence.spread_px, EDGE_PX)
+    if baseline is not None:
+        start = baseline.start(start, reported, gripper)
+        bias_px, bias_sigma_px = baseline.bias_of(pooled.piece)
+        sigma_px = np.hypot(sigma_px, bias_sigma_px)
+        seen = baseline.known(pooled.piece)
+        spread_px = np.where(seen, np.hypot(WITH_BASELINE * evidence.spread_px, EDGE_PX), spread_px)
+    models = suspects(
+        gripper, float(ref_cam_T_grip[2, 3]), _knowledge(evidence.jaw_reported_m, reference_sigma, report, baseline)
+    )
+    view = EdgeView(camera, gripper, evidence)
+
+    def fitted(suspect: Suspect) -> Weighed:
+        first = start
+        if suspect.cause in (Cause.CAMERA_MOUNT, Cause.UNKNOWN):  # followed at once, however far
+            first = replace(start, cam_T_grip=evidence.cam_T_grip)
+        weight = np.linalg.inv(covariance_px2(evidence.edge, sigma_px, spread_px))
+        return weigh(view, gripper, suspect.model, start, first, bias_px, weight)
+
+    # What even the freest model doesn't explain all others needn't: pieces that are mistaken, and errors in common.
+    residual_px = fitted(models[-1]).residual_px
+    sigma_px = sigma_px * np.maximum(np.abs(residual_px) / (OUTLIER * sigma_px), 1.0)
+    sigma_px = np.hypot(sigma_px, _shared_px(residual_px, sigma_px))
+    fits = {(suspect.cause, suspect.part): fitted(suspect) for suspect in models}
+    log = {(s.cause, s.part): fits[s.cause, s.part].log_evidence + math.log(s.prior) for s in models}
+    change_px = _blur_change_px(pooled, baseline)
+    if change_px is not None:
+        for key in log:
+            log[key] += _blur_log_likelihood(change_px, may=key[0] in (Cause.LENS, Cause.UNKNOWN))
+    if pooled.absent:
+        log[Cause.VIEW_BLOCKED, None] = log[None, None] + math.log(BLOCKED)
+        fits[Cause.VIEW_BLOCKED, None] = fits[None, None]
+        for cause, part in log:
+            chance = ABSENT.get(cause, STRAY) if cause is not None else STRAY
+            log[cause, part] += math.log(STRAY if part is not None and part not in pooled.absent else chance)
+    return Comparison(log, fits, change_px)
+
+
+def _knowledge(
+    jaw_reported_m: float | None, reference_sigma: Array, report: Report, baseline: Baseline | None
+) -> Knowledge:
+    """What holds as long as nothing has moved."""
+    exact = report.sigma_m == 0.0
+    if jaw_reported_m is None:
+        pose = reference_sigma if baseline is None else SETTLED_SIGMA
+        return Knowledge(pose, JAW_UNREPORTED_SIGMA_M, jaw_reported=False)
+    if baseline is None:
+        jaw_m = 0.0 if exact else math.hypot(report.sigma_m, report.offset_sigma_m)
+        return Knowledge(reference_sigma, max(jaw_m, SETTLED_JAW_M), jaw_reported=True)
+    jaw_m = SETTLED_JAW_M
+    if baseline.jaw_reported_m is not None and not exact:
+        # The part of the report's error that changes is another one some way on.
+        way_m = abs(jaw_reported_m - baseline.jaw_reported_m)
+        jaw_m = math.hypot(jaw_m, report.sigma_m * math.sqrt(2.0 - 2.0 * math.exp(-way_m / (2.0 * report.sigma_m))))
+    return Knowledge(SETTLED_SIGMA, jaw_m, jaw_reported=True)
+
+
+def _shared_px(residual_px: Array, sigma_px: Array) -> float:
+    """Standard deviation that comes on top of that assumed (moment estimator of a random effect, DerSimonian and Laird
+    1986); the fit's degrees of freedom are half of the pieces, about.
+    """
+    weight = 1.0 / sigma_px**2
+    excess = float(weight @ residual_px**2) - 0.5 * len(residual_px)
+    return math.sqrt(max(excess, 0.0) / float(weight.sum()))
+
+
+def _blur_change_px(pooled: Pooled, baseline: Baseline | None) -> float | None:
+    if pooled.blur_px2 is None or baseline is None or baseline.blur_px2 is None:
+        return None
+    return math.sqrt(pooled.blur_px2) - math.sqrt(baseline.blur_px2)
+
+
+def _blur_log_likelihood(change_px: float, *, may: bool) -> float:
+    """Of a change of the blur where the lens stays as it is, or may have changed."""
+    stays = -0.5 * (change_px / BLUR_SIGMA_PX) ** 2
+    if not may:
+        return max(stays, WORST)
+    changes = math.log(BLUR_SIGMA_PX * math.sqrt(2.0 * math.pi) / BLUR_RANGE_PX)
+    return float(np.logaddexp(stays, changes)) - math.log(2.0)

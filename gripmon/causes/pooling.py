@@ -1,0 +1,148 @@
+"""Evidence of several frames made one: the middle place of each piece of an edge, which single mistakes don't shift."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.causes.state import EdgeView, State, edge_places
+from gripmon.gripper import Gripper
+from gripmon.records import Array, EdgeEvidence
+
+PIECES = 5
+"""Pieces that an edge is divided into."""
+
+SEEN_IN = 1.0 / 3.0
+"""Part of the frames in which a piece has to be seen."""
+
+CONSTANT = 0.5
+"""Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
+
+FEWEST_STRETCHES, FEWEST_SHARE = 3, 0.25
+"""Stretches of a finger, and share of its profiles, with which it counts as seen in a frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pooled:
+    """``evidence`` of the newest frame's time with a stretch for each piece ``piece`` (s,) of an edge; ``absent``:
+    fingers in view that are not seen, ``blur_px2``: of the lens, None where it can't be told, ``noise`` as in
+    ``EdgeEvidence``; ``frames`` that it was made of.
+    """
+
+    evidence: EdgeEvidence
+    piece: NDArray[np.intp]
+    absent: tuple[int, ...]
+    blur_px2: float | None
+    noise: float
+    frames: int
+
+
+def piece_of(edge: NDArray[np.intp], fraction: Array) -> NDArray[np.intp]:
+    """(s,) number of the piece among all pieces of all edges."""
+    return np.asarray(edge * PIECES + np.minimum((fraction * PIECES).astype(np.intp), PIECES - 1))
+
+
+def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Pooled:
+    """One or more frames as one, at the place of the newest; motion between them that comes and goes averages out."""
+    newest = frames[-1]
+    base = _state(newest, newest, gripper)
+    places, residuals, fractions, sigmas, details = [], [], [], [], []
+    for frame in frames:
+        frame = _without(frame, absent_fingers(frame, gripper), gripper)
+        if not len(frame.edge):
+            continue
+        residual, _ = EdgeView(camera, gripper, frame).residual(_state(frame, newest, gripper))
+        places.append(piece_of(frame.edge, frame.fraction))
+        residuals.append(residual)
+        fractions.append(frame.fraction)
+        sigmas.append(frame.sigma_px)
+        details.append(np.column_stack([frame.per_px, frame.spread_px, frame.blur_px2, frame.across]))
+    absences = [absent_fingers(frame, gripper) for frame in frames]
+    often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
+    noise = float(np.median([frame.noise for frame in frames]))
+    if not places:
+        return Pooled(
+            _only(newest, np.zeros(len(newest.edge), dtype=bool)), np.zeros(0, np.intp), often, None, noise, 0
+        )
+    piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
+    sigma, detail = np.concatenate(sigmas), np.concatenate(details)
+    numbers, count = np.unique(piece, return_counts=True)
+    numbers = numbers[count >= SEEN_IN * len(frames)]
+    numbers = numbers[~np.isin(gripper.edge_finger[numbers // PIECES], often)]
+    rows = [np.flatnonzero(piece == number) for number in numbers]
+
+    def middle(values: Array) -> Array:
+        return np.array([np.median(values[own], axis=0) for own in rows]).reshape(len(rows), *values.shape[1:])
+
+    shift_px, at, own_px, other = middle(residual), middle(fraction), middle(sigma), middle(detail)
+    size = np.array([len(own) for own in rows])
+    # Standard error of a median, from the scatter as it is; a single frame has its own.
+    scatter_px = np.array(
+        [1.4826 * np.median(np.abs(residual[own] - r)) for own, r in zip(rows, shift_px, strict=True)]
+    )
+    scatter_px = np.where(size >= 3, scatter_px, own_px)
+    edge = numbers // PIECES
+    xy, across_xy = edge_places(gripper, base, edge, at)
+    per_px = other[:, 0]
+    evidence = replace(
+        newest,
+        edge=edge,
+        fraction=at,
+        xy=xy + (shift_px * per_px)[:, None] * across_xy,
+        per_px=per_px,
+        sigma_px=np.hypot(1.25 * scatter_px / np.sqrt(size), CONSTANT * own_px),
+        spread_px=other[:, 1],
+        blur_px2=other[:, 2],
+        across=other[:, 3:],
+    )
+    return Pooled(evidence, numbers, often, isotropic_blur_px2(evidence), noise, len(frames))
+
+
+def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
+    """Fingers that should be in view and are not seen."""
+    stretches = np.bincount(gripper.edge_finger[evidence.edge], minlength=len(gripper.finger_ids))
+    sampled = np.isfinite(evidence.finger_share)
+    seen = (stretches >= FEWEST_STRETCHES) & (np.nan_to_num(evidence.finger_share) >= FEWEST_SHARE)
+    return tuple(np.flatnonzero(sampled & ~seen).tolist())
+
+
+def isotropic_blur_px2(evidence: EdgeEvidence) -> float | None:
+    """The least variance of the edges' blur over all directions in the image; None with too few directions.
+
+    Motion smears edges along one direction only; a lens out of focus blurs all of them.
+    """
+    if len(evidence.edge) < 6:
+        return None
+    angle = 2.0 * np.arctan2(evidence.across[:, 1], evidence.across[:, 0])
+    design = np.column_stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)])
+    if np.linalg.cond(design) > 10.0:
+        return None
+    weight = np.ones(len(angle))
+    for _ in range(8):  # towards least absolute deviations: an edge beside another one looks wide
+        terms = np.linalg.lstsq(design * weight[:, None], evidence.blur_px2 * weight, rcond=None)[0]
+        rest = np.abs(evidence.blur_px2 - design @ terms)
+        weight = 1.0 / np.sqrt(np.maximum(rest, 0.02))
+    return max(float(terms[0] - np.hypot(terms[1], terms[2])), 0.0)
+
+
+def _state(frame: EdgeEvidence, newest: EdgeEvidence, gripper: Gripper) -> State:
+    """Where the newest frame has everything, with the opening as it was reported, or seen, in another."""
+    opening_m = frame.jaw_opening_m
+    if frame.jaw_reported_m is not None and newest.jaw_reported_m is not None:
+        opening_m = newest.jaw_opening_m + frame.jaw_reported_m - newest.jaw_reported_m
+    opening_m = min(max(opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
+    return State(newest.cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
+
+
+def _without(evidence: EdgeEvidence, fingers: tuple[int, ...], gripper: Gripper) -> EdgeEvidence:
+    """Less what was taken for fingers that are not there."""
+    return _only(evidence, ~np.isin(gripper.edge_finger[evidence.edge], fingers)) if fingers else evidence
+
+
+def _only(evidence: EdgeEvidence, kept: NDArray[np.bool_]) -> EdgeEvidence:
+    names = ("edge", "fraction", "xy", "per_px", "sigma_px", "spread_px", "blur_px2", "across")
+    return replace(evidence, **{name: getattr(evidence, name)[kept] for name in names})
