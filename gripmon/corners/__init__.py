@@ -1,6 +1,5 @@
 """Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
 
-from gripmon.corners.evidence import edge_evidence
 from gripmon.corners.measure import FingertipMeter, Patience
 from gripmon.corners.settling import Effort, Measurement, MeasurementSettings
 from gripmon.corners.sums import edge_sums
@@ -16,7 +15,6 @@ __all__ = [
     "TaughtEdges",
     "TaughtModel",
     "agreeing_fingers",
-    "edge_evidence",
     "edge_sums",
     "finger_shares",
     "trace_of",
