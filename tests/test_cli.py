@@ -26,7 +26,7 @@ from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Origin, Severi
 from gripmon.simulator import FrameTruth
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("demo", "run", "replay", "simulate", "check", "teach")
+COMMANDS = ("demo", "run", "send", "replay", "simulate", "check", "teach")
 GRIPMON = (sys.executable, "-m", "gripmon")
 
 
@@ -99,6 +99,9 @@ def test_help_explains_every_argument(command: str, capsys: pytest.CaptureFixtur
         ["demo", "--seed", "-1"],
         ["simulate", "bump", "--out", "x", "--seed", "-1"],
         ["check", "x.yaml", "--jsn"],
+        ["send", "explode", "--robot", "arm"],
+        ["send", "undo"],
+        ["send", "undo", "--robot", "arm", "--timeout", "0"],
     ],
 )
 def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):

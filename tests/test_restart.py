@@ -1,0 +1,356 @@
+"""A restart: the monitor goes on from what was kept, and looks before it says valid.
+
+In one process on the core, and as users meet it: ``gripmon run`` killed and started again, ``gripmon send``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zenoh
+from kept_states import configuration, keep, make_pictures
+from loopback import ask, free_endpoint, plain_session, wait_until
+from meters import box_gripper
+from simulated import PAPER_LENS, nominal_cam_T_grip
+from watched import frames_of, new_monitor, pose_of, reference_of
+
+from gripmon.camera import make_camera
+from gripmon.config import load_config
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.records import (
+    AlertKind,
+    Command,
+    CommandName,
+    FrameRecord,
+    MonitorState,
+    ReferenceRecord,
+    Severity,
+    Verdict,
+)
+from gripmon.references import ReferenceBook
+
+HERE = Path(__file__).resolve().parent
+ROBOT = "gripmon/demo/wrist"
+
+
+# --- the core ---
+
+
+def restarted(state: MonitorState) -> Monitor:
+    back = msgspec.json.decode(msgspec.json.encode(state), type=MonitorState)
+    reference = reference_of(nominal_cam_T_grip())
+    return Monitor(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings(), reference, state=back)
+
+
+def with_reference(shift_m: tuple[float, float, float]) -> MonitorState:
+    """After the configured reference one that was measured later, its TCP shifted."""
+    book = ReferenceBook(reference_of(nominal_cam_T_grip()))
+    pose = nominal_cam_T_grip()
+    pose[:3, 3] += shift_m
+    book.adopt(book.draft(pose, np.diag([4e-12] * 3 + [1e-8] * 3), 77))
+    return MonitorState(book.history)
+
+
+def test_without_a_state_nothing_is_said_of_a_restart():
+    frames, _ = frames_of("static")
+    monitor = new_monitor()
+    assert not [alert for frame in frames for alert in monitor.process(frame).alerts]
+    assert monitor.state().references == (monitor.reference,)
+
+
+def test_what_a_monitor_tells_of_itself_another_one_goes_on_from():
+    frames, truths = frames_of("static")
+    first = new_monitor()
+    for frame in frames[:20]:
+        first.process(frame)
+    assert first.state().cam_T_grip is not None
+    undisturbed = restarted(first.state())
+    assert undisturbed.state().references == first.state().references
+    records = [undisturbed.process(frame) for frame in frames[20:]]
+    told = [(i, alert) for i, record in enumerate(records) for alert in record.alerts]
+    [(at, alert)] = told
+    assert alert.kind is AlertKind.RESTARTED and "factory-1, revision 1" in alert.text
+    assert Verdict.VALID not in [record.verdict for record in records[:at]] and at < 5
+    assert Verdict.VALID in [record.verdict for record in records]
+    errors = [
+        np.linalg.norm(pose_of(r.cam_T_grip)[:3, 3] - t.cam_T_grip[:3, 3])
+        for r, t in zip(records, truths[20:], strict=True)
+    ]
+    assert max(errors) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("shift_m", "fits"), [((0.0, 0.0, 0.0), True), ((2e-5, 0.0, 0.0), True), ((0.0, 0.0015, 0.0), False)]
+)
+def test_it_says_whether_the_picture_fits_the_reference_that_was_kept(shift_m: tuple[float, float, float], fits: bool):
+    monitor = restarted(with_reference(shift_m))
+    frames, _ = frames_of("static")
+    records = [monitor.process(frame) for frame in frames]
+    first = next(i for i, record in enumerate(records) if AlertKind.RESTARTED in [a.kind for a in record.alerts])
+    assert all(record.verdict is not Verdict.VALID for record in records[:first])
+    assert {(record.reference_id, record.revision) for record in records[: first + 1]} == {
+        (with_reference(shift_m).references[-1].reference_id, 2)
+    }
+    [alert] = [a for record in records for a in record.alerts if a.kind is AlertKind.RESTARTED]
+    assert (alert.severity is Severity.INFO) == fits
+    assert "revision 2" in alert.text
+
+
+def test_a_gripper_that_is_not_seen_after_a_restart_is_never_valid():
+    monitor = restarted(with_reference((0.0, 0.0, 0.0)))
+    frames, _ = frames_of("static")
+    for frame in frames[:10]:
+        blank = np.full_like(frame.image, 120)
+        blank += np.random.default_rng(frame.seq).integers(0, 9, blank.shape, dtype=np.uint8)
+        record = monitor.process(type(frame)(frame.seq, frame.stamp_ns, blank, frame.jaw_opening_m))
+        assert record.verdict is Verdict.UNKNOWN and record.revision == 2
+        assert AlertKind.RESTARTED not in [alert.kind for alert in record.alerts]
+
+
+def test_the_state_revision_grows_with_every_change_and_only_then():
+    frames, _ = frames_of("static")
+    monitor = restarted(with_reference((2e-5, 0.0, 0.0)))
+    for frame in frames[:10]:
+        monitor.process(frame)
+    before, kept = monitor.state_revision, monitor.state()
+    for refused in (CommandName.ACCEPT, CommandName.REJECT):
+        assert not monitor.command(Command(refused), 5).done
+    assert monitor.state_revision == before and monitor.state().references == kept.references
+    reply = monitor.command(Command(CommandName.UNDO), 123)
+    assert reply.done and (reply.reference_id, reply.revision) == (monitor.reference.reference_id, 3)
+    assert monitor.state_revision > before
+    assert monitor.reference.cam_T_grip == kept.references[0].cam_T_grip and monitor.reference.stamp_ns == 123
+    record = monitor.process(frames[10])
+    assert record.revision == 3 and AlertKind.RESTORED in [alert.kind for alert in record.alerts]
+    assert np.linalg.norm(record.drift.tcp_shift_m) < 5e-5
+    assert "first reference" in monitor.command(Command(CommandName.UNDO), 5).text
+    told = monitor.command(Command(CommandName.STATE), 5)
+    assert told.done and told.monitor is not None and told.monitor.references == monitor.state().references
+
+
+def test_a_state_that_does_not_hold_together_is_an_error():
+    first, second = with_reference((0.0, 0.0, 0.0)).references
+    with pytest.raises(ValueError, match="revision 1 follows revision 2"):
+        restarted(MonitorState((second, first)))
+
+
+# --- as users meet it ---
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_pictures(tmp_path_factory.mktemp("restart") / "pictures")
+
+
+class Cell:
+    """A router with ears, a configuration, and monitors that are started on it."""
+
+    def __init__(self, folder: Path, pictures: Path, session: zenoh.Session, endpoint: str) -> None:
+        self.folder, self.session, self.endpoint = folder, session, endpoint
+        self.config = configuration(folder, pictures, endpoint)
+        self.kept = folder / "kept.json"
+        self.transforms: list[FrameRecord] = []
+        self.alerts: list[dict[str, object]] = []
+        self._subscribers = [
+            session.declare_subscriber(
+                f"{ROBOT}/transform",
+                lambda sample: self.transforms.append(msgspec.json.decode(sample.payload.to_bytes(), type=FrameRecord)),
+            ),
+            session.declare_subscriber(
+                f"{ROBOT}/alert", lambda sample: self.alerts.append(json.loads(sample.payload.to_bytes()))
+            ),
+        ]
+
+    @contextmanager
+    def monitor(self, *options: str) -> Iterator[subprocess.Popen[str]]:
+        """``gripmon run`` until its end, which is kill -9."""
+        self.transforms.clear()
+        self.alerts.clear()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "gripmon", "run", str(self.config), *options],
+            stderr=subprocess.PIPE, text=True, cwd=HERE.parent,
+        )  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.communicate()
+
+    def run(self, *options: str) -> subprocess.CompletedProcess[str]:
+        return gripmon("run", str(self.config), *options)
+
+    def send(self, *arguments: str, robot: str = "demo") -> subprocess.CompletedProcess[str]:
+        return gripmon("send", *arguments, "--robot", robot, "--connect", self.endpoint)
+
+    def wait(self, condition: Callable[[FrameRecord], bool], what: str) -> FrameRecord:
+        """The first transform that fits."""
+        wait_until(lambda: any(condition(record) for record in list(self.transforms)), what, 60.0)
+        return next(record for record in self.transforms if condition(record))
+
+    def wait_valid(self) -> FrameRecord:
+        return self.wait(lambda record: record.verdict is Verdict.VALID, "a valid transform")
+
+    def reference(self) -> ReferenceRecord:
+        (said,) = ask(self.session, f"{ROBOT}/reference")
+        return msgspec.convert(said, ReferenceRecord)
+
+
+def gripmon(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "gripmon", *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60.0, cwd=HERE.parent)
+
+
+@pytest.fixture
+def cell(tmp_path: Path, pictures: Path) -> Iterator[Cell]:
+    endpoint = free_endpoint()
+    with plain_session(listen=endpoint, mode="router") as session:
+        yield Cell(tmp_path, pictures, session, endpoint)
+
+
+def test_undone_killed_and_started_again_it_goes_on(cell: Cell):
+    kept = keep(cell.config, 2e-5, -1e-5)
+    second, third = kept.references[1:]
+    with cell.monitor():
+        assert cell.wait_valid().reference_id == third.reference_id
+        undone = cell.send("undo")
+        assert (undone.returncode, undone.stderr) == (0, "")
+        fourth = cell.wait(lambda record: record.revision == 3, "the undo to be named").reference_id
+        assert undone.stdout == f"{fourth} is in force and restores {second.reference_id}\n"
+        refused = cell.send("accept", "nothing")
+        assert (refused.returncode, refused.stdout) == (3, "")
+        assert refused.stderr == "refused: no new reference is proposed\n"
+    with cell.monitor():
+        cell.wait_valid()
+        assert {(record.reference_id, record.revision) for record in cell.transforms} == {(fourth, 3)}
+        assert cell.transforms[0].verdict is not Verdict.VALID
+        wait_until(lambda: cell.alerts, "the alert of the restart")
+        assert cell.alerts[0]["kind"] == "restarted" and f"{fourth}, revision 3" in str(cell.alerts[0]["text"])
+        reference = cell.reference()
+        assert (reference.parent, reference.restores) == (third.reference_id, second.reference_id)
+        told = cell.send("state")
+        assert told.returncode == 0
+        assert [line.split()[:2] for line in told.stdout.splitlines() if line.startswith("  ")] == [
+            [str(i), name]
+            for i, name in enumerate(["demo-calibration", second.reference_id, third.reference_id, fourth])
+        ]
+        whole = cell.send("state", "--json")
+        assert [r["revision"] for r in json.loads(whole.stdout)["monitor"]["references"]] == [0, 1, 2, 3]
+
+
+def test_a_damaged_file_is_set_aside_said_on_the_network_and_replaced(cell: Cell):
+    keep(cell.config, 2e-5)
+    cell.kept.write_bytes(cell.kept.read_bytes()[:-100])
+    with cell.monitor():
+        assert cell.wait_valid().reference_id == "demo-calibration"
+        wait_until(lambda: cell.alerts, "the alert")
+    text = str(cell.alerts[0]["text"])
+    assert cell.alerts[0]["kind"] == "restarted" and "is damaged" in text and "kept.json.damaged-1" in text
+    assert (cell.folder / "kept.json.damaged-1").is_file()
+    with cell.monitor():
+        cell.wait_valid()
+        wait_until(lambda: cell.alerts, "the alert")
+    assert "damaged" not in str(cell.alerts[0]["text"]), "what was written since is whole"
+
+
+def test_a_changed_calibration_and_a_fresh_start_begin_anew_with_the_next_revision(cell: Cell):
+    keep(cell.config, 2e-5)
+    with cell.monitor("--fresh-state"):
+        record = cell.wait_valid()
+        assert (record.reference_id, record.revision) == ("demo-calibration", 2)
+    text = cell.config.read_text()
+    assert text.count("fx_px: 962.0") == 1
+    cell.config.write_text(text.replace("fx_px: 962.0", "fx_px: 962.5"))
+    with cell.monitor():
+        assert cell.wait_valid().revision == 3
+        wait_until(lambda: cell.alerts, "the alert")
+    assert "the camera model changed since" in str(cell.alerts[0]["text"])
+    assert sorted(path.name for path in cell.folder.glob("kept.json.r*")) == [
+        "kept.json.replaced-1",
+        "kept.json.replaced-2",
+    ]
+
+
+def test_another_robots_state_and_a_file_in_use_are_refused_in_one_line(cell: Cell):
+    keep(cell.config, 2e-5)
+    before = cell.kept.read_bytes()
+    text = cell.config.read_text()
+    with cell.monitor() as first:
+        cell.wait_valid()
+        second = cell.run()
+        assert second.returncode == 2
+        assert second.stderr == (
+            f"{cell.config}: state.file: {cell.kept} is in use by process {first.pid}; stop that one, or give this "
+            "monitor a file of its own\n"
+        )
+    cell.config.write_text(text.replace("robot: demo", "robot: other"))
+    other = cell.run()
+    assert (other.returncode, other.stdout) == (2, "")
+    assert other.stderr == (
+        f"{cell.config}: state.file: {cell.kept} is the state of demo/wrist, not of other/wrist; a file of its own for "
+        "each monitor\n"
+    )
+    assert load_config(cell.config).settings.robot == "other" and cell.kept.stat().st_size >= len(before)
+
+
+def test_a_folder_that_can_not_be_written_is_said_and_the_monitor_goes_on(cell: Cell):
+    (cell.folder / "a-file").write_text("x")
+    cell.config.write_text(cell.config.read_text().replace("kept.json", "a-file/kept.json"))
+    with cell.monitor():
+        cell.wait_valid()
+        wait_until(
+            lambda: any("state not kept" in str(s["message"]) for s in ask(cell.session, f"{ROBOT}/state")),
+            "the message",
+        )
+        count = len(cell.transforms)
+        wait_until(lambda: len(cell.transforms) > count + 5, "more transforms")
+
+
+def test_a_command_to_nobody_is_one_line_and_exit_code_3(cell: Cell):
+    begun_s = time.monotonic()
+    done = cell.send("undo", "--timeout", "0.5")
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr == "send: no monitor demo/* is on the network\n"
+    assert time.monotonic() - begun_s < 30.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["state", "x-1"], "send: state takes no ID, but x-1 is given; leave it out\n"),
+        (["undo", "--zenoh-config", "x.json5"], "send: --connect has no effect beside --zenoh-config; one of them\n"),
+    ],
+)
+def test_wrong_usage_of_send_is_one_line_and_exit_code_2(cell: Cell, arguments: list[str], said: str):
+    done = cell.send(*arguments)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", said)
+
+
+@pytest.mark.parametrize("robot", ["two words", "a/b", ""])
+def test_a_name_that_can_not_be_is_wrong_usage(cell: Cell, robot: str):
+    done = cell.send("undo", robot=robot)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "can't be part of a Zenoh key" in done.stderr
+
+
+def test_replay_and_check_leave_the_state_alone(cell: Cell, pictures: Path, tmp_path: Path):
+    keep(cell.config, 2e-5)
+    before = {path.name: path.read_bytes() for path in cell.folder.glob("kept*")}
+    images = tmp_path / "few"
+    images.mkdir()
+    for path in sorted(pictures.iterdir())[:3]:
+        (images / path.name).symlink_to(path.resolve())
+    out = tmp_path / "out.jsonl"
+    assert gripmon("replay", str(images), "--config", str(cell.config), "--out", str(out)).returncode == 0
+    assert gripmon("check", str(cell.config)).returncode == 0
+    assert {json.loads(line)["revision"] for line in out.read_text().splitlines()} == {0}
+    assert {path.name: path.read_bytes() for path in cell.folder.glob("kept*")} == before
+    assert not (Path(os.environ["XDG_STATE_HOME"])).exists()
