@@ -13,7 +13,7 @@ from gripmon.causes.baseline import Baseline
 from gripmon.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
 from gripmon.causes.pooling import Pooled
 from gripmon.causes.state import EdgeView, State
-from gripmon.causes.weighing import Weighed, covariance_px2, weigh
+from gripmon.causes.weighing import Errors, Weighed, weigh
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Cause
 
@@ -28,9 +28,6 @@ WITH_BASELINE = 0.1
 
 EDGE_PX = 0.02
 """What a whole edge is off by at least."""
-
-OUTLIER = 2.5
-"""Standard deviations from which a piece that even the freest model doesn't explain counts for less."""
 
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
 SETTLED_JAW_M = 5e-6
@@ -104,13 +101,12 @@ def compare(
         first = start
         if suspect.cause in (Cause.CAMERA_MOUNT, Cause.UNKNOWN):  # followed at once, however far
             first = replace(start, cam_T_grip=evidence.cam_T_grip)
-        weight = np.linalg.inv(covariance_px2(evidence.edge, sigma_px, spread_px))
-        return weigh(view, gripper, suspect.model, start, first, bias_px, weight)
+        errors = Errors(bias_px, sigma_px, spread_px, edge)
+        return weigh(view, gripper, suspect.model, start, first, errors)
 
-    # What even the freest model doesn't explain all others needn't: pieces that are mistaken, and errors in common.
-    residual_px = fitted(models[-1]).residual_px
-    sigma_px = sigma_px * np.maximum(np.abs(residual_px) / (OUTLIER * sigma_px), 1.0)
-    sigma_px = np.hypot(sigma_px, _shared_px(residual_px, sigma_px))
+    # What even the freest model doesn't explain all pieces share as an error.
+    edge = np.unique(evidence.edge, return_inverse=True)[1]
+    sigma_px = np.hypot(sigma_px, _shared_px(fitted(models[-1]).residual_px, sigma_px))
     fits = {(suspect.cause, suspect.part): fitted(suspect) for suspect in models}
     log = {(s.cause, s.part): fits[s.cause, s.part].log_evidence + math.log(s.prior) for s in models}
     change_px = _blur_change_px(pooled, baseline)
@@ -146,12 +142,11 @@ def _knowledge(
 
 
 def _shared_px(residual_px: Array, sigma_px: Array) -> float:
-    """Standard deviation that comes on top of that assumed (moment estimator of a random effect, DerSimonian and Laird
-    1986); the fit's degrees of freedom are half of the pieces, about.
+    """Scale that comes on top of that assumed: from the middle size of what the freest model leaves, which takes about
+    half of the scatter upon itself.
     """
-    weight = 1.0 / sigma_px**2
-    excess = float(weight @ residual_px**2) - 0.5 * len(residual_px)
-    return math.sqrt(max(excess, 0.0) / float(weight.sum()))
+    excess = float(np.median(residual_px**2 / sigma_px**2)) / (0.6745**2 * 0.5) - 1.0
+    return math.sqrt(max(excess, 0.0) * float(np.median(sigma_px**2)))
 
 
 def _blur_change_px(pooled: Pooled, baseline: Baseline | None) -> float | None:
