@@ -268,6 +268,32 @@ def test_the_reference_id_depends_on_the_calibration_only(folder: Path):
     )
 
 
+def test_only_a_live_camera_keeps_its_state_unless_told_where(folder: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "/var/state")
+    path = folder / "config.yaml"
+    text = path.read_text() + "state: {file: auto}\n"
+    for name, changed, expected in (
+        ("live", text, Path("/var/state/gripmon/arm1-wrist.json")),
+        ("simulated", text.replace("kind: live, device: 0", "kind: simulator"), None),
+        ("nowhere", text.replace("file: auto", "file: null"), None),
+        ("told", text.replace("file: auto", "file: kept/arm.json"), folder / "kept" / "arm.json"),
+        ("absolute", text.replace("file: auto", "file: /data/arm.json"), Path("/data/arm.json")),
+    ):
+        path.write_text(changed)
+        assert load_config(path).state_path == expected, name
+    assert load_config(builtin_config("live_camera.yaml")).state_path == Path("/var/state/gripmon/arm1-wrist.json")
+
+
+def test_a_state_belongs_to_camera_gripper_and_reference_whatever_else_changes(folder: Path):
+    owner = load_config(folder / "config.yaml").state_owner
+    assert (owner.robot, owner.camera) == ("arm1", "wrist")
+    same = load_config(edited(folder, "^camera:", "# a comment\ncamera:")).state_owner
+    assert same == owner
+    moved = load_config(edited(folder, r"0.1188\]", "0.1189]")).state_owner.calibration
+    assert (moved.camera, moved.gripper) == (owner.calibration.camera, owner.calibration.gripper)
+    assert moved.reference != owner.calibration.reference
+
+
 class _Inner(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     gain: Annotated[float, Meta(gt=0.0, description="gain (DN)")] = 1.0
     mode: Literal["fast", "slow"] = "fast"

@@ -289,6 +289,9 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
     (path,) = tmp_path.iterdir()
     told = Recorded(path)
     assert [cell.seq for cell in told.timed("rig/reference")] == [0, 7]
+    lines = told.by_seq("reference", "json").items()
+    whole = {seq: msgspec.json.decode(line, type=type(moved)) for seq, (line,) in lines}
+    assert whole == {0: REFERENCE, 7: moved}, "with its provenance"
     assert [c.seq for c in told.timed("events") if c.values["text"] == ["reference second (configuration)"]] == [7]
 
 

@@ -427,3 +427,14 @@ def test_the_default_place_follows_the_standard(monkeypatch: pytest.MonkeyPatch)
     for unusable in ("", "relative/path"):
         monkeypatch.setenv("XDG_STATE_HOME", unusable)
         assert default_path("arm1", "wrist") == Path("/home/robot/.local/state/gripmon/arm1-wrist.json")
+
+
+def test_a_user_without_a_home_has_to_name_a_file(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("XDG_STATE_HOME", "")
+
+    def homeless(self: Path) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "expanduser", homeless)
+    with pytest.raises(StateFileError, match="auto, but this user has no home folder; the path of a file, or null"):
+        default_path("arm1", "wrist")

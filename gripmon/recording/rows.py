@@ -139,6 +139,8 @@ class RowWriter:
 
     def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Event:
         self._rig.write_reference(reference, first)
+        whole = rr.AnyValues.columns(json=[to_json(reference).decode()])
+        self._send.columns("reference", [first.stamp_ns], [first.seq], whole)
         return Event(first.stamp_ns, first.seq, "INFO", f"reference {reference.reference_id} ({reference.origin})")
 
     def _log_static(self, scene: Scene) -> None:
