@@ -151,7 +151,8 @@ class StateFile:
         self.configured = configured
         self.notices: tuple[str, ...] = ()
         self.failure = ""
-        self._path, self._owner = path, owner
+        # A link leads to where the file shall be; renaming would replace the link itself.
+        self._path, self._owner = path.resolve(), owner
         self._usable = True
         self._lock = self._take_lock()
         try:

@@ -398,6 +398,35 @@ def test_what_could_not_be_read_again_is_not_written(path: Path):
     assert unpack(path.read_bytes()).state == STATE
 
 
+def test_a_link_leads_to_the_file_and_stays(tmp_path: Path, path: Path):
+    link = tmp_path / "link.json"
+    link.symlink_to(path)
+    file = opened(link)
+    assert file.write(STATE)
+    with pytest.raises(StateFileError, match="in use"):
+        opened(path)
+    file.close()
+    assert link.is_symlink() and read_once(path).state == read_once(link).state == STATE
+
+
+def test_file_and_folder_are_on_the_disk_before_writing_ends(path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A power cut after that takes nothing back: first the content, then the name."""
+    file = opened(path)
+    assert file.write(state_of("a"))
+    synced, real = [], os.fsync
+
+    def noted(descriptor: int) -> None:
+        named = Path(f"/proc/self/fd/{descriptor}").readlink()
+        synced.append(
+            (named.name.startswith(".arm.json-"), named == path.parent, unpack(path.read_bytes()).state == STATE)
+        )
+        real(descriptor)
+
+    monkeypatch.setattr("gripmon.atomic.os.fsync", noted)
+    assert file.write(STATE)
+    assert synced == [(True, False, False), (False, True, True)]
+
+
 def test_leftovers_of_killed_writers_are_cleared_but_nothing_else(path: Path):
     write(path, DATA)
     others = [".arm.json-0a1b2c3d.tmp.keep", ".arms.json-0a1b2c3d.tmp", "arm.json-1.tmp", "arm.json.damaged-1"]
