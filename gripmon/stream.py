@@ -5,6 +5,7 @@ Time is the frames' own stamps.  Some 1,700 pixels of each frame are looked at, 
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import deque
 from dataclasses import dataclass
@@ -66,9 +67,12 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 @dataclass(frozen=True, slots=True)
 class StreamFault:
-    """What is wrong with the stream now: of each ``kind`` there is one at a time."""
+    """What is wrong with the stream now: of each ``kind`` there is one at a time.
 
-    kind: Literal["frozen", "replaced", "clock", "rate"]
+    A ``gap`` is over when it is told; its cause is unknown: a camera that was away, or a clock that was set.
+    """
+
+    kind: Literal["frozen", "replaced", "clock", "gap", "rate"]
     cause: Cause
     text: str
 
@@ -86,7 +90,7 @@ class StreamWatch:
     def add(self, frame: Frame) -> tuple[StreamFault, ...]:
         """What is wrong now; empty when all is well.  Never raises for a bad frame."""
         faults = (
-            self._clock.add(frame, self._rate.usual_ns),
+            self._clock.add(frame, self._rate),
             self._rate.add(frame),
             self._kind.add(frame.image),
             self._frozen.add(frame, self._rate.usual_ns),
@@ -142,35 +146,33 @@ class _Clock:
         self._seq = 0
         self._calm = CALM_FRAMES
         self._standing = 0
-        self._text = ""
+        self._fault: StreamFault | None = None
 
-    def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
-        said = self._said(frame, usual_ns)
+    def add(self, frame: Frame, rate: _Rate) -> StreamFault | None:
+        fault = self._found(frame, rate)
         self._stamp_ns, self._seq = frame.stamp_ns, frame.seq
-        if said is None:
-            self._calm += 1
-            if self._calm >= CALM_FRAMES:
-                self._standing = 0
-                return None
-        else:
-            self._calm, self._text = 0, said
-        return StreamFault("clock", Cause.CLOCK, self._text) if self._text else None
+        if fault is not None:
+            self._calm, self._fault = 0, fault
+            return fault
+        self._calm += 1
+        if self._calm >= CALM_FRAMES:
+            self._standing, self._fault = 0, None
+        return self._fault
 
-    def _said(self, frame: Frame, usual_ns: float | None) -> str | None:
+    def _found(self, frame: Frame, rate: _Rate) -> StreamFault | None:
         if self._stamp_ns is None:
             return None
         step_ns = frame.stamp_ns - self._stamp_ns
         if step_ns < 0:
-            return f"the frames' clock went back by {-1e-9 * step_ns:.3f} s"
+            return StreamFault("clock", Cause.CLOCK, f"the frames' clock went back by {-1e-9 * step_ns:.3f} s")
         if step_ns == 0:
             self._standing += 1
-            return "the frames' clock stands still" if self._standing >= STANDING_STAMPS else None
-        frames = max(frame.seq - self._seq, 1)
-        if usual_ns is not None and step_ns > max(frames * JUMP_PERIODS * usual_ns, JUMP_NS):
-            return (
-                f"the frames' stamps jumped by {1e-9 * step_ns:.1f} s at once: the clock was set, or "
-                "no frame came for so long"
-            )
+            text = f"{self._standing} frames have the stamp of the one before: their clock stands still"
+            return StreamFault("clock", Cause.CLOCK, text) if self._standing >= STANDING_STAMPS else None
+        if step_ns > JUMP_NS and step_ns > rate.longest_ns(max(frame.seq - self._seq, 1)):
+            # The frames alone don't tell which.
+            text = f"no frame came for {1e-9 * step_ns:.1f} s, or the frames' clock was set ahead by so much"
+            return StreamFault("gap", Cause.UNKNOWN, text)
         return None
 
 
@@ -195,14 +197,19 @@ class _Rate:
             return None
         return _NS / statistics.median(self._arrivals_ns)
 
+    def longest_ns(self, frames: int) -> float:
+        """Longest time that so many frames take as long as nothing is wrong; infinite until it is known."""
+        frames_per_s = self.frames_per_s
+        return math.inf if frames_per_s is None else frames * JUMP_PERIODS * _NS / frames_per_s
+
     def add(self, frame: Frame) -> StreamFault | None:
         last, self._last = self._last, (frame.seq, frame.stamp_ns)
         if last is None or frame.stamp_ns <= last[1]:
             return self._fault
         step_ns = frame.stamp_ns - last[1]
         interval_ns = step_ns / max(frame.seq - last[0], 1)
-        if self.usual_ns is not None and interval_ns > max(JUMP_PERIODS * self.usual_ns, JUMP_NS):
-            return self._fault  # the clock's fault
+        if interval_ns > JUMP_NS and interval_ns > self.longest_ns(1):
+            return self._fault  # a gap
         self._arrivals_ns.append(step_ns)
         self._block_ns.append(interval_ns)
         if len(self._block_ns) == BLOCK:

@@ -20,6 +20,9 @@ from gripmon.records import Array, Cause
 Key = tuple[Cause | None, int | None]
 """A cause and the finger that it is about; None for the cause: nothing moved."""
 
+FOLLOWED = (Cause.CAMERA_MOUNT, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
+"""Causes by which the whole gripper shows elsewhere, however far."""
+
 FLOOR_PX = 0.015
 """Standard deviation of a piece's place that nothing else explains."""
 
@@ -33,6 +36,7 @@ SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
 SETTLED_JAW_M = 5e-6
 """Of the pose (m and rad) and the opening that a baseline knows."""
 
+LENS_CHANGES = (Cause.LENS, Cause.CAMERA_REPLACED, Cause.UNKNOWN)
 BLUR_SIGMA_PX, BLUR_RANGE_PX = 0.1, 4.0
 """Scatter of the blur while the lens stays as it is, and how far it goes when it doesn't."""
 
@@ -75,9 +79,10 @@ def compare(
     reference_sigma: Array,
     report: Report,
     baseline: Baseline | None,
+    interrupted: bool,
 ) -> Comparison:
     """``reference_sigma`` (6,): standard deviations of ``ref_cam_T_grip`` (4, 4), m and rad, which count as long as
-    there is no ``baseline``.  ``pooled`` has at least some pieces.
+    there is no ``baseline``.  ``pooled`` has at least some pieces.  ``interrupted``: see :func:`models.suspects`.
     """
     evidence = pooled.evidence
     reported = evidence.jaw_reported_m is not None
@@ -92,14 +97,13 @@ def compare(
         sigma_px = np.hypot(sigma_px, bias_sigma_px)
         seen = baseline.known(pooled.piece)
         spread_px = np.where(seen, np.hypot(WITH_BASELINE * evidence.spread_px, EDGE_PX), spread_px)
-    models = suspects(
-        gripper, float(ref_cam_T_grip[2, 3]), _knowledge(evidence.jaw_reported_m, reference_sigma, report, baseline)
-    )
+    known = _knowledge(evidence.jaw_reported_m, reference_sigma, report, baseline)
+    models = suspects(gripper, float(ref_cam_T_grip[2, 3]), known, interrupted)
     view = EdgeView(camera, gripper, evidence)
 
     def fitted(suspect: Suspect) -> Weighed:
         first = start
-        if suspect.cause in (Cause.CAMERA_MOUNT, Cause.UNKNOWN):  # followed at once, however far
+        if suspect.cause in FOLLOWED:
             first = replace(start, cam_T_grip=evidence.cam_T_grip)
         errors = Errors(bias_px, sigma_px, spread_px, edge)
         return weigh(view, gripper, suspect.model, start, first, errors)
@@ -112,7 +116,7 @@ def compare(
     change_px = _blur_change_px(pooled, baseline)
     if change_px is not None:
         for key in log:
-            log[key] += _blur_log_likelihood(change_px, may=key[0] in (Cause.LENS, Cause.UNKNOWN))
+            log[key] += _blur_log_likelihood(change_px, may=key[0] in LENS_CHANGES)
     if pooled.absent:
         log[Cause.VIEW_BLOCKED, None] = log[None, None] + math.log(BLOCKED)
         fits[Cause.VIEW_BLOCKED, None] = fits[None, None]

@@ -90,6 +90,11 @@ class CauseJudge:
     def reset(self) -> None:
         """All is well again: evidence is forgotten."""
         self._frames.clear()
+        self._interrupted = False
+
+    def interrupted(self) -> None:
+        """No frames came for long, before those that are added next: somebody may have exchanged the camera."""
+        self._interrupted = True
 
     @property
     def wants_baseline(self) -> bool:
@@ -123,7 +128,14 @@ class CauseJudge:
 
     def _compared(self, pooled: Pooled, ref_cam_T_grip: Array, baseline: Baseline | None) -> Comparison:
         return compare(
-            pooled, self._camera, self._gripper, ref_cam_T_grip, self._reference_sigma, self._report, baseline
+            pooled,
+            self._camera,
+            self._gripper,
+            ref_cam_T_grip,
+            self._reference_sigma,
+            self._report,
+            baseline,
+            self._interrupted,
         )
 
     def _learnt(self, ref_cam_T_grip: Array) -> Baseline | None:

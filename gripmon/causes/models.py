@@ -20,7 +20,7 @@ FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about an opening that nobody reports."""
 
-_MOUNT, _FINGER, _JAW, _LENS, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.1, 0.1
+_MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.2, 0.1, 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,11 +46,12 @@ class Suspect:
     model: Model
 
 
-def suspects(gripper: Gripper, distance_m: float, known: Knowledge) -> list[Suspect]:
+def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted: bool) -> list[Suspect]:
     """The models that exist for this gripper, ``distance_m`` from the camera to the TCP.
 
     A gripper of one finger has none for a bent finger, which looks like a motion of the camera; without a jaw, or
-    where nobody reports its opening, there is none for a wrong report.
+    where nobody reports its opening, there is none for a wrong report.  Nobody exchanges a camera without the stream
+    being ``interrupted``.
     """
     fingers = len(gripper.finger_ids)
     held = np.zeros(FINGERS + 6 * fingers)
@@ -73,12 +74,16 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge) -> list[Susp
         Suspect(Cause.CAMERA_MOUNT, None, _MOUNT, Model(held, freed((POSE, pose)), MOUNT_SIZES_M)),
         Suspect(Cause.LENS, None, _LENS, Model(held, freed((FOCAL, 1.0)), FOCAL_SIZES)),
     ]
+    if interrupted:
+        # Another camera in its place: an image of another scale from nearly the same place.
+        model = Model(held, freed((POSE, pose), (FOCAL, 5.0)), MOUNT_SIZES_M)
+        out.append(Suspect(Cause.CAMERA_REPLACED, None, _REPLACED, model))
     if gripper.has_jaw and known.jaw_reported:
         out.append(Suspect(Cause.JAW_OPENING, None, _JAW, Model(held, freed((JAW, 1.0)), JAW_SIZES_M)))
     if fingers > 1:
         for finger in range(fingers):
             model = Model(held, freed(bent(finger)), FINGER_SIZES_M)
             out.append(Suspect(Cause.FINGER_BENT, finger, _FINGER / fingers, model))
-    every = freed((POSE, pose), (FOCAL, 1.0), *(bent(finger) for finger in range(fingers)))
+    every = freed((POSE, pose), (FOCAL, 5.0), *(bent(finger) for finger in range(fingers)))
     out.append(Suspect(Cause.UNKNOWN, None, _SEVERAL, Model(held, every, MOUNT_SIZES_M)))
     return out

@@ -50,6 +50,12 @@ def _of(key: Key, fit: Weighed, blur_change_px: float | None, gripper: Gripper) 
                 f"the camera moved against the gripper: TCP by {shift_mm:.3f} mm, turned by {turn_deg:.3f} degrees; "
                 f"{also} would look the same"
             )
+        case Cause.CAMERA_REPLACED:
+            return (
+                f"the image has another scale ({100.0 * math.expm1(float(motion[FOCAL])):+.2f} %) and is seen from "
+                f"elsewhere ({1e3 * float(np.linalg.norm(motion[POSE][:3])):.2f} mm at the TCP): another camera, or a "
+                "lens that changed as the mount moved"
+            )
         case Cause.FINGER_BENT:
             assert part is not None
             own = motion[finger_slice(part)]
@@ -84,6 +90,7 @@ def _name(key: Key, gripper: Gripper) -> str:
         Cause.FINGER_BENT: f"finger {'' if part is None else gripper.finger_ids[part]} is bent",
         Cause.JAW_OPENING: "the opening is reported wrong",
         Cause.LENS: "focal length or focus changed",
+        Cause.CAMERA_REPLACED: "the camera was replaced",
         Cause.VIEW_BLOCKED: "the view is blocked",
         Cause.UNKNOWN: "several things at once",
     }

@@ -49,8 +49,12 @@ def run(trial: Trial) -> Told:
     records: list[FrameRecord] = []
     faults = []
     for index, frame in enumerate(trial.frames()):
-        # What happened at some time counts, also when it is over.
-        faults += stream.add(frame)
+        for fault in stream.add(frame):
+            # What happened at some time counts, also when it is over.
+            if fault.kind == "gap":
+                judge.interrupted()
+            else:
+                faults.append(fault)
         records.append(monitor.process(frame))
         _judge(monitor, judge, rig.start_cam_T_grip, frame, index < trial.well)
     if faults:

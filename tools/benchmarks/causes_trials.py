@@ -369,7 +369,7 @@ def _rate(rng: Rng, rig: Rig) -> Trial:
 
 
 def _replaced(rng: Rng, rig: Rig) -> Trial:
-    """Images of another size or type, or of the same from another camera in about the same place."""
+    """Images of another size or type; or, after some time without any, of the same from another camera."""
     if rng.random() < 0.5:
         smaller = bool(rng.random() < 0.5)
 
@@ -391,7 +391,15 @@ def _replaced(rng: Rng, rig: Rig) -> Trial:
         read_noise_dn=float(rng.uniform(0.5, 4.0)),
         psf_sigma_px=float(rng.uniform(0.5, 0.9)),
     )
-    return _other_camera(rig, f"the same type, focal length {lens.fx_px:.0f} px", lens, pose, sensor=sensor)
+    away_ns = int(1e9 * _log_uniform(rng, 10.0, 1000.0))  # nobody exchanges a camera within a frame
+
+    def frames() -> Iterator[Frame]:
+        before, after = rig.simulator(), rig.simulator(lens, pose, sensor=sensor)
+        for index in range(WELL + AFTER):
+            frame = (before if index < WELL else after).frame(index)
+            yield frame if index < WELL else replace(frame, stamp_ns=frame.stamp_ns + away_ns)
+
+    return Trial(rig, f"the same type, focal length {lens.fx_px:.0f} px", None, WELL, frames)
 
 
 ROWS: dict[str, Row] = {
