@@ -18,19 +18,23 @@ from gripmon.statefile import StateFile
 FRAMES = 3000
 
 
-def make_pictures(folder: Path) -> Path:
-    """A folder of many frames: the demo's camera, which stands still."""
+def make_pictures(folder: Path, *, knocked_every: int | None = None) -> Path:
+    """A folder of many frames: the demo's camera, which stands still, or is knocked to and fro by 3.5 mm."""
     folder.mkdir()
     config = load_config(builtin_config("demo.yaml"))
     scenario = make_scenario("static", duration_s=0.2, fps=20.0)
-    simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, 1)
-    for i in range(4):
-        image = simulator.frame(i).image
-        assert image is not None and cv2.imwrite(str(folder / f"original{i}.bmp"), image)
+    knocked_T = config.cam_T_grip.copy()
+    knocked_T[0, 3] += 0.0035
+    for place, cam_T_grip in enumerate((config.cam_T_grip, knocked_T)):
+        simulator = Simulator(config.camera, config.gripper, cam_T_grip, scenario, 1)
+        for i in range(4):
+            image = simulator.frame(i).image
+            assert image is not None and cv2.imwrite(str(folder / f"original{place}{i}.bmp"), image)
     frames = folder / "frames"
     frames.mkdir()
     for i in range(FRAMES):
-        (frames / f"{i:05d}.bmp").symlink_to(folder / f"original{i % 4}.bmp")
+        place = 0 if knocked_every is None else i // knocked_every % 2
+        (frames / f"{i:05d}.bmp").symlink_to(folder / f"original{place}{i % 4}.bmp")
     return frames
 
 

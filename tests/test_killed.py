@@ -18,7 +18,7 @@ import zenoh
 from kept_states import configuration, keep, make_pictures
 from loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.records import CommandReply, FrameRecord, ReferenceRecord
+from gripmon.records import CommandReply, FrameRecord, MonitorState, ReferenceRecord
 from gripmon.references import state_fault
 from gripmon.statefile import unpack
 
@@ -53,6 +53,17 @@ class Witness:
             known = self.named.setdefault(revision, reference_id)
         if known != reference_id:
             self.faults.append(f"revision {revision} is {known}, and {reference_id}")
+
+    def compare(self, path: Path) -> MonitorState:
+        """The state in a file, which must hold together and agree with all that was heard so far."""
+        kept, said = unpack(path.read_bytes()).state, self.newest
+        assert state_fault(kept) == ""
+        assert said <= kept.references[-1].revision, "what was said is kept"
+        for reference in kept.references:
+            self.name(reference.revision, reference.reference_id)
+            assert self.published.get(reference.revision, reference) == reference
+        assert self.faults == []
+        return kept
 
     def ask_until(self, stop: threading.Event, references: list[str]) -> None:
         """Undo to and fro between the last two references, without a pause."""
@@ -114,6 +125,31 @@ def forks(config: Path) -> Iterator[Forks]:
         made.close()
 
 
+def test_killed_while_it_calibrates_anew_it_goes_on_from_the_newest_reference(tmp_path: Path):
+    """The same without commands: the camera is knocked to and fro, and past the limit each time."""
+    endpoint = free_endpoint()
+    policy = {"limit_m": 0.001, "settle_frames": 4, "confirm_frames": 1}
+    config = configuration(
+        tmp_path,
+        make_pictures(tmp_path / "pictures", knocked_every=12),
+        endpoint,
+        monitor={"policy": policy, "recalibration": {"frames": 4, "sure_sigma_m": 0.001, "largest_sigma_m": 0.001}},
+    )
+    chance = random.Random(6)
+    with plain_session(listen=endpoint, mode="router") as session, forks(config) as monitors:
+        witness = Witness(session)
+        newest = 0
+        for _ in range(8):
+            pid = monitors.start()
+            wait_until(lambda newest=newest: witness.newest > newest, "a recalibration", 60.0)
+            time.sleep(chance.uniform(0.0, 0.5))
+            monitors.kill(pid)
+            kept = witness.compare(tmp_path / "kept.json")
+            newest = kept.references[-1].revision
+            assert {reference.origin for reference in kept.references[1:]} == {"recalibration"}
+    assert newest >= 8
+
+
 def test_killed_at_fifty_moments_it_goes_on_from_what_it_said_last(tmp_path: Path):
     """Frames as fast as they can be measured, a change of reference with nearly every one of them, and so many
     references that the monitor spends much of its time writing them.
@@ -141,14 +177,7 @@ def test_killed_at_fifty_moments_it_goes_on_from_what_it_said_last(tmp_path: Pat
             monitors.kill(pid)
             stop.set()
             asker.join()
-            kept, said = unpack((tmp_path / "kept.json").read_bytes()).state, witness.newest
-            assert state_fault(kept) == ""
-            for reference in kept.references:
-                witness.name(reference.revision, reference.reference_id)
-                assert witness.published.get(reference.revision, reference) == reference
-            assert witness.faults == []
-            assert said <= kept.references[-1].revision, "what was said is kept"
-            state = kept
+            state = witness.compare(tmp_path / "kept.json")
             lives.append(witness.answered - before)
     log = (tmp_path / "log.txt").read_text()
     assert "damaged" not in log and "Traceback" not in log
