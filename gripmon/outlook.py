@@ -19,7 +19,7 @@ from gripmon.corners.profiles import Candidates
 from gripmon.corners.uncertainty import Uncertainty
 from gripmon.geometry import from_record
 from gripmon.gripper import Gripper
-from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.records import Array, Image, ReferenceRecord
 
 EDGE_POINT_SIGMA_PX = 0.05
@@ -87,17 +87,17 @@ def expect(
     taught: TaughtEdges | None = None,
 ) -> Outlook:
     """What a frame at the reference's pose and an opening (nominal if None) may tell."""
-    monitor = Monitor(camera, gripper, settings, reference, taught)
+    tracker = Tracker(camera, gripper, settings, taught)
     cam_T_grip = from_record(reference.cam_T_grip)
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     meter = ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m, taught)
     given = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
-    covariance = monitor.update(given)[1]
+    covariance = tracker.update(given)[1]
     lever_m = _lever_m(given.prediction)
     jaw = None
     if gripper.has_jaw:
         free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
-        jaw = _jaw_outlook(monitor.update(free)[1], free.covariance, lever_m)
+        jaw = _jaw_outlook(tracker.update(free)[1], free.covariance, lever_m)
     edges, corners = len(given.prediction.layout.edges), given.corners.usable
     return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw)
 

@@ -65,6 +65,11 @@ class ReferenceBook:
         return self._references[-1]
 
     @property
+    def in_force(self) -> ReferenceRecord:
+        """The reference in force, or the earlier one that it restores."""
+        return self._original(self.current)
+
+    @property
     def configured(self) -> ReferenceRecord:
         """The reference that the configuration gave."""
         return self._references[0]
@@ -136,7 +141,7 @@ class ReferenceBook:
         """Back to an earlier reference; without an id to the one before, and with every further undo to the one before
         that.  Raises :class:`CommandRefused`.
         """
-        in_force = self._original(self.current)
+        in_force = self.in_force
         if reference_id:
             earlier = self._find(reference_id)
             if earlier is None:
@@ -156,7 +161,7 @@ class ReferenceBook:
         return self._restore(self.configured, RESET, stamp_ns)
 
     def _restore(self, earlier: ReferenceRecord, origin: str, stamp_ns: int) -> ReferenceRecord:
-        if self._original(self.current).reference_id == earlier.reference_id:
+        if self.in_force.reference_id == earlier.reference_id:
             raise CommandRefused(f"{earlier.reference_id} is in force already, as revision {self.current.revision}")
         return self._append(
             self._next(

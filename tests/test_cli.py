@@ -380,6 +380,6 @@ def test_the_comparison_counts_by_hand():
     bump, occlusion = result.events
     assert (bump.event, bump.frames, occlusion.event, occlusion.frames) == ("bump", 3, "occlusion", 2)
     assert bump.noticed_after_s == pytest.approx(0.1)
-    assert bump.alerts == ("recalibrated (unknown)", "jump (camera_mount_moved)"), "in order; the first is no alarm"
+    assert bump.alerts == ("recalibrated (unknown)", "step (camera_mount_moved)"), "in order; the first is no alarm"
     assert occlusion.noticed_after_s is None and occlusion.alerts == ()
     assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]

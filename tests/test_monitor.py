@@ -177,7 +177,7 @@ def test_the_reference_in_force_is_the_one_that_records_name():
 
 def test_without_recalibration_the_old_reference_stays():
     frames, truths = frames_of("bump")
-    settings = MonitorSettings(policy=PolicySettings(recalibrate=False))
+    settings = MonitorSettings(recalibration=RecalibrationSettings(mode="off"))
     seen = watch(frames, truths, new_monitor(settings))
     assert {r.revision for r in seen.records} == {1}
     assert seen.records[-1].state is State.DRIFTING

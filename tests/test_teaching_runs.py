@@ -15,8 +15,8 @@ from watched import pose_of, reference_of
 
 from gripmon.config import builtin_config, load_config
 from gripmon.corners import MeasurementSettings, TaughtEdges
+from gripmon.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.policy import PolicySettings
 from gripmon.recalibrate import RecalibrationSettings
 from gripmon.records import AlertKind, Frame
 from gripmon.simulator import Simulator, make_scenario
@@ -36,7 +36,7 @@ def test_a_recalibrated_monitor_keeps_what_was_taught():
     simulator = Simulator(CAMERA, bevelled(BEVEL_M), POSE, Scenario(**sections), 1)
     taught = arrays(taught_from(image_of(BEVEL_M)))
     settings = MonitorSettings(
-        policy=PolicySettings(frames_per_s=20.0), recalibration=RecalibrationSettings(sure_sigma_m=2e-4)
+        drift=DriftSettings(frames_per_s=20.0), recalibration=RecalibrationSettings(sure_sigma_m=2e-4)
     )
     monitor = Monitor(CAMERA, box_gripper(), settings, reference_of(POSE), taught)
     errors_m, recalibrated = [], []

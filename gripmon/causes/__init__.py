@@ -1,5 +1,5 @@
 """What moved: competing models compared on the same edges, with probabilities."""
 
-from gripmon.causes.judge import CauseJudge, CauseSettings, Explanation
+from gripmon.causes.judge import CauseJudge, CauseSettings
 
-__all__ = ["CauseJudge", "CauseSettings", "Explanation"]
+__all__ = ["CauseJudge", "CauseSettings"]

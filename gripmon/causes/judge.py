@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
@@ -17,7 +16,7 @@ from gripmon.causes.comparing import Comparison, Key, Report, compare
 from gripmon.causes.pooling import Pooled, pool
 from gripmon.causes.words import sentence
 from gripmon.gripper import Gripper
-from gripmon.records import Array, Cause, CauseWeight, EdgeEvidence
+from gripmon.records import Array, Cause, CauseWeight, EdgeEvidence, Explanation
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""
@@ -42,18 +41,6 @@ class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         float, Meta(gt=0.5, lt=1.0, description="probability from which a cause is named, else it is unknown")
     ] = 0.9
     frames: Annotated[int, Meta(ge=1, le=1000, description="newest frames that the evidence is taken from")] = 12
-
-
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """``causes``: all that were weighed, the most probable first; ``probable`` the one to name, UNKNOWN where none is
-    probable enough, or nothing has moved; ``text`` a sentence, with what this camera can't separate.  No evidence:
-    UNKNOWN alone.
-    """
-
-    causes: tuple[CauseWeight, ...]
-    probable: CauseWeight
-    text: str
 
 
 class CauseJudge:

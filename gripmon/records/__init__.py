@@ -28,6 +28,7 @@ from gripmon.records.frames import (
     unmeasured_record,
 )
 from gripmon.records.messages import AlertRecord, StateRecord
+from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.values import Array, Drift, Image, Smoothed, Transform, to_json
 
@@ -46,14 +47,17 @@ __all__ = [
     "CommandReply",
     "CornerFault",
     "CornerRecord",
+    "Creep",
     "Drift",
     "EdgeEvidence",
     "EdgeSums",
+    "Explanation",
     "Frame",
     "FrameRecord",
     "Image",
     "MeasurementTrace",
     "MonitorState",
+    "Motion",
     "OpenAlert",
     "Origin",
     "ReferenceInputs",
@@ -65,6 +69,7 @@ __all__ = [
     "StateRecord",
     "Transform",
     "Verdict",
+    "Vibration",
     "to_json",
     "unmeasured_record",
 ]

@@ -53,6 +53,7 @@ class Refusal(enum.StrEnum):
     WHITE = "white"
     FLAT = "flat"
     JAW_OPENING = "jaw_opening"
+    FROZEN = "frozen"
 
 
 class CornerFault(enum.StrEnum):

@@ -48,7 +48,8 @@ class MonitorState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     ``references`` from the configured one to the one in force, ``proposal`` a new one that waits for an operator,
     ``alerts`` those that are open, ``alerts_raised`` how many there were: it numbers the next one.  ``cam_T_grip`` is
-    the last transform that was measured, None if none was.
+    the last transform that was measured, None if none was; ``reference_error`` (6) what of a
+    shift against the configured reference was there from the start, None if that isn't known.
     """
 
     references: tuple[ReferenceRecord, ...]
@@ -56,3 +57,4 @@ class MonitorState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     alerts: tuple[OpenAlert, ...] = ()
     alerts_raised: int = 0
     cam_T_grip: Transform | None = None
+    reference_error: tuple[float, ...] | None = None

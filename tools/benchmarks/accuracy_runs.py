@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from benchmarks.peers import LOST_M, PEERS, timed
 from benchmarks.scenes import Sequence, Shot
+from gripmon.drift import DriftSettings
 from gripmon.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.policy import PolicySettings
 from gripmon.records import Array, FrameRecord, Origin, ReferenceRecord, Verdict
 
 WAYS = ("edges", "corners")
@@ -93,7 +93,7 @@ class OurRun:
 def monitor_for(sequence: Sequence, way: str) -> Monitor:
     """A monitor as a user would set it up for the sequence's camera, gripper and calibration."""
     known = {} if sequence.jaw_sigma_m is None else {"jaw_sigma_m": sequence.jaw_sigma_m}
-    settings = MonitorSettings(measurement=way, policy=PolicySettings(frames_per_s=sequence.fps), **known)  # type: ignore[arg-type]
+    settings = MonitorSettings(measurement=way, drift=DriftSettings(frames_per_s=sequence.fps), **known)  # type: ignore[arg-type]
     covariance = tuple(sequence.start_covariance.ravel().tolist())
     reference = ReferenceRecord("start", 0, 0, "configuration", to_record(sequence.start_cam_T_grip), covariance)
     return Monitor(sequence.camera, sequence.gripper, settings, reference, sequence.taught)

@@ -9,9 +9,10 @@ import numpy as np
 from benchmarks.causes_trials import START_SIGMA, Trial
 from gripmon.camera import make_camera
 from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.drift import DriftSettings
 from gripmon.geometry import to_record
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.policy import PolicySettings
+from gripmon.recalibrate import RecalibrationSettings
 from gripmon.records import Array, Cause, Frame, FrameRecord, ReferenceRecord
 from gripmon.stream import StreamWatch
 
@@ -39,7 +40,9 @@ def run(trial: Trial) -> Told:
         "start", 1, 0, "configuration", to_record(rig.start_cam_T_grip), tuple(np.diag(START_SIGMA**2).ravel().tolist())
     )
     settings = MonitorSettings(
-        jaw_sigma_m=rig.jaw_sigma_m, policy=PolicySettings(frames_per_s=rig.scenario.fps, recalibrate=False)
+        jaw_sigma_m=rig.jaw_sigma_m,
+        drift=DriftSettings(frames_per_s=rig.scenario.fps),
+        recalibration=RecalibrationSettings(mode="off"),
     )
     monitor = Monitor(camera, rig.gripper, settings, reference)
     judge = CauseJudge(
@@ -66,9 +69,7 @@ def _judge(monitor: Monitor, judge: CauseJudge, ref_cam_T_grip: Array, frame: Fr
     measurement = monitor._newest
     if measurement is None or (well and not (measurement.trusted and judge.wants_baseline)):
         return
-    assert frame.image is not None
-    reported = frame.jaw_opening_m is not None
-    evidence = monitor._meter.evidence(frame.image, measurement, ref_cam_T_grip, jaw_reported=reported)
+    evidence = monitor._tracker.evidence(frame, measurement, ref_cam_T_grip)
     (judge.well if well else judge.add)(evidence)
 
 

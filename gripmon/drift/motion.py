@@ -1,0 +1,120 @@
+"""One stream: is the camera where the reference has it, since when not, and how does it move?"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gripmon.drift.history import History
+from gripmon.drift.sequential import SequentialTest
+from gripmon.drift.settings import DriftSettings
+from gripmon.drift.vibration import VibrationWatch
+from gripmon.records import AlertKind, Array, Creep, Motion
+
+LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
+"""Frames at most, and since the last step, whose mean tells whether the camera is back, and of which the present shift
+is the mean.
+"""
+
+RETURNED = 12.6
+"""Squared normalised shift below which the camera counts as back: one in twenty unmoved ones exceeds it (chi-square,
+6 degrees of freedom), so that between this and the test's threshold an alert stays.
+"""
+
+SUSPICIOUS = 0.4
+"""Part of the threshold from which the evidence is looked at more closely, before it is decided."""
+
+STEP_S = 0.5
+"""A change of the mean that took no longer is a step."""
+
+
+class MotionWatch:
+    """The sequential test, and what follows from it for one camera."""
+
+    def __init__(self, settings: DriftSettings):
+        self.test = SequentialTest(settings)
+        self._tolerated = np.array([settings.tolerated_m] * 3 + [settings.tolerated_rad] * 3)
+        self._vibration = VibrationWatch(settings.vibration_m)
+        self._history = History()
+        self._frames_per_s = settings.frames_per_s
+        self._kind = AlertKind.DRIFT
+        self._present = False
+        self._creep: Creep | None = None
+
+    def reset(self, reference_covariance: Array) -> None:
+        """There is a new reference, with the covariance (6, 6) of its error: drift is reckoned from zero."""
+        self.test.restart(np.array([True]))
+        self.test.set_reference_covariance(reference_covariance)
+        self._history.clear()
+        self._vibration.forget()
+        self._present, self._kind, self._creep = False, AlertKind.DRIFT, None
+
+    def resume(self, moved: bool) -> None:
+        """After a restart: whether the camera was not where the reference has it."""
+        self._present = moved
+
+    def set_frames_per_s(self, frames_per_s: float) -> None:
+        """The stream's own rate."""
+        self._frames_per_s = frames_per_s
+        self.test.set_frames_per_s(frames_per_s)
+
+    def add(self, shift: Array | None, covariance: Array, now_s: float) -> Motion:
+        """One frame's shift (6,) against the reference, with its covariance (6, 6), at the frames' time.
+
+        None for a shift while the reference's error isn't known yet.
+        """
+        if shift is None:
+            return Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
+        test = self.test
+        finding = test.add(shift[None], covariance[None])
+        moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
+        length = int(finding.length[0])
+        at_once = stepped and length <= STEP_S * self._frames_per_s
+        if stepped:
+            test.restart(np.array([True]), length)
+        if at_once:
+            self._vibration.forget()
+        vibration = self._vibration.add(shift, now_s, test.usual_covariance())
+        frames = max(int(test.windows.frames[0]), 1)
+        level, level_covariance = self._level(min(frames, LEVEL_FRAMES))
+        before = self._present
+        self._present = moved or (before and self._away(level, level_covariance))
+        complete = self._history.add(shift, now_s)
+        begun = moved and not before
+        if begun or at_once:
+            self._kind, self._creep = (AlertKind.STEP if at_once else AlertKind.DRIFT), None
+        if self._present and (complete or begun) and not at_once:
+            self._look_back(level, level_covariance)
+        frames = min(frames, NEWEST_FRAMES)
+        newest, newest_covariance = self._level(frames)
+        return Motion(
+            present=self._present,
+            kind=self._kind,
+            shift=newest,
+            sigma=np.sqrt(newest_covariance.diagonal()),
+            frames=frames,
+            begun=begun,
+            stepped=at_once,
+            step_frames=length if at_once else 0,
+            creep=self._creep,
+            vibration=vibration,
+            suspicious=bool(finding.excess[0] > SUSPICIOUS),
+        )
+
+    def _level(self, frames: int) -> tuple[Array, Array]:
+        mean, covariance = self.test.level(frames)
+        return mean[0], covariance[0]
+
+    def _away(self, level: Array, covariance: Array) -> bool:
+        beyond = np.sign(level) * np.maximum(np.abs(level) - self._tolerated, 0.0)
+        return bool(beyond @ np.linalg.solve(covariance, beyond) > RETURNED)
+
+    def _look_back(self, level: Array, covariance: Array) -> None:
+        """Step or creep, by the last minutes."""
+        towards = np.linalg.solve(covariance, level)
+        length = float(np.sqrt(np.maximum(level @ towards, 1e-300)))
+        towards = towards / length
+        self._creep = self._history.creep(towards)
+        if self._creep is not None:
+            self._kind = AlertKind.CREEP
+        elif self._kind is not AlertKind.STEP:
+            self._kind = AlertKind.STEP if self._history.is_step(towards) else AlertKind.DRIFT

@@ -1,0 +1,194 @@
+"""The sequential test: a generalised likelihood ratio over windows of 2 to 4096 frames.
+
+For every window length two hypotheses are tested against an unmoved camera: its mean lies off the reference (which
+finds creeps, and any shift in the end), and it differs from the mean of the window before (which finds steps soon, for
+errors that last cancel in the difference).  Unknown shifts are estimated, so that each statistic is Hotelling's T² with
+the covariances that the stream itself has shown.  Lai 1995 gives the scheme for independent frames; that frames err
+together enters through the covariances alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from gripmon.drift.scatter import Scatter
+from gripmon.drift.settings import DriftSettings
+from gripmon.drift.windows import LENGTHS, Windows
+from gripmon.records import Array
+
+REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
+"""Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""
+
+FREEDOM, FREEDOM_GROWTH = 6.0, 1.0 / 3.0
+"""Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
+number of frames with which those of a mean grow: the mean of many is more nearly normal.
+"""
+
+PRIOR_FREEDOM = 20.0
+"""Degrees of freedom that what frames claim adds to what the stream has shown."""
+
+SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
+"""Differences over the last frames, or windows, that are larger than learnt, up to so many times, raise thresholds."""
+
+REPORTED_MEMORY = 1.0 / 64.0
+
+_COUNT = np.array(LENGTHS, dtype=float)[:, None]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What the test says after a frame, for each stream (s,): whether the camera has ``moved``; if so ``length``, the
+    frames of the window that showed it, and whether it was a difference (``stepped``) or its mean; ``excess`` of the
+    largest statistic over its threshold (1 at the threshold).
+    """
+
+    moved: np.ndarray
+    length: np.ndarray
+    stepped: np.ndarray
+    excess: Array
+
+
+class SequentialTest:
+    """Tests ``streams`` series of shifts against a reference."""
+
+    def __init__(self, settings: DriftSettings, streams: int = 1):
+        self._settings = settings
+        self._streams = streams
+        self.windows = Windows(streams)
+        self.scatter = Scatter(streams)
+        self._tolerated = np.array([settings.tolerated_m] * 3 + [settings.tolerated_rad] * 3)
+        self._frames_per_s = settings.frames_per_s
+        self._last_two = np.zeros((2, streams, 6))
+        self._sure = np.zeros((streams, 6))
+        self._seen = np.zeros(streams, dtype=np.intp)
+        self._reported = np.zeros((streams, 6, 6))
+        self._reference: Array = np.zeros((streams, 6, 6))
+        self._frames = 0
+        self._surge = np.ones((len(LENGTHS), streams))
+        self._stale = True
+        self._threshold: Array | None = None
+
+    def set_frames_per_s(self, frames_per_s: float) -> None:
+        """The stream's own rate: the contract is in days, the thresholds are in frames."""
+        if abs(frames_per_s - self._frames_per_s) > 0.05 * self._frames_per_s:
+            self._frames_per_s, self._threshold = frames_per_s, None
+
+    def set_reference_covariance(self, covariance: Array) -> None:
+        """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is no drift."""
+        self._reference = np.broadcast_to(covariance, (self._streams, 6, 6)).copy()
+        self._stale = True
+
+    def add(self, shift: Array, covariance: Array, learn: np.ndarray | None = None) -> Finding:
+        """One frame's shift (s, 6) against the reference, m and rad, with its reported covariance (s, 6, 6).
+
+        ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.
+        """
+        usual = self._report(covariance)
+        self.windows.add(self._without_wild_ones(self._as_far_as_sure(shift, usual)))
+        if self._stale or self._frames % REFRESH_FRAMES == 0:
+            self._refresh()
+        self._frames += 1
+        mean, before = self.windows.means()
+        difference = mean - before
+        mean_full, both_full = self.windows.full()
+        square = np.stack(
+            [_square(self._whitening[0], self._beyond_tolerance(mean)), _square(self._whitening[1], difference)]
+        )
+        full = np.stack([mean_full, both_full])
+        beyond = np.where(full, square / (self._threshold * np.maximum(self._surge, 1.0)), 0.0)  # (2, k, s)
+        excess = beyond.max(axis=(0, 1))
+        moved = excess > 1.0
+        if self._frames % LEARNING_FRAMES == 0:
+            # An offset that stays says nothing against what differences show.
+            usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
+            if learn is not None:
+                usable &= learn
+            self.scatter.learn(difference, square[1], usable, LEARNING_FRAMES)
+            self._learn_surge(square[1], usable)
+        # The shortest window that is beyond its threshold dates the motion best.
+        index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
+        stepped = beyond[1, index, np.arange(self._streams)] > 1.0
+        return Finding(moved, np.array(LENGTHS)[index], stepped, excess)
+
+    def level(self, frames: int) -> tuple[Array, Array]:
+        """Mean shift (s, 6) over the last ``frames`` frames, and its covariance (s, 6, 6) (that of the next shorter
+        window of :data:`LENGTHS`).
+        """
+        index = int(np.searchsorted(LENGTHS, frames, side="right")) - 1
+        return self.windows.mean_of_last(frames), self._mean_covariance[index]
+
+    def usual_covariance(self) -> Array:
+        """(6, 6) of the first stream's shifts about their mean, by what was learnt and what frames claim."""
+        return np.asarray(self.scatter.of_single_frames()[0] + self._reported[0])
+
+    def restart(self, streams: np.ndarray, keep: np.ndarray | int = 0) -> None:
+        """Forget the frames of some streams (s,) but the last ``keep``; what was learnt about the noise stays."""
+        self.windows.keep(streams, keep)
+        self._seen = np.where(streams, np.minimum(self._seen, keep), self._seen)
+
+    def _as_far_as_sure(self, shift: Array, usual: Array) -> Array:
+        """A frame that claims more error than usual (s,) moves the series by that much less."""
+        fresh = self._seen == 0
+        self._sure = np.where(fresh[:, None], shift, self._sure + usual[:, None] * (shift - self._sure))
+        return self._sure
+
+    def _report(self, covariance: Array) -> Array:
+        """Follow the reported covariances; the usual variances over this frame's, 1 at most, on average (s,)."""
+        first = self._seen == 0
+        gain = np.where(first & ~self.scatter._begun, 1.0, REPORTED_MEMORY)
+        self._reported += gain[:, None, None] * (covariance - self._reported)
+        self.scatter.begin(self._reported)
+        variances = np.einsum("sii->si", covariance) / np.einsum("sii->si", self._reported)
+        return 1.0 / np.maximum(variances.mean(axis=1), 1.0)
+
+    def _without_wild_ones(self, shift: Array) -> Array:
+        """Median of three frames: no single frame can decide, and a step is late by one."""
+        one, two = self._last_two
+        fresh = (self._seen == 0)[:, None]
+        one[:] = np.where(fresh, shift, one)
+        two[:] = np.where(fresh, shift, two)
+        middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), shift))
+        self._last_two[0], self._last_two[1] = two.copy(), shift
+        self._seen += 1
+        return middle
+
+    def _beyond_tolerance(self, mean: Array) -> Array:
+        return np.sign(mean) * np.maximum(np.abs(mean) - self._tolerated, 0.0)
+
+    def _learn_surge(self, square: Array, usable: np.ndarray) -> None:
+        """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
+        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * _COUNT), 0.0)
+        self._surge += rate * (np.minimum(square / 6.0, SURGE_MOST) - self._surge)
+
+    def _refresh(self) -> None:
+        self._stale = False
+        of_mean, of_difference = self.scatter.covariances(self._reported)
+        self._mean_covariance = of_mean + self._reference
+        self._whitening = _whitening(np.stack([self._mean_covariance, of_difference]))
+        # Slow to compute, slow to change.
+        if self._threshold is None or self._frames % (16 * REFRESH_FRAMES) == 0:
+            self._threshold = self._thresholds(self.scatter.windows)
+
+    def _thresholds(self, windows: Array) -> Array:
+        """(k, s) what T² exceeds by chance so rarely that all lengths together keep the contract.
+
+        T² / 6 of a covariance from m samples is distributed as F(6, m - 5), nearly (Hotelling), and so is that of
+        errors with Student's distribution, with its degrees of freedom: both count.
+        """
+        a_day = 86_400.0 * self._frames_per_s
+        chance = self._settings.false_alarms_per_day / (a_day * 2 * len(LENGTHS))
+        freedom = 1.0 / (1.0 / (windows + PRIOR_FREEDOM) + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
+        return np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0)
+
+
+def _square(whitening: Array, values: Array) -> Array:
+    white = (whitening @ values[..., None])[..., 0]
+    return np.asarray((white * white).sum(axis=-1))
+
+
+def _whitening(covariance: Array) -> Array:
+    """(..., 6, 6) W with W C Wᵀ = 1."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))

@@ -1,0 +1,31 @@
+"""What counts as a drift, and how often an unmoved camera may be said to have moved."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+
+class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The sequential test's contract."""
+
+    false_alarms_per_day: Annotated[
+        float, Meta(gt=0.0, le=1000.0, description="drift alarms a day that an unmoved camera may give (1/day)")
+    ] = 1.0
+    frames_per_s: Annotated[
+        float,
+        Meta(gt=0.0, le=2000.0, description="frame rate until the stream's own has been measured (1/s)"),
+    ] = 60.0
+    tolerated_m: Annotated[
+        float,
+        Meta(ge=0.0, le=0.1, description="shift of the TCP along a camera axis that is never worth an alarm (m)"),
+    ] = 5e-6
+    tolerated_rad: Annotated[
+        float, Meta(ge=0.0, le=1.0, description="turn about a camera axis that is never worth an alarm (rad)")
+    ] = 1e-4
+    vibration_m: Annotated[
+        float,
+        Meta(gt=0.0, le=0.1, description="vibration of the TCP, root mean square, from which there is an alert (m)"),
+    ] = 2e-5

@@ -1,0 +1,85 @@
+"""Does the camera vibrate?  Differences between frames grow in one direction, while their mean stays."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from gripmon.records import Array, Vibration
+
+KEPT_FRAMES = 128
+"""Frames that are looked at: two seconds at 60 frames/s."""
+
+LOOK_FRAMES = 32
+"""Looked at once in so many frames."""
+
+TIMES = 6.0
+"""Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
+
+
+class VibrationWatch:
+    """Looks at the last :data:`KEPT_FRAMES` shifts of the TCP."""
+
+    def __init__(self, smallest_m: float):
+        """``smallest_m``: root mean square from which a vibration is worth telling."""
+        self._smallest_m = smallest_m
+        self._shifts: deque[Array] = deque(maxlen=KEPT_FRAMES)
+        self._times_s: deque[float] = deque(maxlen=KEPT_FRAMES)
+        self._since_look = 0
+        self._found: Vibration | None = None
+
+    def forget(self) -> None:
+        """The camera has moved: the step is no vibration."""
+        self._shifts.clear()
+        self._times_s.clear()
+        self._found = None
+
+    def add(self, shift: Array, now_s: float, usual: Array) -> Vibration | None:
+        """One frame's shift (6,); ``usual`` (6, 6): covariance of an unmoved camera's shifts about their mean.
+
+        What is going on; None for no vibration.
+        """
+        self._shifts.append(shift)
+        self._times_s.append(now_s)
+        self._since_look += 1
+        if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
+            self._since_look = 0
+            self._found = self._look(usual[:3, :3])
+        return self._found
+
+    def _look(self, usual: Array) -> Vibration | None:
+        shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
+        line = np.column_stack([np.ones(KEPT_FRAMES), times_s - times_s.mean()])
+        shifts = shifts - line @ np.linalg.lstsq(line, shifts, rcond=None)[0]  # a creep is no vibration
+        # The loudest direction; half of the windows must show it, so that one step in them does not.
+        parts = [part.T @ part / len(part) for part in np.split(shifts, 4)]
+        direction = _loudest(np.mean(parts, axis=0), usual)
+        loud = [float(direction @ part @ direction) for part in parts]
+        expected = float(direction @ usual @ direction)
+        excess = float(np.median(loud)) - expected
+        if excess < (TIMES - 1.0) * expected or excess < self._smallest_m**2:
+            return None
+        return Vibration(math.sqrt(excess), _frequency_hz(shifts @ direction, times_s))
+
+
+def _loudest(covariance: Array, usual: Array) -> Array:
+    """The direction (3,) of length one in which a covariance exceeds the usual one the most."""
+    root = np.linalg.cholesky(usual)
+    inverse = np.linalg.inv(root)
+    _, directions = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    direction = inverse.T @ directions[:, -1]
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def _frequency_hz(values: Array, times_s: Array) -> float:
+    """Of the largest line in the spectrum, between lines by a parabola through its neighbours."""
+    interval_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+    if interval_s <= 0.0:
+        return 0.0
+    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values))))
+    top = int(power[1:-1].argmax()) + 1
+    below, at, above = power[top - 1 : top + 2]
+    bend = below - 2.0 * at + above
+    return float((top + (0.5 * (below - above) / bend if bend else 0.0)) / (len(values) * interval_s))

@@ -1,0 +1,7 @@
+"""The per-frame method."""
+
+from gripmon.monitor.core import Monitor
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import CORNER_COUNTS, Tracker
+
+__all__ = ["CORNER_COUNTS", "Monitor", "MonitorSettings", "Tracker"]

@@ -1,0 +1,355 @@
+"""The per-frame method: predict, measure, update, judge, and past the limit recalibrate.
+
+A pure function of the frames so far: no clock, no I/O, no threads.  Time is the frames' own.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+
+from gripmon.camera import Camera
+from gripmon.causes import CauseJudge
+from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
+from gripmon.drift import Baseline, MotionWatch
+from gripmon.geometry import from_record, perturbation_between, to_record
+from gripmon.gripper import Gripper
+from gripmon.inspection import inspect
+from gripmon.monitor.answers import corner_records, drift_between, flat, smoothed_record, unmeasured_corners
+from gripmon.monitor.asking import Inquiry
+from gripmon.monitor.renewal import Renewal
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.policy import Evidence, Judgement, Policy
+from gripmon.recalibrate import Proposal
+from gripmon.recalibrate import Refusal as Refused
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    Command,
+    CommandName,
+    CommandReply,
+    CornerFault,
+    Drift,
+    Explanation,
+    Frame,
+    FrameRecord,
+    MeasurementTrace,
+    MonitorState,
+    Origin,
+    ReferenceRecord,
+    Refusal,
+    Severity,
+    State,
+    Verdict,
+    unmeasured_record,
+)
+from gripmon.references import CommandRefused
+from gripmon.smoothing import PoseAverage
+from gripmon.stream import StreamFault, StreamWatch
+
+FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
+"""Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
+
+JAW_SURPRISE = 5.0
+"""Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
+
+
+class Monitor:
+    """Watches one camera on one gripper, starting from a reference calibration."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+        taught: TaughtEdges | None = None,
+        state: MonitorState | None = None,
+    ):
+        """``state``, where given, is what :meth:`state` said before a restart: its newest reference counts then.
+
+        Raises ValueError for a state that doesn't hold together.
+        """
+        self._camera, self._gripper, self._settings = camera, gripper, settings
+        # What was taught belongs to the gripper's edges: a new reference doesn't change it.
+        self._tracker = Tracker(camera, gripper, settings, taught)
+        self._policy = Policy(settings.policy, settings.recalibration.mode != "off")
+        self._watch = MotionWatch(settings.drift)
+        self._stream = StreamWatch(settings.stream)
+        judge = CauseJudge(
+            camera, gripper, settings.causes, np.zeros(6), settings.jaw_sigma_m, settings.jaw_offset_sigma_m
+        )
+        self._inquiry = Inquiry(judge)
+        self._average = PoseAverage(settings.smoothing)
+        self._due: list[Alert] = []  # of commands, for the next record
+        self._covariance: Array | None = None
+        self._now_s = 0.0  # time that has passed since the first frame
+        self._measured_s: float | None = None
+        self._stamp_s: float | None = None
+        self._newest: Measurement | None = None
+        self._restarted = state is not None  # and not yet said whether the picture fits
+        self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state)
+        error = None if state is None or state.reference_error is None else np.array(state.reference_error)
+        sigma = np.sqrt(np.reshape(self._renewal.book.configured.covariance, (6, 6)).diagonal())
+        self._configured_baseline = Baseline(sigma, settings.policy.settle_frames, error)
+        self._begin()
+        last = None if state is None else state.cam_T_grip
+        self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
+        if state is not None:
+            self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
+            self._watch.resume(moved=self._policy.drifting)
+
+    @property
+    def reference(self) -> ReferenceRecord:
+        """The calibration that drift is measured against now."""
+        return self._renewal.book.current
+
+    @property
+    def proposal(self) -> ReferenceRecord | None:
+        """A new reference that waits for an operator."""
+        return self._renewal.book.proposal
+
+    @property
+    def recalibration(self) -> Proposal | Refused | None:
+        """What came of the newest attempt at a new reference; None before the first one."""
+        return self._renewal.outcome
+
+    @property
+    def state_revision(self) -> int:
+        """Grows with each change of what :meth:`state` gives, the last transform aside."""
+        return (
+            self._renewal.book.changes + self._policy.alerts.changes + int(self._configured_baseline.error is not None)
+        )
+
+    def state(self) -> MonitorState:
+        """What has to survive a restart."""
+        error = self._configured_baseline.error
+        return MonitorState(
+            self._renewal.book.history,
+            self._renewal.book.proposal,
+            alerts=self._policy.alerts.open,
+            alerts_raised=self._policy.alerts.raised,
+            cam_T_grip=None if self._covariance is None else to_record(self._cam_T_grip),
+            reference_error=None if error is None else tuple(error.tolist()),
+        )
+
+    def process(self, frame: Frame) -> FrameRecord:
+        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
+        self._tick(frame)
+        faults = self._look_at_stream(frame)
+        refusal = inspect(frame, self._camera, self._gripper) or _frozen(faults)
+        if refusal is not None:
+            self._newest = None
+            return self._unmeasured(frame, f"{refusal[0]}: {refusal[1]}", CornerFault.FRAME_REFUSED, refusal=refusal[0])
+        measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip)
+        if not measurement.trusted:
+            explanation = self._explain(frame, measurement, wrong=True)
+            return self._unmeasured(
+                frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation=explanation
+            )
+        before_T = self._cam_T_grip
+        measurement = self._newest = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
+        self._cam_T_grip, self._covariance = self._tracker.update(measurement)
+        self._measured_s = self._now_s
+        evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
+        if evidence.motion.stepped or evidence.jumped:
+            self._average.forget()
+        self._average.add(self._cam_T_grip, self._covariance)
+        judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
+        origin, alerts = Origin.UPDATE, judgement.alerts
+        if self._restarted and judgement.state is not State.ACQUIRING:
+            self._restarted = False
+            alerts = (self._after_restart(evidence), *alerts)
+        if judgement.state is not State.RECALIBRATING or self._policy.still_frames <= 1:
+            self._renewal.moved()
+        if judgement.state is State.RECALIBRATING:
+            self._renewal.still(frame, measurement, self._cam_T_grip, self._covariance)
+        if judgement.recalibrate:
+            before = self.reference
+            alerts += self._renewal.recalibrate(self._drift(), evidence.explanation, self._now_s, frame.stamp_ns)
+            if self.reference is not before:
+                origin = Origin.RECALIBRATION
+                self._begin()
+        return self._record(frame, judgement, origin, alerts, measurement)
+
+    def trace(self) -> MeasurementTrace | None:
+        """The pixels behind the newest record; None if its frame was refused."""
+        if self._newest is None:
+            return None
+        return trace_of(self._newest, self._camera, self._gripper)
+
+    def _tick(self, frame: Frame) -> None:
+        """Time passes to the frame's stamp; a clock that was set back stops it for this one frame only."""
+        stamp_s = 1e-9 * frame.stamp_ns
+        elapsed_s = max(stamp_s - self._stamp_s, 0.0) if self._stamp_s is not None else 0.0
+        self._stamp_s = stamp_s
+        self._now_s += elapsed_s
+        self._average.wander(elapsed_s)
+
+    def _look_at_stream(self, frame: Frame) -> tuple[StreamFault, ...]:
+        """What is wrong with the stream, told of in the next record; its rate, for the drift test."""
+        faults = self._stream.add(frame)
+        told = tuple((fault.kind, fault.cause, fault.text) for fault in faults)
+        self._due += self._policy.stream(told, self._now_s, frame.stamp_ns)
+        if self._stream.frames_per_s is not None:
+            self._watch.set_frames_per_s(self._stream.frames_per_s)
+        return faults
+
+    def _evidence(self, frame: Frame, measurement: Measurement, before_T: Array, doubtful: bool) -> Evidence:
+        assert self._covariance is not None
+        drift = self._drift()
+        # Motion that the profiles can follow from frame to frame is no jump.
+        looked_far = measurement.effort is not Effort.NARROW
+        reach_px = self._settings.corners.sampling.reach_px
+        jumped = looked_far and self._tracker.moved_px(measurement, before_T) > reach_px
+        shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
+        since_start = self._baseline.subtract(shift)
+        motion = self._watch.add(since_start, self._covariance, self._now_s)
+        sigma = np.sqrt(self._covariance.diagonal())
+        astray = self._gripper_astray(measurement)
+        explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious)
+        d_m, delta_rad = drift.translation_m, drift.rotation_rad
+        return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)
+
+    def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
+        return self._inquiry.ask(
+            wrong, lambda: self._tracker.evidence(frame, measurement, self._ref_cam_T_grip), self._ref_cam_T_grip
+        )
+
+    def _gripper_astray(self, measurement: Measurement) -> bool:
+        """Whether the gripper contradicts its model: one finger is where the transform says and another, though
+        sampled, is not (hidden, or bent), or the seen jaw opening is not the reported one.
+        """
+        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+            return True
+        shares = agreeing_fingers(measurement, self._gripper)
+        return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
+
+    def _drift(self) -> Drift:
+        return drift_between(self._ref_cam_T_grip, self._cam_T_grip)
+
+    def command(self, command: Command, stamp_ns: int) -> CommandReply:
+        """Do what an operator asks, between two frames; what can't be done is refused and changes nothing."""
+        before, done = self.reference, True
+        try:
+            text, alerts = self._obey(command, stamp_ns)
+            self._due += alerts
+        except CommandRefused as refusal:
+            done, text = False, str(refusal)
+        if self.reference is not before:
+            self._begin()
+        state = self.state() if command.name is CommandName.STATE else None
+        return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
+
+    def _obey(self, command: Command, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
+        name, reference = command.name, self.reference
+        if name is CommandName.STATE:
+            return f"{self._policy.state}, {reference.reference_id} in force, revision {reference.revision}", ()
+        if name is CommandName.ACKNOWLEDGE:
+            seen = self._policy.alerts.acknowledge(command.argument)
+            if not seen:
+                which = f"no open alert {command.argument}" if command.argument else "no open alert"
+                raise CommandRefused(f"{which} that isn't acknowledged")
+            return "acknowledged: " + ", ".join(alert.alert_id for alert in seen), seen
+        if name is not CommandName.RECALIBRATE:
+            return self._renewal.obey(command, self._now_s, stamp_ns)
+        if self._newest is None or not self._newest.trusted:
+            raise CommandRefused("nothing was measured in the newest frame")
+        alerts = self._renewal.recalibrate(self._drift(), Explanation(), self._now_s, stamp_ns, asked=True)
+        if self.reference is reference:
+            raise CommandRefused(alerts[-1].text if alerts else "not calibrated anew now")
+        return f"calibrated anew: {self.reference.reference_id}, revision {self.reference.revision}", alerts
+
+    def _begin(self) -> None:
+        """Drift is reckoned from the reference in force."""
+        book = self._renewal.book
+        covariance = np.reshape(self.reference.covariance, (6, 6))
+        self._ref_cam_T_grip = self._renewal.ref_cam_T_grip
+        if book.in_force == book.configured:
+            # What the first frames show of a configured reference's error is no longer uncertain.
+            self._baseline, covariance = self._configured_baseline, np.zeros((6, 6))
+        else:
+            self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
+        self._watch.reset(covariance)
+        self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
+
+    def _after_restart(self, evidence: Evidence) -> Alert:
+        """Whether the picture fits the reference from which the monitor went on."""
+        fits = not evidence.motion.present
+        text = f"restarted from {self.reference.reference_id}, revision {self.reference.revision}; the picture " + (
+            "fits it" if fits else "does not fit it: the camera has moved"
+        )
+        text += f" ({1e3 * evidence.d_m:.2f} mm, {np.degrees(evidence.delta_rad):.2f} degrees)"
+        return Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.INFO if fits else Severity.WARNING, text)
+
+    def _unmeasured(
+        self,
+        frame: Frame,
+        reason: str,
+        fault: CornerFault,
+        refusal: Refusal | None = None,
+        explanation: Explanation | None = None,
+    ) -> FrameRecord:
+        """The last transform held with a covariance that grows, or none when it is too old."""
+        judgement = self._policy.unmeasured(self._now_s, frame.stamp_ns, refusal, self._measured_s, explanation)
+        self._renewal.moved()
+        blank = unmeasured_record(
+            frame,
+            self.reference,
+            reason,
+            verdict=judgement.verdict,
+            state=judgement.state,
+            corners=unmeasured_corners(self._gripper.corner_ids, fault),
+            alerts=(*self._noted(), *judgement.alerts),
+        )
+        if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
+            return blank
+        growth = np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
+        return msgspec.structs.replace(
+            blank,
+            cam_T_grip=to_record(self._cam_T_grip),
+            covariance=flat(self._covariance + growth),
+            smoothed=smoothed_record(self._average, self._tracker.floor + growth),
+            drift=self._drift(),
+        )
+
+    def _record(
+        self,
+        frame: Frame,
+        judgement: Judgement,
+        origin: Origin,
+        alerts: tuple[Alert, ...],
+        measurement: Measurement,
+    ) -> FrameRecord:
+        assert self._covariance is not None
+        taken = self._tracker.taken(measurement, self._settings.update_corners)
+        return FrameRecord(
+            seq=frame.seq,
+            stamp_ns=frame.stamp_ns,
+            verdict=judgement.verdict,
+            state=judgement.state,
+            source=origin,
+            cam_T_grip=to_record(self._cam_T_grip),
+            covariance=flat(self._covariance),
+            smoothed=smoothed_record(self._average, self._tracker.floor),
+            drift=self._drift(),
+            reference_id=self.reference.reference_id,
+            revision=self.reference.revision,
+            rms_px=measurement.corner_rms_px(self._cam_T_grip),
+            jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
+            corners=corner_records(measurement, self._gripper.corner_ids, taken),
+            alerts=(*self._noted(), *alerts),
+            name=frame.name,
+        )
+
+    def _noted(self) -> list[Alert]:
+        noted, self._due = self._due, []
+        return noted
+
+
+def _frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
+    """An image that repeats an earlier one shows what was, not what is."""
+    return next(((Refusal.FROZEN, fault.text) for fault in faults if fault.kind == "frozen"), None)

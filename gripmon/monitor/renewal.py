@@ -1,0 +1,138 @@
+"""The reference renewed: measured anew past the limit, accepted by an operator, or taken back by one."""
+
+from __future__ import annotations
+
+import math
+
+from gripmon.corners import Measurement, edge_sums
+from gripmon.geometry import from_record
+from gripmon.gripper import Gripper
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import CORNER_COUNTS
+from gripmon.policy import Policy
+from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    Command,
+    CommandName,
+    Drift,
+    Explanation,
+    Frame,
+    MonitorState,
+    ReferenceRecord,
+    Severity,
+)
+from gripmon.references import CommandRefused, ReferenceBook
+
+
+class Renewal:
+    """The references and what changes them.  Who calls it finds out by ``book.current`` whether it has."""
+
+    def __init__(
+        self,
+        settings: MonitorSettings,
+        gripper: Gripper,
+        floor: Array,
+        reference: ReferenceRecord,
+        policy: Policy,
+        state: MonitorState | None,
+    ):
+        """``floor`` (6, 6): covariance of the systematic error.  ValueError for a state that doesn't hold together."""
+        self._gripper, self._policy = gripper, policy
+        self._recalibrator = Recalibrator(
+            settings.recalibration, gripper, floor, CORNER_COUNTS[settings.recalibrate_corners]
+        )
+        self.outcome: Proposal | Refusal | None = None
+        """What came of the newest attempt at a new reference; None before the first one."""
+        self.book = (
+            ReferenceBook(reference) if state is None else ReferenceBook.restored(state.references, state.proposal)
+        )
+
+    def moved(self) -> None:
+        """The camera doesn't stand still, or needs no new reference: begin to collect anew."""
+        self._recalibrator.forget()
+
+    def still(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array) -> None:
+        """One more frame of a camera that stands still."""
+        corners, jaw_opening_m = measurement.corners, measurement.jaw_opening_m
+        self._recalibrator.add(
+            StillFrame(
+                frame.seq,
+                frame.stamp_ns,
+                cam_T_grip,
+                covariance,
+                self._gripper.points_grip_m(jaw_opening_m)[self._gripper.corner_points],
+                corners.usable,
+                corners.xy,
+                corners.joint_covariance_xy(corners.usable),
+                edge_sums(measurement, self._gripper, cam_T_grip, jaw_opening_m),
+            )
+        )
+
+    def recalibrate(
+        self, drift: Drift, explanation: Explanation, now_s: float, stamp_ns: int, *, asked: bool = False
+    ) -> tuple[Alert, ...]:
+        """The frames since the camera came to rest become the reference, or a proposal, or neither: what there is to
+        say of it.  ``asked``: an operator wants it, so that a doubt is told and not waited out.
+        """
+        outcome = self.outcome = self._recalibrator.outcome(self.book.current)
+        if outcome.wait and not asked:
+            return ()
+        if isinstance(outcome, Refusal):
+            self._policy.not_recalibrated()
+            return self._policy.refused(outcome.text, explanation, now_s, stamp_ns)
+        moved = (
+            f"the camera moved by {1e3 * drift.translation_m:.2f} mm and {math.degrees(drift.rotation_rad):.2f} degrees"
+        )
+        cause = explanation.probable.cause
+        draft = self.book.draft(outcome.cam_T_grip, outcome.covariance, stamp_ns, cause=cause, inputs=outcome.inputs)
+        asks = [] if outcome.needs_person is None or asked else [outcome.needs_person]
+        if self.book.chosen_by_operator and not asked:
+            asks.append("an operator chose the reference in force")
+        if asks:
+            if self.book.proposal is not None:
+                return ()
+            self.book.propose(draft)
+            text = f"{moved}; the new reference {draft.reference_id} waits to be accepted: {'; '.join(asks)}"
+            return self._policy.proposed(text, explanation, now_s, stamp_ns)
+        self.book.adopt(draft)
+        text = (
+            f"{moved}; it was calibrated anew from {outcome.inputs.frames} frames, corners "
+            f"{', '.join(outcome.inputs.corners)}: revision {self.book.current.revision}"
+        )
+        done = Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)
+        return (*self._policy.recalibrated(now_s), done)
+
+    def obey(self, command: Command, now_s: float, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
+        """Accept, reject, undo or reset: what was done, in words, and what there is to tell.
+
+        Raises :class:`CommandRefused`; then nothing has changed.
+        """
+        name, argument = command.name, command.argument
+        if name is CommandName.REJECT:
+            rejected = self.book.reject(argument)
+            self.moved()
+            self._policy.not_recalibrated()
+            return f"{rejected.reference_id} is rejected", self._policy.decided("the proposal was rejected", now_s)
+        if name is CommandName.ACCEPT:
+            self.book.accept(argument)
+        elif name is CommandName.UNDO:
+            self.book.undo(stamp_ns, argument)
+        elif name is CommandName.RESET:
+            self.book.reset(stamp_ns)
+        else:
+            raise CommandRefused(f"{name} doesn't concern the reference")
+        current = self.book.current
+        text = f"{current.reference_id} is in force, revision {current.revision}"
+        if current.restores:
+            text += f"; it restores {current.restores}"
+        kind = AlertKind.RESTORED if current.restores else AlertKind.RECALIBRATED
+        return text, (*self._policy.recalibrated(now_s), Alert(kind, Cause.UNKNOWN, Severity.WARNING, text))
+
+    @property
+    def ref_cam_T_grip(self) -> Array:
+        """The transform (4, 4) of the reference in force."""
+        return from_record(self.book.current.cam_T_grip)

@@ -1,0 +1,69 @@
+"""What a person may set about the whole method, a section for each step."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.causes import CauseSettings
+from gripmon.corners import MeasurementSettings
+from gripmon.drift import DriftSettings
+from gripmon.policy import PolicySettings
+from gripmon.recalibrate import RecalibrationSettings
+from gripmon.smoothing import SmoothingSettings
+from gripmon.stream import StreamSettings
+
+
+class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The whole method, a section for each step."""
+
+    measurement: Annotated[
+        Literal["edges", "corners"],
+        Meta(description="what the update rests on: all agreed edge points, or the corners of equation (17)"),
+    ] = "edges"
+    update_corners: Annotated[
+        Literal["all", "3P", "4P", "5P"],
+        Meta(
+            description="with measurement: corners, which ones: all that are usable, or so many of them next to the TCP"
+        ),
+    ] = "all"
+    recalibrate_corners: Annotated[
+        Literal["all", "4P", "5P"],
+        Meta(
+            description="which corners a recalibration takes: all that are usable, or so many of them next to the TCP"
+        ),
+    ] = "all"
+    jaw_sigma_m: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.05,
+            description="standard deviation of the part of the reported jaw opening's error that changes as the jaw "
+            "moves; 0: the report is exact (m)",
+        ),
+    ] = 5e-5
+    jaw_offset_sigma_m: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.05,
+            description="standard deviation of the part that never changes; no effect where the report is exact (m)",
+        ),
+    ] = 2e-4
+    floor_m: Annotated[
+        float,
+        Meta(ge=0.0, le=0.01, description="systematic error of the position that no averaging removes, each axis (m)"),
+    ] = 2e-6
+    floor_rad: Annotated[
+        float,
+        Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)"),
+    ] = 5e-5
+    corners: MeasurementSettings = MeasurementSettings()
+    smoothing: SmoothingSettings = SmoothingSettings()
+    drift: DriftSettings = DriftSettings()
+    policy: PolicySettings = PolicySettings()
+    causes: CauseSettings = CauseSettings()
+    stream: StreamSettings = StreamSettings()
+    recalibration: RecalibrationSettings = RecalibrationSettings()

@@ -1,0 +1,139 @@
+"""From one frame to the corrected transform: measure, take what is known of the jaw into account, update."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.camera import Camera
+from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.differential import DegenerateGeometry, Update, differential_update
+from gripmon.geometry import perturb
+from gripmon.gripper import Gripper
+from gripmon.jaw import JawKnowledge
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.records import Array, EdgeEvidence, Frame
+
+USUAL_SHARE = 0.6
+"""Share of agreeing profiles that is expected before anything is known about this gripper."""
+
+USUAL_RATES = (0.02, 0.1)
+"""How fast the usual share follows a smaller and a larger one, per frame: trust is not lowered by a few bad frames."""
+
+CORNER_COUNTS = {"all": None, "3P": 3, "4P": 4, "5P": 5}
+"""Most corners that a variant takes; named as in the paper."""
+
+
+class Tracker:
+    """Measures one gripper in one camera's frames, one after the other."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, settings: MonitorSettings, taught: TaughtEdges | None = None):
+        self._gripper, self._settings = gripper, settings
+        self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
+        self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
+        self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        self.jaw_opening_m = gripper.jaw_nominal_m
+        """Where the jaw was seen last: what to expect when nobody reports it."""
+        self._usual_share = USUAL_SHARE
+        self._credit = float(settings.corners.search.eager_frames)
+        self._untrusted = 0
+
+    @property
+    def floor(self) -> Array:
+        """(6, 6) covariance of the systematic error that no averaging removes."""
+        return self._floor
+
+    def measure(self, frame: Frame, cam_T_grip: Array) -> Measurement:
+        """Measure about ``cam_T_grip`` (4, 4), where the gripper is expected, and look further when clearly fewer edge
+        points agree than usually.
+
+        A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is
+        searched for in the first frames, then in one of several.
+        """
+        search = self._settings.corners.search
+        reported_m = frame.jaw_opening_m
+        assert frame.image is not None
+        measurement = self._meter.measure(
+            frame.image,
+            cam_T_grip,
+            self.jaw_opening_m if reported_m is None else reported_m,
+            self._usual_share,
+            Patience(
+                when_doubtful=self._credit >= 1.0,
+                when_lost=self._untrusted < search.eager_frames or self._untrusted % search.patient_every == 0,
+            ),
+            jaw_reported=reported_m is not None,
+        )
+        share = measurement.consensus.share
+        earned = -1.0 if measurement.looked_far else 1.0 / search.refill_frames
+        self._credit = min(max(self._credit + earned, 0.0), float(search.eager_frames))
+        self._untrusted = 0 if measurement.trusted else self._untrusted + 1
+        if measurement.trusted:
+            self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
+        return measurement
+
+    def with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
+        """The same with the opening's error as earlier frames have shown it."""
+        if reported_m is None or not self._gripper.has_jaw:
+            return measurement
+        fused = self._jaw.fuse(measurement.jaw_reported_m, measurement.jaw_opening_m, measurement.covariance)
+        covariance = measurement.covariance.copy()
+        covariance[:6, :6] = fused.covariance
+        covariance[6, 6] = fused.sigma_m**2
+        return replace(
+            measurement,
+            cam_T_grip=perturb(measurement.cam_T_grip, fused.xi),
+            jaw_opening_m=min(max(fused.jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m),
+            covariance=covariance,
+            jaw_surprise=max(measurement.jaw_surprise, fused.surprise, key=abs),
+        )
+
+    def update(self, measurement: Measurement) -> tuple[Array, Array]:
+        """The corrected transform and its covariance: by all agreed edge points, or by the corners and equation
+        (17).
+        """
+        cam_T_grip, covariance = measurement.cam_T_grip, measurement.covariance[:6, :6]
+        taken = self.taken(measurement, self._settings.update_corners)
+        if self._settings.measurement == "corners" and np.count_nonzero(taken) >= 3:
+            covariance_xy = measurement.corners.joint_covariance_xy(taken)
+            try:
+                update = self._corner_update(measurement, taken, covariance_xy, measurement.jaw_opening_m)
+                cam_T_grip = perturb(measurement.prediction.cam_T_grip, update.xi)
+                covariance = update.covariance
+                if self._gripper.has_jaw:
+                    # The corners take the opening as known: what its uncertainty does to the motion comes on top.
+                    jaw_sigma_m = float(np.sqrt(measurement.covariance[6, 6]))
+                    opened_m = measurement.jaw_opening_m + jaw_sigma_m
+                    opened = self._corner_update(measurement, taken, covariance_xy, opened_m)
+                    covariance = covariance + np.outer(opened.xi - update.xi, opened.xi - update.xi)
+            except DegenerateGeometry:
+                pass  # The corners that are left lie on a line: the edges still determine the motion.
+        return cam_T_grip, covariance + self._floor
+
+    @staticmethod
+    def _corner_update(
+        measurement: Measurement, taken: NDArray[np.bool_], covariance_xy: Array, jaw_opening_m: float
+    ) -> Update:
+        """Equation (17) on the corners ``taken`` (c,), with the jaw at an opening."""
+        return differential_update(
+            measurement.corners_at(jaw_opening_m)[taken],
+            measurement.corners.xy[taken],
+            covariance_xy,
+            measurement.prediction.cam_T_grip[:3, 3],
+        )
+
+    def taken(self, measurement: Measurement, variant: str) -> NDArray[np.bool_]:
+        """(c,) the usable corners that a variant takes."""
+        return self._gripper.innermost_corners(measurement.corners.usable, CORNER_COUNTS[variant])
+
+    def moved_px(self, measurement: Measurement, before_T: Array) -> float:
+        """How far the measured edges are from where ``before_T`` (4, 4) would have them."""
+        return self._meter.moved_px(measurement, before_T)
+
+    def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
+        """What the fingers show one by one in a frame that was measured; takes as long as the measurement."""
+        assert frame.image is not None
+        reported = frame.jaw_opening_m is not None
+        return self._meter.evidence(frame.image, measurement, ref_cam_T_grip, jaw_reported=reported)

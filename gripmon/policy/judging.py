@@ -1,0 +1,308 @@
+"""Judging what was measured: states, verdicts, alerts, and when to recalibrate.
+
+A function of the frames so far: time is the frames' own.  Whether the camera has moved is decided in ``drift``, what
+moved in ``causes``; here it is decided what follows.
+
+What a verdict means to a controller: ``valid``, use the transform; ``suspect``, finish or stop a motion by it, don't
+begin one; ``unknown``, don't move by it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from gripmon.policy.alerts import AlertBook
+from gripmon.policy.limits import time_left_s
+from gripmon.policy.settings import PolicySettings
+from gripmon.records import Alert, AlertKind, Array, Cause, Explanation, Motion, Severity, State, Verdict
+
+NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
+"""Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
+where it was, and is not calibrated anew.
+"""
+
+MOTION, VIBRATION, VIEW, IMAGE, GRIPPER, RENEWAL = "motion", "vibration", "view", "image", "gripper", "renewal"
+STREAM = "stream:"
+"""What alerts are about; of each there is one open at a time."""
+
+_MOTION_KINDS = {AlertKind.STEP: "a step", AlertKind.CREEP: "a creep", AlertKind.DRIFT: "a drift"}
+
+
+NO_EXPLANATION = Explanation()
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What one measured frame says: ``shift`` (6,) of the transform against the reference with ``sigma`` (6,), the
+    motion ``d_m`` and ``delta_rad`` of equation (14), what the frames so far make of the ``motion``, whether the pose
+    jumped against the previous frame, what would explain it, and whether the gripper contradicts its model (a finger or
+    the jaw is not where it should be), and whether the stream of frames is at fault (so that stamps or the camera's
+    calibration may not hold).
+    """
+
+    shift: Array
+    sigma: Array
+    d_m: float
+    delta_rad: float
+    motion: Motion
+    jumped: bool = False
+    explanation: Explanation = NO_EXPLANATION
+    gripper_astray: bool = False
+    stream_at_fault: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    state: State
+    verdict: Verdict
+    alerts: tuple[Alert, ...]
+    recalibrate: bool = False
+
+
+class Policy:
+    """The states ``acquiring -> tracking <-> drifting -> recalibrating -> tracking``, ``occluded`` and ``lost``."""
+
+    def __init__(self, settings: PolicySettings, may_recalibrate: bool = True):
+        self._settings = settings
+        self._may_recalibrate = may_recalibrate
+        self.alerts = AlertBook(settings.update_alert_s, settings.clear_alert_s)
+        self.state = State.ACQUIRING
+        self._since_jump = 0
+        self._still = 0
+        self._still_shift: Array = np.zeros(6)
+        self._bad_since_s: float | None = None
+
+    def measured(self, evidence: Evidence, now_s: float, stamp_ns: int) -> Judgement:
+        """A frame from which a transform could be measured."""
+        settings, motion, probable = self._settings, evidence.motion, evidence.explanation.probable
+        self._bad_since_s = None
+        self._since_jump = 1 if evidence.jumped else self._since_jump + 1
+        self._count_still(evidence)
+        confirmed = self._since_jump >= settings.confirm_frames
+        past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
+        not_the_camera = probable.cause in NOT_THE_CAMERA
+        recalibrate = False
+        if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
+            state: State = State.ACQUIRING if self.state is State.LOST else self.state
+        elif past_limit and self._may_recalibrate and not not_the_camera:
+            state = State.RECALIBRATING
+            recalibrate = self._still >= settings.settle_frames
+        elif motion.present:
+            state = State.DRIFTING
+        else:
+            state = State.TRACKING
+        self.state = state
+        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
+        sure = sure and not (evidence.gripper_astray or not_the_camera or evidence.stream_at_fault)
+        verdict = Verdict.VALID if confirmed and sure else Verdict.SUSPECT
+        return Judgement(state, verdict, self._alerts_of(evidence, now_s, stamp_ns), recalibrate)
+
+    def unmeasured(
+        self,
+        now_s: float,
+        stamp_ns: int,
+        refusal: str | None,
+        measured_s: float | None,
+        explanation: Explanation | None = None,
+    ) -> Judgement:
+        """A frame from which nothing could be measured: refused as an image (``refusal`` says why), or the gripper
+        isn't seen in it (``explanation`` may know why).  ``measured_s`` is when a transform was last measured, None for
+        never.
+        """
+        settings, book = self._settings, self.alerts
+        self._since_jump = self._still = 0
+        if self._bad_since_s is None:
+            self._bad_since_s = now_s
+        lasted_s = now_s - self._bad_since_s
+        held = measured_s is not None and now_s - measured_s <= settings.hold_s
+        if held:
+            # A bad image says nothing about the gripper: only time makes it lost.
+            known = refusal is not None and self.state is not State.LOST
+            self.state = self.state if known else State.OCCLUDED
+        elif measured_s is not None or lasted_s > settings.hold_s:
+            self.state = State.LOST
+        alerts: tuple[Alert, ...] = ()
+        explanation = explanation or NO_EXPLANATION
+        probable = explanation.probable
+        if self.state is State.LOST:
+            what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
+            cause = Cause.IMAGE_BAD if refusal else Cause.UNKNOWN if measured_s is None else probable.cause
+            why = "" if refusal else explanation.text
+            text = f"{what} for {lasted_s:.1f} s; no transform is given" + (f"; {why}" if why else "")
+            lost = Alert(AlertKind.LOST, cause, Severity.ERROR, text, part=probable.part, causes=explanation.causes)
+            alerts += book.present(VIEW, lost, now_s, stamp_ns)
+        elif self.state is State.OCCLUDED:
+            text = "too few edges of the gripper are seen; the last transform is held"
+            text += f"; {explanation.text}" if explanation.text else ""
+            cause, causes = probable.cause, explanation.causes
+            occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
+            before = book.about(VIEW)
+            if before is None or before.kind is AlertKind.OCCLUDED:  # lost isn't taken back for one frame
+                alerts += book.present(VIEW, occluded, now_s, stamp_ns)
+        if refusal and lasted_s >= settings.image_alert_after_s:
+            text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
+            bad = Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text)
+            alerts += book.present(IMAGE, bad, now_s, stamp_ns)
+        elif not refusal:
+            alerts += book.absent(IMAGE, "images are good again", now_s)
+        return Judgement(self.state, Verdict.SUSPECT if held else Verdict.UNKNOWN, alerts)
+
+    def stream(self, faults: tuple[tuple[str, Cause, str], ...], now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
+        """What is wrong with the stream of frames just now: kind of fault, cause, and what there is to say of it."""
+        book = self.alerts
+        alerts: tuple[Alert, ...] = ()
+        wrong = {STREAM + kind: Alert(AlertKind.STREAM, cause, Severity.ERROR, text) for kind, cause, text in faults}
+        for topic, alert in wrong.items():
+            alerts += book.present(topic, alert, now_s, stamp_ns)
+        for each in book.open:
+            if each.topic.startswith(STREAM) and each.topic not in wrong:
+                alerts += book.absent(each.topic, "the stream of frames is as it should be", now_s)
+        return alerts
+
+    def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
+        """The reference was replaced: drift is reckoned from zero, and what was said of it is over."""
+        self._still = 0
+        over = self.alerts.absent(MOTION, "there is a new reference", now_s, at_once=True)
+        return over + self.decided("there is a new reference", now_s)
+
+    def not_recalibrated(self) -> None:
+        """The reference could not be measured anew: try again when the camera has stood still for as long again."""
+        self._still = 0
+
+    def refused(self, why: str, explanation: Explanation, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
+        """Past the limit, but there is no new reference."""
+        text = f"past the limit, but not calibrated anew: {why}"
+        return self._about_renewal(AlertKind.REFUSED, Severity.ERROR, text, explanation, now_s, stamp_ns)
+
+    def proposed(self, text: str, explanation: Explanation, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
+        """A new reference waits for an operator."""
+        return self._about_renewal(AlertKind.PROPOSED, Severity.WARNING, text, explanation, now_s, stamp_ns)
+
+    def decided(self, text: str, now_s: float) -> tuple[Alert, ...]:
+        """Nothing waits for an operator any more."""
+        return self.alerts.absent(RENEWAL, text, now_s, at_once=True)
+
+    def _about_renewal(
+        self, kind: AlertKind, severity: Severity, text: str, explanation: Explanation, now_s: float, stamp_ns: int
+    ) -> tuple[Alert, ...]:
+        probable = explanation.probable
+        alert = Alert(kind, probable.cause, severity, text, part=probable.part, causes=explanation.causes)
+        return self.alerts.present(RENEWAL, alert, now_s, stamp_ns)
+
+    @property
+    def drifting(self) -> bool:
+        """Whether an alert about the camera's motion is open."""
+        return self.alerts.about(MOTION) is not None
+
+    def hold_variance(self, held_s: float) -> Array:
+        """(6,) what a held transform's variances have grown by after ``held_s`` seconds."""
+        settings = self._settings
+        rates = [settings.hold_m_per_sqrt_s] * 3 + [settings.hold_rad_per_sqrt_s] * 3
+        return np.square(rates) * held_s
+
+    @property
+    def still_frames(self) -> int:
+        """For how many frames the transform has not left its place."""
+        return self._still
+
+    def _count_still(self, evidence: Evidence) -> None:
+        """Frames since the transform last left the place where it came to rest: by half of what is worth a warning, and
+        beyond its noise.
+        """
+        settings = self._settings
+        worth = np.array([settings.warn_m] * 3 + [settings.warn_rad] * 3)
+        leeway = np.maximum(0.5 * worth, 5.0 * evidence.sigma)
+        if evidence.jumped or self._still == 0 or (np.abs(evidence.shift - self._still_shift) > leeway).any():
+            self._still, self._still_shift = 1, evidence.shift
+        else:
+            self._still += 1
+
+    def _alerts_of(self, evidence: Evidence, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
+        book, motion, probable = self.alerts, evidence.motion, evidence.explanation.probable
+        not_the_camera = probable.cause in NOT_THE_CAMERA
+        alerts = book.absent(VIEW, "the gripper is measured again", now_s)
+        alerts += book.absent(IMAGE, "images are good again", now_s)
+        # What lies in the gripper or the lens is told once, as that.
+        if motion.present and (not not_the_camera or book.about(MOTION) is not None):
+            alerts += book.present(MOTION, self._motion_alert(evidence), now_s, stamp_ns)
+        else:
+            alerts += book.absent(MOTION, "the camera is where the reference has it", now_s)
+        vibration = motion.vibration
+        if vibration is not None:
+            size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
+            text = f"the camera vibrates: TCP {size_mm:.3f} mm rms at about {hertz:.0f} Hz"
+            severity = Severity.WARNING if vibration.rms_m >= self._settings.warn_m else Severity.INFO
+            alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
+            alerts += book.present(VIBRATION, alert, now_s, stamp_ns)
+        else:
+            alerts += book.absent(VIBRATION, "the camera no longer vibrates", now_s)
+        if evidence.d_m <= self._settings.limit_m and evidence.delta_rad <= self._settings.limit_rad:
+            refused = book.about(RENEWAL)
+            if refused is not None and refused.kind is AlertKind.REFUSED:
+                alerts += book.absent(RENEWAL, "no longer past the limit", now_s)
+        if not_the_camera:
+            alerts += book.present(GRIPPER, _gripper_alert(evidence.explanation), now_s, stamp_ns)
+        else:
+            alerts += book.absent(GRIPPER, "fingers, jaw and lens are as they should be", now_s)
+        return alerts
+
+    def _motion_alert(self, evidence: Evidence) -> Alert:
+        settings, motion, explanation = self._settings, evidence.motion, evidence.explanation
+        shift_m, turn_rad = float(np.linalg.norm(motion.shift[:3])), float(np.linalg.norm(motion.shift[3:]))
+        severity = Severity.INFO
+        if shift_m >= settings.limit_m or turn_rad >= settings.limit_rad:
+            severity = Severity.ERROR
+        elif shift_m >= settings.warn_m or turn_rad >= settings.warn_rad:
+            severity = Severity.WARNING
+        rate, left_s = None, None
+        if motion.creep is not None:
+            rate = motion.creep.rate_m_per_min
+            left_s = time_left_s(motion.shift, motion.creep.velocity, settings.limit_m, settings.limit_rad)
+        x, y, z = motion.shift[:3].tolist()
+        parts = [_motion_text(motion), _creep_text(rate, left_s), explanation.text]
+        return Alert(
+            kind=motion.kind,
+            cause=explanation.probable.cause,
+            severity=severity,
+            text="; ".join(part for part in parts if part),
+            part=explanation.probable.part,
+            causes=explanation.causes,
+            tcp_shift_m=(x, y, z),
+            rotation_rad=turn_rad,
+            rate_m_per_min=rate,
+            time_left_s=left_s,
+        )
+
+
+def _motion_text(motion: Motion) -> str:
+    x, y, z = (1e3 * motion.shift[:3]).tolist()
+    sx, sy, sz = (1e3 * motion.sigma[:3]).tolist()
+    turn = math.degrees(float(np.linalg.norm(motion.shift[3:])))
+    return (
+        f"{_MOTION_KINDS[motion.kind]} against the reference: TCP {x:+.3f} {y:+.3f} {z:+.3f} mm "
+        f"(1 sigma {sx:.3f} {sy:.3f} {sz:.3f}), turned by {turn:.3f} degrees"
+    )
+
+
+def _creep_text(rate_m_per_min: float | None, left_s: float | None) -> str:
+    if rate_m_per_min is None:
+        return ""
+    text = f"{1e3 * rate_m_per_min:.3f} mm/min"
+    if left_s is None:
+        return text
+    return f"{text}, {_duration(left_s)} to the limit" if left_s > 0.0 else f"{text}, past the limit"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.0f} h"
+
+
+def _gripper_alert(explanation: Explanation) -> Alert:
+    probable = explanation.probable
+    kind = AlertKind.LENS if probable.cause is Cause.LENS else AlertKind.GRIPPER
+    return Alert(kind, probable.cause, Severity.ERROR, explanation.text, part=probable.part, causes=explanation.causes)

@@ -1,0 +1,73 @@
+"""What a person may set about verdicts and alerts."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+
+class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How bad what was noticed is, and what is done then."""
+
+    warn_m: Annotated[
+        float,
+        Meta(gt=0.0, le=1.0, description="shift of the TCP from which a drift is a warning; below, information (m)"),
+    ] = 1e-4
+    warn_rad: Annotated[
+        float, Meta(gt=0.0, le=3.0, description="turn from which a drift is a warning; below, information (rad)")
+    ] = 3e-3
+    limit_m: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=1.0,
+            description="shift of the TCP from which a drift is an error, and motion d of equation (14) past which the "
+            "reference is measured anew (m)",
+        ),
+    ] = 2.5e-3
+    limit_rad: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=3.0,
+            description="turn from which a drift is an error, and rotation delta of equation (14) past which the "
+            "reference is measured anew (rad)",
+        ),
+    ] = 0.02
+    update_alert_s: Annotated[
+        float, Meta(ge=0.0, le=3600.0, description="an open alert that changes is updated so often at most (s)")
+    ] = 2.0
+    clear_alert_s: Annotated[
+        float, Meta(ge=0.0, le=3600.0, description="what an alert is about must be over for so long to clear it (s)")
+    ] = 1.0
+    settle_frames: Annotated[
+        int,
+        Meta(
+            ge=1, le=10000, description="frames that the gripper must stand still in the image before a recalibration"
+        ),
+    ] = 20
+    confirm_frames: Annotated[
+        int, Meta(ge=1, le=1000, description="frames that must agree after a jump before the transform counts as valid")
+    ] = 2
+    hold_s: Annotated[
+        float,
+        Meta(ge=0.0, le=3600.0, description="how long the last transform is held when nothing can be measured (s)"),
+    ] = 1.0
+    hold_m_per_sqrt_s: Annotated[
+        float,
+        Meta(gt=0.0, le=1.0, description="growth of a held transform's position sigma (m per square root of a second)"),
+    ] = 2e-4
+    hold_rad_per_sqrt_s: Annotated[
+        float,
+        Meta(
+            gt=0.0, le=3.0, description="growth of a held transform's rotation sigma (rad per square root of a second)"
+        ),
+    ] = 2e-3
+    image_alert_after_s: Annotated[
+        float, Meta(ge=0.0, le=3600.0, description="refused frames for so long give an alert (s)")
+    ] = 1.0
+    suspect_sigma_m: Annotated[
+        float, Meta(gt=0.0, le=1.0, description="a transform whose TCP is less certain than this is suspect (m)")
+    ] = 1e-4

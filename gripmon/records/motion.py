@@ -1,0 +1,72 @@
+"""What the frames so far add up to: has the camera moved, how, and why?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gripmon.records.alerts import AlertKind, Cause, CauseWeight
+from gripmon.records.values import Array
+
+UNEXPLAINED = CauseWeight(Cause.UNKNOWN, 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Creep:
+    """``velocity`` (6,) of the drift, m/s and rad/s, and the time ``since_s`` when it began."""
+
+    velocity: Array
+    since_s: float
+
+    @property
+    def rate_m_per_min(self) -> float:
+        """Of the TCP."""
+        return 60.0 * float(np.linalg.norm(self.velocity[:3]))
+
+
+@dataclass(frozen=True, slots=True)
+class Vibration:
+    """Root mean square of the TCP's motion about its mean, m, and its strongest frequency, 1/s; that is seen in a frame
+    rate's light only: beyond half of it frequencies fold back.
+    """
+
+    rms_m: float
+    frequency_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What a frame adds up to.
+
+    ``present``: the camera isn't where the reference has it, by the mean ``shift`` (6,) of the last ``frames`` frames
+    with standard deviations ``sigma`` (6,); ``kind``: step, creep, or drift where neither is certain.  ``begun``: it
+    has just been found; ``stepped``: it has just moved at once, ``step_frames`` ago.  ``suspicious``: something speaks
+    for it.
+    """
+
+    present: bool
+    kind: AlertKind
+    shift: Array
+    sigma: Array
+    frames: int
+    begun: bool = False
+    stepped: bool = False
+    step_frames: int = 0
+    creep: Creep | None = None
+    vibration: Vibration | None = None
+    suspicious: bool = False
+
+    @property
+    def quiet(self) -> bool:
+        """Nothing moves and nothing speaks for it."""
+        return not (self.present or self.suspicious or self.vibration is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """What may have caused what is seen: all that were weighed, the ``probable`` one, and a sentence about it."""
+
+    causes: tuple[CauseWeight, ...] = ()
+    probable: CauseWeight = UNEXPLAINED
+    text: str = ""
