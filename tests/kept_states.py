@@ -15,10 +15,8 @@ from gripmon.references import ReferenceBook
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.statefile import StateFile
 
-FRAMES = 3000
 
-
-def make_pictures(folder: Path, *, knocked_every: int | None = None) -> Path:
+def make_pictures(folder: Path, frames: int, *, knocked_every: int | None = None) -> Path:
     """A folder of many frames: the demo's camera, which stands still, or is knocked to and fro by 3.5 mm."""
     folder.mkdir()
     config = load_config(builtin_config("demo.yaml"))
@@ -30,12 +28,12 @@ def make_pictures(folder: Path, *, knocked_every: int | None = None) -> Path:
         for i in range(4):
             image = simulator.frame(i).image
             assert image is not None and cv2.imwrite(str(folder / f"original{place}{i}.bmp"), image)
-    frames = folder / "frames"
-    frames.mkdir()
-    for i in range(FRAMES):
+    links = folder / "frames"
+    links.mkdir()
+    for i in range(frames):
         place = 0 if knocked_every is None else i // knocked_every % 2
-        (frames / f"{i:05d}.bmp").symlink_to(folder / f"original{place}{i % 4}.bmp")
-    return frames
+        (links / f"{i:05d}.bmp").symlink_to(folder / f"original{place}{i % 4}.bmp")
+    return links
 
 
 def configuration(folder: Path, pictures: Path, endpoint: str, **more: object) -> Path:

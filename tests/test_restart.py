@@ -149,7 +149,7 @@ def test_a_state_that_does_not_hold_together_is_an_error():
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_pictures(tmp_path_factory.mktemp("restart") / "pictures")
+    return make_pictures(tmp_path_factory.mktemp("restart") / "pictures", 6000)
 
 
 class Cell:
