@@ -9,10 +9,10 @@ import numpy as np
 
 from gripmon.records import Array, Creep
 
-BLOCK_S = 1.0
+BLOCK_S = 0.5
 """Frames are averaged over so many seconds."""
 
-KEPT_BLOCKS = 600
+KEPT_BLOCKS = 256
 
 FEWEST_BLOCKS = 6
 """Blocks below which a creep isn't told from a step."""
@@ -78,6 +78,16 @@ class History:
             return False
         along = np.array(self._means) @ towards
         return _best(along, _steps(count))[0] <= BETTER * _best(along, _ramps(np.array(self._times_s)))[0]
+
+
+def goes_on(values: Array) -> bool:
+    """Whether the newest of a series (n,) are still on their way rather than at a new place."""
+    count = len(values)
+    if count < FEWEST_BLOCKS:
+        return False
+    step, _ = _best(values, _steps(count))
+    ramp, _ = _best(values, _ramps(np.arange(float(count))))
+    return ramp < step
 
 
 def _steps(count: int) -> Array:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
-from gripmon.drift.history import History
+from gripmon.drift.history import History, goes_on
 from gripmon.drift.sequential import SequentialTest
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.vibration import VibrationWatch
@@ -36,6 +38,7 @@ class MotionWatch:
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
+        self._newest: deque[Array] = deque(maxlen=4 * int(STEP_S * 240.0))
         self._kind = AlertKind.DRIFT
         self._present = False
         self._creep: Creep | None = None
@@ -45,6 +48,7 @@ class MotionWatch:
         self.test.restart(np.array([True]))
         self.test.set_reference_covariance(reference_covariance)
         self._history.clear()
+        self._newest.clear()
         self._vibration.forget()
         self._present, self._kind, self._creep = False, AlertKind.DRIFT, None
 
@@ -68,7 +72,8 @@ class MotionWatch:
         finding = test.add(shift[None], covariance[None])
         moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
         length = int(finding.length[0])
-        at_once = stepped and length <= STEP_S * self._frames_per_s
+        self._newest.append(shift)
+        at_once = stepped and length <= STEP_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
         if at_once:
@@ -99,6 +104,12 @@ class MotionWatch:
             vibration=vibration,
             suspicious=bool(finding.excess[0] > SUSPICIOUS),
         )
+
+    def _goes_on(self, length: int) -> bool:
+        """Whether the frames about a difference between windows of ``length`` frames show a creep, not a step."""
+        frames = np.array(self._newest)[-4 * length :]
+        towards = np.linalg.solve(self.test.usual_covariance(), frames[-length:].mean(axis=0) - frames[0])
+        return goes_on(frames @ towards)
 
     def _level(self, frames: int) -> tuple[Array, Array]:
         mean, covariance = self.test.level(frames)

@@ -7,8 +7,13 @@ from collections.abc import Callable
 from gripmon.causes import CauseJudge
 from gripmon.records import Array, EdgeEvidence, Explanation
 
-CALM_FRAMES = 30
-"""Frames in a row in which nothing looks wrong after which the evidence is forgotten."""
+CALM_FRAMES, LULL_FRAMES = 30, 3
+"""Frames in a row in which nothing looks wrong after which the evidence is forgotten, and up to which an explanation
+holds.
+"""
+
+FEWEST_FRAMES = 5
+"""Frames that must look wrong before it is said why: a change of light spoils one or two."""
 
 AT_FIRST, EVERY = (1, 2, 3, 5, 8, 12, 20), 16
 """Frames after which the first conclusions are drawn, and after how many more each further one: gathering evidence
@@ -40,13 +45,16 @@ class Inquiry:
                 self._judge.add(evidence())
             if concluded:
                 self._explanation = self._judge.explanation(ref_cam_T_grip)
-            return self._explanation
+            return self._told()
         self._calm += 1
         if self._calm == CALM_FRAMES:
             self._forget()
         if self._calm >= CALM_FRAMES and self._judge.wants_baseline:
             self._judge.well(evidence())
-        return self._explanation
+        return self._told()
+
+    def _told(self) -> Explanation:
+        return self._explanation if self._asked >= FEWEST_FRAMES and self._calm <= LULL_FRAMES else Explanation()
 
     def _forget(self) -> None:
         self._judge.reset()

@@ -85,7 +85,8 @@ class Renewal:
             self._policy.not_recalibrated()
             return self._policy.refused(outcome.text, explanation, now_s, stamp_ns)
         moved = (
-            f"the camera moved by {1e3 * drift.translation_m:.2f} mm and {math.degrees(drift.rotation_rad):.2f} degrees"
+            f"the TCP has moved by {1e3 * math.hypot(*drift.tcp_shift_m):.2f} mm, turned by "
+            f"{math.degrees(drift.rotation_rad):.2f} degrees"
         )
         cause = explanation.probable.cause
         draft = self.book.draft(outcome.cam_T_grip, outcome.covariance, stamp_ns, cause=cause, inputs=outcome.inputs)

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from gripmon.records import Alert, AlertEvent, OpenAlert, Severity
+from gripmon.records import Alert, AlertEvent, Cause, OpenAlert, Severity
 
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 
@@ -30,8 +30,8 @@ class AlertBook:
     """
 
     def __init__(self, update_s: float, clear_s: float):
-        """An alert is updated once in ``update_s`` at most, unless it becomes more severe, and cleared when its
-        condition has been absent for ``clear_s``.
+        """An alert is updated once in ``update_s`` at most, unless it becomes more severe or its cause becomes known,
+        and cleared when its condition has been absent for ``clear_s``.
         """
         self._update_s, self._clear_s = update_s, clear_s
         self._open: dict[str, _Open] = {}
@@ -82,7 +82,8 @@ class AlertBook:
             acknowledged=known.acknowledged and _RANK[alert.severity] <= _RANK[known.severity],
         )
         worse = _RANK[alert.severity] > _RANK[known.severity]
-        due = now_s - entry.said_s >= self._update_s and not known.acknowledged
+        explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
+        due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
         if worse or (due and _differ(known, updated)):
             self._keep(topic, updated, now_s)
             return (updated,)

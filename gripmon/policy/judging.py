@@ -129,7 +129,7 @@ class Policy:
         probable = explanation.probable
         if self.state is State.LOST:
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
-            cause = Cause.IMAGE_BAD if refusal else Cause.UNKNOWN if measured_s is None else probable.cause
+            cause = Cause.IMAGE_BAD if refusal else Cause.UNKNOWN if measured_s is None else self._blocked(explanation)
             why = "" if refusal else explanation.text
             text = f"{what} for {lasted_s:.1f} s; no transform is given" + (f"; {why}" if why else "")
             lost = Alert(AlertKind.LOST, cause, Severity.ERROR, text, part=probable.part, causes=explanation.causes)
@@ -137,7 +137,7 @@ class Policy:
         elif self.state is State.OCCLUDED:
             text = "too few edges of the gripper are seen; the last transform is held"
             text += f"; {explanation.text}" if explanation.text else ""
-            cause, causes = probable.cause, explanation.causes
+            cause, causes = self._blocked(explanation), explanation.causes
             occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
             before = book.about(VIEW)
             if before is None or before.kind is AlertKind.OCCLUDED:  # lost isn't taken back for one frame
@@ -161,6 +161,11 @@ class Policy:
             if each.topic.startswith(STREAM) and each.topic not in wrong:
                 alerts += book.absent(each.topic, "the stream of frames is as it should be", now_s)
         return alerts
+
+    @staticmethod
+    def _blocked(explanation: Explanation) -> Cause:
+        """Why the gripper isn't seen, where nothing else is known: something is before it."""
+        return explanation.probable.cause if explanation.text else Cause.VIEW_BLOCKED
 
     def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
         """The reference was replaced: drift is reckoned from zero, and what was said of it is over."""
