@@ -9,7 +9,7 @@ import math
 import statistics
 from collections import deque
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -44,7 +44,7 @@ ARRIVALS, MOST_BLOCKS = 64, 512
 """How many newest intervals and blocks are kept."""
 
 REGULAR = 0.3
-"""Median deviation of the blocks over their median up to which there is a usual rate at all."""
+"""Median deviation of the intervals over their median up to which there is a usual rate at all."""
 
 DEPARTED, RETURNED = 1.6, 1.3
 """Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
@@ -166,7 +166,7 @@ class _Clock:
         if step_ns < 0:
             return StreamFault("clock", Cause.CLOCK, f"the frames' clock went back by {-1e-9 * step_ns:.3f} s")
         if step_ns == 0:
-            self._standing += 1
+            self._standing, self._calm = self._standing + 1, 0
             text = f"{self._standing} frames have the stamp of the one before: their clock stands still"
             return StreamFault("clock", Cause.CLOCK, text) if self._standing >= STANDING_STAMPS else None
         if step_ns > JUMP_NS and step_ns > rate.longest_ns(max(frame.seq - self._seq, 1)):
@@ -187,7 +187,7 @@ class _Rate:
         self._last: tuple[int, int] | None = None
         self._arrivals_ns: deque[int] = deque(maxlen=ARRIVALS)
         self._block_ns: list[float] = []
-        self._blocks_ns: deque[tuple[float, float]] = deque(maxlen=MOST_BLOCKS)
+        self._blocks: deque[_Block] = deque(maxlen=MOST_BLOCKS)
         self.usual_ns: float | None = None
         self._fault: StreamFault | None = None
 
@@ -213,7 +213,9 @@ class _Rate:
         self._arrivals_ns.append(step_ns)
         self._block_ns.append(interval_ns)
         if len(self._block_ns) == BLOCK:
-            self._blocks_ns.append((statistics.median(self._block_ns), sum(self._block_ns)))
+            middle_ns = statistics.median(self._block_ns)
+            uneven = statistics.median(abs(t - middle_ns) for t in self._block_ns) / middle_ns
+            self._blocks.append(_Block(middle_ns, sum(self._block_ns), uneven))
             self._block_ns = []
             if self.usual_ns is None:
                 self._learn()
@@ -222,15 +224,16 @@ class _Rate:
         return self._fault
 
     def _judge(self, usual_ns: float) -> None:
-        recent_ns, span_ns = [], 0.0
-        for middle_ns, lasted_ns in reversed(self._blocks_ns):
-            recent_ns.append(middle_ns)
-            span_ns += lasted_ns
-            if span_ns >= _NS * self._settings.rate_s:
+        recent: list[_Block] = []
+        lasted_ns = 0.0
+        for block in reversed(self._blocks):
+            recent.append(block)
+            lasted_ns += block.lasted_ns
+            if lasted_ns >= _NS * self._settings.rate_s:
                 break
         else:
             return
-        slower = statistics.median(recent_ns) / usual_ns
+        slower = _middle_ns(recent) / usual_ns
         if max(slower, 1.0 / slower) > DEPARTED:
             text = f"{_NS / (slower * usual_ns):.1f} frames a second arrive; {_NS / usual_ns:.1f} were usual"
             self._fault = StreamFault("rate", Cause.CLOCK, text)
@@ -238,13 +241,29 @@ class _Rate:
             self._fault = None
 
     def _learn(self) -> None:
-        blocks_ns = self._blocks_ns
-        if len(blocks_ns) < LEARN_BLOCKS or sum(lasted_ns for _, lasted_ns in blocks_ns) < LEARN_NS:
+        if len(self._blocks) < LEARN_BLOCKS or sum(block.lasted_ns for block in self._blocks) < LEARN_NS:
             return
-        middle_ns = statistics.median(m for m, _ in blocks_ns)
         # Frames that come as they like have no usual rate.
-        if statistics.median(abs(m - middle_ns) for m, _ in blocks_ns) < REGULAR * middle_ns:
-            self.usual_ns = middle_ns
+        if statistics.median(block.uneven for block in self._blocks) < REGULAR:
+            self.usual_ns = _middle_ns(list(self._blocks))
+
+
+class _Block(NamedTuple):
+    """Some intervals: the middle one, all of them, and their median deviation over the middle one."""
+
+    middle_ns: float
+    lasted_ns: float
+    uneven: float
+
+
+def _middle_ns(blocks: list[_Block]) -> float:
+    """The interval in the middle of the time: half of it went by with shorter ones."""
+    half_ns, passed_ns = 0.5 * sum(block.lasted_ns for block in blocks), 0.0
+    for block in sorted(blocks):
+        passed_ns += block.lasted_ns
+        if passed_ns >= half_ns:
+            break
+    return block.middle_ns
 
 
 class _Kind:

@@ -32,6 +32,9 @@ WITH_BASELINE = 0.1
 EDGE_PX = 0.02
 """What a whole edge is off by at least."""
 
+MODEL_M = 3e-5
+"""How exactly a gripper's file says where its edges lie, which counts as long as there is no baseline."""
+
 SETTLED_SIGMA = np.array([5e-6] * 3 + [5e-5] * 3)
 SETTLED_JAW_M = 5e-6
 """Of the pose (m and rad) and the opening that a baseline knows."""
@@ -90,7 +93,8 @@ def compare(
     start = State(ref_cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
     sigma_px: Array = np.hypot(evidence.sigma_px, FLOOR_PX)
     bias_px: Array = np.zeros(len(evidence.edge))
-    spread_px: Array = np.hypot(evidence.spread_px, EDGE_PX)
+    model_px = MODEL_M / (evidence.per_px * float(ref_cam_T_grip[2, 3]))
+    spread_px: Array = np.hypot(np.hypot(evidence.spread_px, EDGE_PX), model_px)
     if baseline is not None:
         start = baseline.start(start, reported, gripper)
         bias_px, bias_sigma_px = baseline.bias_of(pooled.piece)

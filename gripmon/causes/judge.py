@@ -24,7 +24,7 @@ FEWEST_PIECES = 4
 ENOUGH, SETTLED = 20, 6
 """Frames in which all was well that make a baseline, and with which a first one is made if it is asked for earlier."""
 
-CONTRADICTED = 6.0
+CONTRADICTED = 8.0
 """Log evidence by which a cause must beat "nothing moved" among these frames for them not to be a baseline."""
 
 BLIND = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}

@@ -1,0 +1,287 @@
+"""What moved, judged from pieces of edges whose places are known: every cause, outliers, and what can't be told."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from box_models import cube_model, two_fingers_model
+from scipy.integrate import quad
+from scipy.stats import norm
+from shown_edges import OPENING_M, REFERENCE_SIGMA, Shown, bend, knocked
+from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
+
+from gripmon.camera import LensSettings, PaperLens, make_camera
+from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
+from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
+from gripmon.geometry import perturb
+from gripmon.gripper import Gripper, GripperModel
+from gripmon.records import Cause
+
+FRAMES = 8
+
+
+def two_fingers() -> Gripper:
+    return Gripper(msgspec.convert(two_fingers_model(), GripperModel))
+
+
+def zoomed(factor: float) -> PaperLens:
+    return msgspec.structs.replace(
+        PAPER_LENS, fx_px=962.0 * factor, fy_px=962.0 * factor, kappa_per_px2=1.9e-7 / factor**2
+    )
+
+
+def stated(text: str) -> float:
+    """The first number of a sentence."""
+    return float(re.findall(r"[-+]?\d+\.\d+", text)[0])
+
+
+def told(shown: Shown, judge: CauseJudge, **scene: Any) -> tuple[Cause, str | None, str]:
+    for _ in range(FRAMES):
+        judge.add(shown.evidence(**scene))
+    explanation = judge.explanation(shown.reference)
+    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
+    assert [c.probability for c in explanation.causes] == sorted(
+        (c.probability for c in explanation.causes), reverse=True
+    )
+    return explanation.probable.cause, explanation.probable.part, explanation.text
+
+
+@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
+@pytest.mark.parametrize("outliers", [0, 4])
+@pytest.mark.parametrize("size_m", [1.5e-4, 3e-4, 1.5e-3])
+def test_a_bent_finger_is_named_never_the_camera(size_m: float, outliers: int, lens: LensSettings):
+    for seed, (finger, x, y) in enumerate([("left", 1.0, 0.0), ("right", 0.0, 1.0), ("left", -0.6, 0.8)]):
+        shown = Shown(sharp_gripper(), lens, seed)
+        bent = {finger: bend(shown.gripper, finger, (size_m * x, size_m * y))}
+        cause, part, text = told(shown, shown.judge(), bent=bent, outliers=outliers)
+        assert (cause, part) == (Cause.FINGER_BENT, finger)
+        assert f"finger {finger} is bent" in text
+
+
+@pytest.mark.parametrize("outliers", [0, 4])
+@pytest.mark.parametrize(
+    ("shift_m", "turn_deg"),
+    [
+        ((3e-4, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((0.0, 1e-4, 0.0), (0.05, -0.1, 0.0)),
+        ((0.0, 0.0, 0.0), (0.0, 0.0, 0.2)),
+        ((-4e-3, 2e-3, 5e-3), (2.0, 1.0, -3.0)),
+    ],
+)
+def test_a_camera_that_moved_is_named(shift_m: Any, turn_deg: Any, outliers: int):
+    shown = Shown(two_fingers())
+    cause, part, text = told(
+        shown, shown.judge(opening_m=0.03, reported_m=0.03), opening_m=0.03, reported_m=0.03,
+        cam_T_grip=knocked(shown.reference, shift_m, turn_deg), outliers=outliers,
+    )  # fmt: skip
+    assert (cause, part) == (Cause.CAMERA_MOUNT, None)
+    assert stated(text) == pytest.approx(1e3 * np.linalg.norm(shift_m), abs=0.1)
+    assert "would look the same" in text
+
+
+@pytest.mark.parametrize("wrong_m", [2e-4, -5e-4, 2e-3])
+@pytest.mark.parametrize("sigma_m", [0.0, 5e-5])
+def test_a_wrong_report_of_the_opening_is_named(wrong_m: float, sigma_m: float):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge(jaw_sigma_m=sigma_m)
+    cause, _, text = told(shown, judge, opening_m=OPENING_M + wrong_m)
+    assert cause is Cause.JAW_OPENING
+    assert stated(text) == pytest.approx(1e3 * wrong_m, abs=0.03)
+
+
+@pytest.mark.parametrize("change", [-0.01, 0.004, 0.03])
+def test_another_focal_length_is_named(change: float):
+    shown = Shown(sharp_gripper())
+    cause, _, text = told(shown, shown.judge(), camera=make_camera(zoomed(1.0 + change)))
+    assert cause is Cause.LENS
+    assert stated(text) == pytest.approx(100.0 * change, abs=0.05)
+    assert "along its axis" in text
+
+
+def test_another_focus_is_named_and_a_smear_is_not():
+    shown = Shown(sharp_gripper())
+    cause, _, text = told(shown, shown.judge(), blur_px=1.8)
+    assert cause is Cause.LENS
+    assert stated(text) == pytest.approx(1.1)
+    # Smeared along one direction: edges along it stay sharp.
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        evidence = shown.evidence()
+        smeared = 0.7**2 + (2.0 * evidence.across[:, 0]) ** 2
+        judge.add(dataclasses.replace(evidence, blur_px2=smeared))
+    assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
+
+
+@pytest.mark.parametrize("outliers", [0, 5])
+def test_nothing_is_named_when_nothing_moved(outliers: int):
+    for seed in range(10):
+        shown = Shown(sharp_gripper(), seed=seed)
+        cause, part, text = told(shown, shown.judge(outliers=outliers), outliers=outliers)
+        assert (cause, part) == (Cause.UNKNOWN, None)
+        assert "stand where they did" in text
+
+
+def test_what_was_wrong_from_the_start_is_no_news():
+    """Reference and report are off as far as they may be, and stay so."""
+    shown = Shown(sharp_gripper())
+    off = {"cam_T_grip": knocked(shown.reference, (1.5e-4, -1e-4, 2e-4), (0.1, 0.05, -0.1)), "opening_m": 0.0342}
+    assert told(shown, shown.judge(**off), **off)[0] is Cause.UNKNOWN
+    bent = {"right": bend(shown.gripper, "right", (2e-4, -2e-4))}
+    assert told(shown, shown.judge(**off), **off, bent=bent)[:2] == (Cause.FINGER_BENT, "right")
+
+
+def test_a_finger_that_was_bent_from_the_start_does_not_pass_for_normal():
+    shown = Shown(sharp_gripper())
+    bent = {"left": bend(shown.gripper, "left", (-8e-4, 5e-4))}
+    assert told(shown, shown.judge(bent=bent), bent=bent)[:2] == (Cause.FINGER_BENT, "left")
+
+
+def test_two_fingers_bent_differently_have_no_single_cause():
+    shown = Shown(sharp_gripper())
+    bent = {"left": bend(shown.gripper, "left", (-8e-4, 5e-4)), "right": bend(shown.gripper, "right", (3e-4, 1e-3))}
+    cause, _, text = told(shown, shown.judge(), bent=bent)
+    assert cause is Cause.UNKNOWN
+    assert "no single cause" in text
+
+
+def test_an_opening_that_nobody_reports_is_never_reported_wrong():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge(reported_m=None)
+    told(shown, judge, reported_m=None, opening_m=OPENING_M + 1e-3)
+    causes = {c.cause for c in judge.explanation(shown.reference).causes}
+    assert Cause.JAW_OPENING not in causes
+    assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN  # it may open as it likes
+    bent = {"left": bend(shown.gripper, "left", (0.0, 6e-4))}  # across the way of the jaws
+    assert told(shown, shown.judge(reported_m=None), reported_m=None, bent=bent)[:2] == (Cause.FINGER_BENT, "left")
+
+
+def test_one_finger_without_a_jaw_leaves_camera_and_lens():
+    shown = Shown(Gripper(msgspec.convert(cube_model(), GripperModel)))
+    judge = shown.judge()
+    assert told(shown, judge, cam_T_grip=knocked(shown.reference, (4e-4, 2e-4, 0.0)))[0] is Cause.CAMERA_MOUNT
+    causes = {c.cause for c in judge.explanation(shown.reference).causes}
+    assert causes == {Cause.CAMERA_MOUNT, Cause.LENS, Cause.UNKNOWN}
+
+
+def test_a_finger_that_is_not_seen_is_hidden_or_bent_who_knows():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    cause, part, text = told(shown, judge, hidden=("left",))
+    assert (cause, part) == (Cause.UNKNOWN, None)
+    assert "finger left is not seen" in text
+    named = {c.cause for c in judge.explanation(shown.reference).causes if c.probability > 0.1}
+    assert named == {Cause.VIEW_BLOCKED, Cause.FINGER_BENT}
+
+
+def test_nothing_seen_at_all_is_a_blocked_view_or_a_noisy_image():
+    shown = Shown(sharp_gripper())
+    everything = ("left", "right")
+    assert told(shown, shown.judge(), hidden=everything)[0] is Cause.VIEW_BLOCKED
+    assert told(shown, shown.judge(), hidden=everything, noise=0.08)[0] is Cause.IMAGE_BAD
+
+
+def test_another_camera_is_thought_of_only_after_an_interruption():
+    shown = Shown(sharp_gripper())
+    scene = {
+        "camera": make_camera(zoomed(1.05)),
+        "cam_T_grip": knocked(shown.reference, (1e-3, -5e-4, 1e-3), (0.5, -0.8, 0.3)),
+        "sigma_px": 0.01,
+    }
+    judge = shown.judge(sigma_px=0.01)
+    judge.interrupted()
+    cause, _, text = told(shown, judge, **scene)
+    assert cause is Cause.CAMERA_REPLACED
+    assert stated(text) == pytest.approx(5.0, abs=0.3)
+    judge = shown.judge(sigma_px=0.01)
+    told(shown, judge, **scene)
+    assert Cause.CAMERA_REPLACED not in {c.cause for c in judge.explanation(shown.reference).causes}
+
+
+def test_without_evidence_the_cause_is_unknown_and_evidence_can_be_forgotten():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
+    bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}
+    assert told(shown, judge, bent=bent)[0] is Cause.FINGER_BENT
+    judge.reset()
+    assert told(shown, judge)[0] is Cause.UNKNOWN
+    judge.rebase(REFERENCE_SIGMA)
+    assert judge.wants_baseline
+    assert told(shown, judge)[0] is Cause.UNKNOWN
+
+
+def test_a_few_mistaken_frames_do_not_decide():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    bent = {"left": bend(shown.gripper, "left", (1e-3, 1e-3))}
+    for k in range(12):
+        judge.add(shown.evidence(bent=bent) if k % 4 == 1 else shown.evidence())
+    assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
+
+
+@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
+def test_residuals_are_distances_in_the_image_and_their_derivatives_hold(lens: LensSettings):
+    """Against the camera's projection of the moved gripper, and central differences."""
+    shown, gripper = Shown(two_fingers(), lens), two_fingers()
+    evidence = shown.evidence(opening_m=0.032, sigma_px=0.0)
+    view = EdgeView(shown.camera, gripper, evidence)
+    state = State(shown.reference, 0.032, 0.0, np.zeros((2, 6)))
+    assert np.abs(view.residual(state)[0]).max() < 2e-3
+    # A small known motion of the left finger shows as the projection says.
+    shift = np.array([2e-5, -3e-5, 4e-5])
+    finger = np.zeros((2, 6))
+    finger[0, :3] = shift
+    residual = view.residual(State(shown.reference, 0.032, 0.0, finger))[0]
+    points = gripper.points_grip_m(0.032) @ shown.reference[:3, :3].T + shown.reference[:3, 3]
+    ends = points[gripper.edge_points[evidence.edge]]
+    spot = ends[:, 0] + evidence.fraction[:, None] * (ends[:, 1] - ends[:, 0])
+    own = gripper.edge_finger[evidence.edge] == 0
+    way_px = shown.camera.project(spot + shift) - shown.camera.project(spot)
+    expected = np.where(own, -np.einsum("si,si->s", way_px, evidence.across), 0.0)
+    np.testing.assert_allclose(residual, expected, atol=4e-3)
+    # Derivatives of the prediction, of which the residual has the negative; where the pieces lie on their edges.
+    state = State(perturb(shown.reference, np.full(6, 2e-5)), 0.03201, 1e-4, np.zeros((2, 6)))
+    jacobian = view.residual(state)[1]
+    for unknown in range(FINGERS + 12):
+        step = np.zeros(FINGERS + 12)
+        step[unknown] = 1e-6
+        after, before = view.residual(state.moved(step, gripper))[0], view.residual(state.moved(-step, gripper))[0]
+        scale = max(float(np.abs(jacobian[:, unknown]).max()), 1.0)
+        np.testing.assert_allclose(jacobian[:, unknown] / scale, (before - after) / 2e-6 / scale, atol=3e-3)
+
+
+def test_the_evidence_is_the_integral_over_the_prior():
+    """One free unknown, the opening, and edges without an error of their own: quadrature does it, too."""
+    shown = Shown(sharp_gripper(), seed=5)
+    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
+    view, gripper = EdgeView(shown.camera, shown.gripper, evidence), shown.gripper
+    start = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6)))
+    held, freed, sizes = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12), np.array([1e-4, 1e-3])
+    freed[JAW] = 1.0
+    count = len(evidence.edge)
+    edge = np.unique(evidence.edge, return_inverse=True)[1]
+    errors = Errors(np.zeros(count), np.full(count, 0.2), np.full(count, 1e-6), edge)
+    found = weigh(view, gripper, Model(held, freed, sizes), start, start, errors)
+    residual, jacobian = view.residual(start)
+
+    def density(way_m: float) -> float:
+        error = (residual - jacobian[:, JAW] * way_m) / 0.2
+        likelihood = np.exp(-0.5 * (FREEDOM + 1.0) * np.log1p(error**2 / FREEDOM).sum())
+        return float(likelihood * np.mean(norm.pdf(way_m, scale=sizes)))
+
+    integral = quad(density, -1e-3, 1e-3, points=(8e-5,), limit=200)[0]
+    assert found.log_evidence == pytest.approx(math.log(integral), abs=0.25)
+    assert found.motion[JAW] == pytest.approx(8e-5, abs=3e-5)
+    assert not found.motion[POSE].any() and found.motion[FOCAL] == 0.0
+
+
+def test_settings_refuse_a_probability_that_names_anything():
+    with pytest.raises(msgspec.ValidationError, match="probable"):
+        msgspec.convert({"probable": 0.4}, CauseSettings)

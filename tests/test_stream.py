@@ -1,0 +1,198 @@
+"""Faults of the frame stream, from frames alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from gripmon.records import Cause, Frame
+from gripmon.stream import StreamFault, StreamSettings, StreamWatch
+
+FPS = 30.0
+START_NS = 1_700_000_000_000_000_000
+
+
+def picture(number: int, shape: tuple[int, ...] = (48, 64), dtype: str = "uint8") -> np.ndarray:
+    """Noise of its own about a grey ramp."""
+    ramp = np.linspace(40.0, 200.0, shape[1]).reshape((1, -1) + (1,) * (len(shape) - 2))
+    grey = ramp + np.random.default_rng(number).normal(0.0, 3.0, shape)
+    return (np.clip(grey, 0, 255)).astype(np.uint8).astype(dtype)
+
+
+def frames(first: int, count: int, fps: float = FPS, start_ns: int = START_NS) -> list[Frame]:
+    return [Frame(k, start_ns + round(k * 1e9 / fps), picture(k)) for k in range(first, first + count)]
+
+
+def kinds(watch: StreamWatch, stream: Iterable[Frame]) -> list[set[str]]:
+    return [{fault.kind for fault in watch.add(frame)} for frame in stream]
+
+
+def after(well: list[Frame], count: int, fps: float = FPS, **changes: object) -> list[Frame]:
+    """Frames that go on after others, at a rate, with fields replaced."""
+    last = well[-1]
+    return [
+        replace(
+            Frame(last.seq + k, last.stamp_ns + round(k * 1e9 / fps), picture(last.seq + k)),
+            **changes,  # type: ignore[arg-type]
+        )
+        for k in range(1, count + 1)
+    ]
+
+
+def test_a_good_stream_has_no_faults_and_its_rate_is_known():
+    watch = StreamWatch()
+    assert watch.frames_per_s is None
+    assert not any(kinds(watch, frames(0, 300)))
+    assert watch.frames_per_s == pytest.approx(FPS, rel=1e-6)
+
+
+def test_arrival_times_that_jitter_are_no_fault():
+    rng = np.random.default_rng(1)
+    watch = StreamWatch()
+    jittered = [replace(f, stamp_ns=f.stamp_ns + int(rng.normal(0.0, 5e6))) for f in frames(0, 600)]
+    assert not any(kinds(watch, jittered))
+    assert watch.frames_per_s == pytest.approx(FPS, rel=0.1)
+
+
+def test_dropped_frames_are_no_other_rate():
+    """A slow receiver sees every third frame only: their numbers tell."""
+    watch = StreamWatch()
+    well = frames(0, 150)
+    assert not any(kinds(watch, [*well, *after(well, 450)[::3]]))
+    assert watch.frames_per_s == pytest.approx(FPS / 3.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("buffers", [1, 2, 4])
+def test_a_camera_that_hangs_is_told_after_a_second(buffers: int):
+    watch = StreamWatch()
+    well = frames(0, 150)
+    assert not any(kinds(watch, well))
+    held = [f.image for f in well[-buffers:]]
+    frozen = [replace(f, image=held[k % buffers]) for k, f in enumerate(after(well, 60))]
+    found = kinds(watch, frozen)
+    first = found.index({"frozen"})
+    assert 28 <= first <= 33
+    assert all(f == {"frozen"} for f in found[first:])
+    assert not any(kinds(watch, after(frozen, 30)))
+
+
+def test_a_frozen_camera_whose_stamps_stand_still_too():
+    watch = StreamWatch()
+    well = frames(0, 150)
+    kinds(watch, well)
+    last = well[-1]
+    found = kinds(watch, [last] * 60)
+    assert found[-1] == {"frozen", "clock"}
+
+
+def test_a_source_that_shows_every_frame_twice_is_not_frozen():
+    """A camera of 15 frames a second behind an interface of 30."""
+    watch = StreamWatch(StreamSettings(frozen_frames=2, frozen_s=0.03))
+    twice = [replace(f, image=picture(f.seq // 2)) for f in frames(0, 300)]
+    assert not any(kinds(watch, twice))
+
+
+def test_frames_that_repeat_for_a_moment_are_not_frozen():
+    watch = StreamWatch()
+    well = frames(0, 150)
+    kinds(watch, well)
+    assert not any(kinds(watch, after(well, 20, image=well[-1].image)))
+
+
+def test_an_even_image_is_another_fault():
+    watch = StreamWatch()
+    black = [replace(f, image=np.zeros((48, 64), np.uint8)) for f in frames(0, 150)]
+    assert not any(kinds(watch, black))
+
+
+@pytest.mark.parametrize(
+    ("change_ns", "kind", "cause"),
+    [(-50_000_000, "clock", Cause.CLOCK), (-(10**15), "clock", Cause.CLOCK), (60 * 10**9, "gap", Cause.UNKNOWN)],
+)
+def test_a_clock_that_was_set_is_told_and_forgotten(change_ns: int, kind: str, cause: Cause):
+    watch = StreamWatch()
+    well = frames(0, 150)
+    kinds(watch, well)
+    later = [replace(f, stamp_ns=f.stamp_ns + change_ns) for f in after(well, 80)]
+    told = watch.add(later[0])
+    assert [(f.kind, f.cause) for f in told] == [(kind, cause)]
+    assert not kinds(watch, later[1:])[-1]
+
+
+def test_a_clock_that_stands_still_is_told_but_not_one_frame_handed_over_twice():
+    watch = StreamWatch()
+    well = frames(0, 150)
+    assert not any(kinds(watch, [*well, well[-1], *after(well, 60)]))
+    later = after(after(well, 60), 40, stamp_ns=well[-1].stamp_ns + 2 * 10**9)
+    assert kinds(watch, later)[-1] == {"clock"}
+
+
+@pytest.mark.parametrize("factor", [0.4, 0.55, 1.9, 4.0])
+def test_another_rate_is_told_within_seconds_and_cleared(factor: float):
+    watch = StreamWatch()
+    well = frames(0, 150)
+    kinds(watch, well)
+    other = after(well, round(5.0 * factor * FPS), fps=factor * FPS)
+    found = kinds(watch, other)
+    first_s = found.index({"rate"}) / (factor * FPS)
+    assert 0.9 < first_s < 3.5
+    faults = watch.add(after(other, 1, fps=factor * FPS)[0])
+    assert faults[0].cause is Cause.CLOCK
+    assert f"{factor * FPS:.1f} frames a second" in faults[0].text and f"{FPS:.1f} were usual" in faults[0].text
+    assert not kinds(watch, after(other, 200))[-1]
+
+
+def test_a_short_hiccup_is_no_other_rate():
+    watch = StreamWatch()
+    well = frames(0, 150)
+    slow = after(well, 5, fps=5.0)
+    assert not any(kinds(watch, [*well, *slow, *after(slow, 150)]))
+
+
+def test_frames_that_come_as_they_like_have_no_usual_rate():
+    """Photographs taken by hand."""
+    rng = np.random.default_rng(2)
+    stamp_ns, watch = START_NS, StreamWatch()
+    for k in range(400):
+        stamp_ns += int(1e9 * np.exp(rng.normal(0.0, 1.5)))
+        assert not [f for f in watch.add(Frame(k, stamp_ns, picture(k))) if f.kind == "rate"]
+
+
+def test_frames_minutes_apart_are_no_gaps():
+    assert not any(kinds(StreamWatch(), frames(0, 100, fps=0.01)))
+
+
+@pytest.mark.parametrize("other", [picture(1, (40, 64)), picture(1, (48, 64, 3)), picture(1, dtype="uint16")])
+def test_images_of_another_size_or_type_are_another_camera(other: np.ndarray):
+    watch = StreamWatch()
+    well = frames(0, 20)
+    kinds(watch, well)
+    later = [replace(f, image=other + (f.seq % 2)) for f in after(well, 10)]
+    assert [bool(k) for k in kinds(watch, later)] == [False, False] + [True] * 8
+    fault = next(f for f in watch.add(later[-1]) if f.kind == "replaced")
+    assert fault.cause is Cause.CAMERA_REPLACED
+    assert "they were 64x48 px of type uint8" in fault.text
+    assert not kinds(watch, after(later, 5))[-1]
+
+
+def test_one_odd_image_is_not_another_camera():
+    watch = StreamWatch()
+    well = frames(0, 20)
+    assert not any(kinds(watch, [*well, *after(well, 1, image=picture(1, (40, 64))), *after(well, 5)[1:]]))
+
+
+@pytest.mark.parametrize("bad", [None, "no image", np.zeros(5), np.zeros((0, 0)), np.full((48, 64), np.nan)])
+def test_bad_images_raise_nothing(bad: object):
+    watch = StreamWatch()
+    for frame in frames(0, 60):
+        assert isinstance(watch.add(replace(frame, image=bad)), tuple)  # type: ignore[arg-type]
+
+
+def test_a_fault_is_a_value_and_settings_are_checked():
+    assert StreamFault("clock", Cause.CLOCK, "x") == StreamFault("clock", Cause.CLOCK, "x")
+    with pytest.raises(msgspec.ValidationError, match="frozen_s"):
+        msgspec.convert({"frozen_s": 0.0}, StreamSettings)
