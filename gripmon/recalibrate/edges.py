@@ -12,8 +12,11 @@ from gripmon.geometry import perturbation_between
 from gripmon.recalibrate.stills import StillFrame
 from gripmon.records import Array, EdgeSums
 
-POINT_PX = 0.03
-"""Standard deviation of a stretch's mean that lasts and that nothing explains, px."""
+STRETCH_PX, EDGE_PX = 0.015, 0.03
+"""Standard deviations that last and that nothing explains, px: of a stretch's mean, and of a whole edge."""
+
+FEWEST_FREE = 3
+"""Stretches beyond the unknowns from which their residuals say anything."""
 
 LOST = 1.0
 """Variance of a pose that isn't determined without one of its edges, m² and rad²."""
@@ -30,7 +33,8 @@ _SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m by rad: equal pixels, abo
 @dataclass(frozen=True, slots=True)
 class PooledEdges:
     """Stretches of edges summed over all frames, with residuals about one pose; fields as in
-    :class:`~gripmon.records.EdgeSums`.
+    :class:`~gripmon.records.EdgeSums`.  ``sigma_px`` (s,) standard deviation of a stretch's residual by itself,
+    ``shared_px`` (s,) of what it shares with the others of its edge.
     """
 
     edge: NDArray[np.intp]
@@ -38,6 +42,7 @@ class PooledEdges:
     residual_px: Array
     jacobian: Array
     sigma_px: Array
+    shared_px: Array
     moment: Array
     information: Array
 
@@ -67,7 +72,8 @@ def pool(frames: list[StillFrame], cam_T_grip: Array) -> PooledEdges:
         total(weights * all_of("residual_px")) / weight,
         total(weights[:, None] * all_of("jacobian")) / weight[:, None],
         # What lasts of a stretch's error is that of one frame, however many there are.
-        np.sqrt(POINT_PX**2 + spread_px**2 + count[often] / weight),
+        np.sqrt(STRETCH_PX**2 + count[often] / weight),
+        np.hypot(EDGE_PX, spread_px),
         total(all_of("moment")),
         total(all_of("information")),
     )
@@ -109,26 +115,30 @@ def fingers_disagree(pooled: PooledEdges) -> float | None:
     """Probability that fingers which belong together would show residuals which setting one of them free explains so
     much better (F-test: six more unknowns, each); None where fewer than two fingers, or too few stretches, are seen.
 
-    Only the ratio of residuals counts: it doesn't matter how well their size is known.
+    The stretches of an edge err together, too.  Their errors may be larger than :data:`STRETCH_PX` and :data:`EDGE_PX`:
+    then the ratio of residuals alone decides.
     """
     fingers = np.unique(pooled.finger)
     if len(fingers) < 2:
         return None
-    worst = None
-    weight = 1.0 / pooled.sigma_px[:, None]
-    together = pooled.jacobian * _SCALE * weight
-    residual = pooled.residual_px * weight[:, 0]
-    left, rank = _left(together, residual)
+    whitening = _whitening(pooled)
+    jacobian, residual = whitening @ (pooled.jacobian * _SCALE), whitening @ pooled.residual_px
+    left, rank = _left(jacobian, residual)
+    chances = []
     for finger in fingers[1:].tolist():
-        apart = np.hstack([together, together * (pooled.finger == finger)[:, None]])
-        less, more = _left(apart, residual)
+        own = (pooled.finger == finger)[:, None]
+        less, more = _left(np.hstack([jacobian, whitening @ (pooled.jacobian * _SCALE * own)]), residual)
         free = len(residual) - more
-        if free < 3 or more == rank:
-            continue
-        ratio = ((left - less) / (more - rank)) / max(less / free, 1e-12)
-        chance = float(fisher.sf(ratio, more - rank, free))
-        worst = chance if worst is None else min(worst, chance)
-    return worst
+        if free >= FEWEST_FREE and more > rank:
+            ratio = ((left - less) / (more - rank)) / max(less / free, 1.0)
+            chances.append(float(fisher.sf(ratio, more - rank, free)))
+    return min(chances, default=None)
+
+
+def _whitening(pooled: PooledEdges) -> Array:
+    """(s, s) that makes the stretches' errors independent, of size one."""
+    together = (pooled.edge[:, None] == pooled.edge) * np.outer(pooled.shared_px, pooled.shared_px)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(together + np.diag(pooled.sigma_px**2))))
 
 
 def _left(unknowns: Array, values: Array) -> tuple[float, int]:

@@ -26,7 +26,7 @@ from gripmon.recalibrate.pnp import (
     solutions,
 )
 from gripmon.recalibrate.settings import RecalibrationSettings
-from gripmon.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, mean_corners
+from gripmon.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
 from gripmon.records import Array, ReferenceInputs, ReferenceRecord
 
 MOST_OUTLYING = 0.25
@@ -35,7 +35,7 @@ MOST_OUTLYING = 0.25
 OUTLIERS = 0.25
 """Part of the corners that may be left out because the others contradict them; at least one."""
 
-UNLIKELY = 1e-3
+UNLIKELY = 0.01
 """Chance below which residuals are believed to say that the fingers don't belong together."""
 
 
@@ -131,8 +131,8 @@ class Recalibrator:
         self._check_still(tracked)
         pooled = pool(frames, tracked.cam_T_grip)
         by_edges = leave_one_out(pooled)
-        covariance = _larger(tracked.covariance, by_edges) + self._floor
-        at_last = _larger(tracked.covariance_at_last, by_edges) + self._floor
+        covariance = larger(tracked.covariance, by_edges) + self._floor
+        at_last = larger(tracked.covariance_at_last, by_edges) + self._floor
         tracked = replace(tracked, covariance=covariance)
         corners, pose = self._by_corners(mean_corners(frames, tracked.cam_T_grip), tracked)
         self._check_fingers(pooled)
@@ -283,12 +283,3 @@ def _agree(pose: Recalibration, tracked: Average) -> bool:
     """Whether the corners' pose is the tracked one within both covariances, as if they were independent."""
     difference = perturbation_between(tracked.cam_T_grip, pose.cam_T_grip)
     return bool(difference @ np.linalg.solve(pose.covariance + tracked.covariance, difference) <= GATE)
-
-
-def _larger(covariance: Array, other: Array) -> Array:
-    """(m, m) the larger of two covariances along each of their common axes."""
-    factor = np.linalg.cholesky(covariance)
-    inverse = np.linalg.inv(factor)
-    part, axes = np.linalg.eigh(inverse @ other @ inverse.T)
-    axes = factor @ axes
-    return np.asarray((axes * np.maximum(part, 1.0)) @ axes.T)

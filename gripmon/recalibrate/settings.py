@@ -34,7 +34,7 @@ class RecalibrationSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=T
             le=0.01,
             description="standard deviation of the new TCP (of its distance) from which an operator must accept it (m)",
         ),
-    ] = 2e-5
+    ] = 1.7e-5
     largest_sigma_m: Annotated[
         float, Meta(gt=0.0, le=0.01, description="the same from which it is refused altogether (m)")
     ] = 2e-4

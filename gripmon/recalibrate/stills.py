@@ -27,6 +27,9 @@ GATE = 22.46
 OUTLYING = 37.7
 """The same for once in a million times: from there on one frame doesn't belong to the others."""
 
+FIRST = 3
+"""First frames, whose claims are taken for those of all if they are larger."""
+
 FEWEST_SEEN = 0.2
 """Part of the frames in which a corner must be usable."""
 
@@ -77,7 +80,9 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
     if np.count_nonzero(~far) >= 4:
         xis, weights = xis[~far], weights[~far]
     claimed = np.linalg.inv(weights.mean(axis=0))
-    mean = claimed @ np.einsum("nij,nj->i", weights, xis) / len(xis)
+    mean = np.linalg.solve(weights.sum(axis=0), np.einsum("nij,nj->i", weights, xis))
+    # What later frames claim to know better, of the jaw's opening say, they have learnt from pictures that err alike.
+    claimed = larger(claimed, np.mean([f.covariance for f in frames[:FIRST]], axis=0))
     scatter = np.cov(xis.T)
     half = len(xis) // 2
     way = xis[-half:].mean(axis=0) - xis[:half].mean(axis=0)
@@ -107,6 +112,15 @@ def averaged_covariance(claimed: Array, scatter: Array, count: int) -> Array:
     left = np.maximum(1.0 - part, LASTING) + part * (NEIGHBOURS / count)
     axes = factor @ axes
     return np.asarray((axes * left) @ axes.T)
+
+
+def larger(covariance: Array, other: Array) -> Array:
+    """(m, m) the larger of two covariances along each of their common axes."""
+    factor = np.linalg.cholesky(covariance)
+    inverse = np.linalg.inv(factor)
+    part, axes = np.linalg.eigh(inverse @ other @ inverse.T)
+    axes = factor @ axes
+    return np.asarray((axes * np.maximum(part, 1.0)) @ axes.T)
 
 
 def _middle(frames: list[StillFrame]) -> Array:

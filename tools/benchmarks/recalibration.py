@@ -24,8 +24,8 @@ one-sided with 95 % confidence (Clopper and Pearson)."""
 RIGHT_M = 5e-5
 """Error of an accepted TCP up to which it is right."""
 
-AFTER = 66
-"""Frames after the knock that are looked at, at most."""
+AFTER, LOST_FOR = 66, 15
+"""Frames after the knock that are looked at, at most; fewer once so many in a row don't show the gripper."""
 
 ANSWERS = ("accepted", "person", "refused", "gripper", "unsettled", "lost", "needless")
 _MEANINGS = {
@@ -115,6 +115,7 @@ def trial(seed: int, number: int) -> Outcome:
     covariance = tuple(knock.start_covariance.ravel().tolist())
     start = ReferenceRecord("start", 1, 0, "configuration", to_record(knock.start_cam_T_grip), covariance)
     monitor = Monitor(knock.camera, knock.model, settings, start)
+    unseen = (State.LOST, State.OCCLUDED, State.ACQUIRING)
     states = []
     answer, why = "", ""
     index = 0
@@ -128,7 +129,7 @@ def trial(seed: int, number: int) -> Outcome:
             answer, why = "person", getattr(outcome, "needs_person", None) or ""
         elif isinstance(outcome, Refusal) and not outcome.wait:
             answer, why = "refused", str(outcome.reason)
-        if answer:
+        if answer or (len(states) > LOST_FOR and all(s in unseen for s in states[-LOST_FOR:])):
             break
     if not answer:
         answer = _without_answer(states[BEFORE:], State)
