@@ -13,6 +13,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.recalibrate import RecalibrationSettings
 from gripmon.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.simulator import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulator.scenario import Background, Cover, Creep
@@ -110,7 +111,9 @@ def watch(frames: tuple[Frame, ...], truths: tuple[FrameTruth, ...], monitor: Mo
 
 @lru_cache(maxsize=16)
 def watched(scene: str, measurement: str = "edges") -> Watched:
-    settings = MonitorSettings(measurement=measurement)  # type: ignore[arg-type]
+    # A few corners are less certain than the edges: what counts as sure has to be less, too.
+    sure = RecalibrationSettings(**({"sure_sigma_m": 1e-4} if measurement == "corners" else {}))
+    settings = MonitorSettings(measurement=measurement, recalibration=sure)  # type: ignore[arg-type]
     return watch(*frames_of(scene), new_monitor(settings))
 
 
