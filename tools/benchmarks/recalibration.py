@@ -105,13 +105,12 @@ def trial(seed: int, number: int) -> Outcome:
     from benchmarks.knocks import BEFORE, draw_knock
     from gripmon.geometry import from_record, to_record
     from gripmon.monitor import Monitor, MonitorSettings
-    from gripmon.policy import PolicySettings
     from gripmon.recalibrate import Refusal
     from gripmon.records import ReferenceRecord, State
 
     knock = draw_knock(seed, number)
     known = {} if knock.jaw_sigma_m is None else {"jaw_sigma_m": knock.jaw_sigma_m}
-    settings = MonitorSettings(policy=PolicySettings(frames_per_s=knock.simulator.scenario.fps), **known)
+    settings = MonitorSettings(**known)
     covariance = tuple(knock.start_covariance.ravel().tolist())
     start = ReferenceRecord("start", 1, 0, "configuration", to_record(knock.start_cam_T_grip), covariance)
     monitor = Monitor(knock.camera, knock.model, settings, start)
