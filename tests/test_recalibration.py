@@ -15,6 +15,7 @@ from gripmon.gripper import load_gripper
 from gripmon.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.recalibrate.edges import fingers_disagree, leave_one_out, pool
 from gripmon.recalibrate.recalibrator import UNLIKELY
+from gripmon.recalibrate.stills import LASTING as LASTING_PART
 from gripmon.recalibrate.stills import NEIGHBOURS, average, averaged_covariance, mean_corners
 
 SURE = RecalibrationSettings(sure_sigma_m=1e-4)
@@ -72,15 +73,41 @@ def test_the_covariance_is_that_of_the_error():
     assert 0.4 < np.mean(squares) < 1.25
 
 
+def white(rng: np.random.Generator, covariance: np.ndarray, count: int) -> np.ndarray:
+    """(n, m) with exactly this scatter, neighbours alternating."""
+    values = rng.normal(size=(count // 2, len(covariance))) * np.array([1.0, -1.0])[:, None, None]
+    values = values.transpose(1, 0, 2).reshape(count, -1)
+    values = np.linalg.solve(np.linalg.cholesky(np.cov(values.T)), values.T).T
+    return values @ np.linalg.cholesky(covariance).T
+
+
 def test_only_what_scatters_is_averaged_away():
+    rng = np.random.default_rng(1)
     claimed = np.diag([4.0, 1.0, 9.0])
-    np.testing.assert_allclose(averaged_covariance(claimed, np.zeros((3, 3)), 50), claimed)
-    half = averaged_covariance(claimed, 0.5 * claimed, 50)
-    np.testing.assert_allclose(half, claimed * (0.5 + 0.5 * NEIGHBOURS / 50))
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    scatter = np.diag([0.4, 0.8, 3.0])
-    there = averaged_covariance(turn @ claimed @ turn.T, turn @ scatter @ turn.T, 20)
-    np.testing.assert_allclose(there, turn @ averaged_covariance(claimed, scatter, 20) @ turn.T, atol=1e-12)
+    np.testing.assert_allclose(averaged_covariance(claimed, np.ones((50, 3)), 50), claimed, atol=1e-12)
+    half = averaged_covariance(claimed, white(rng, 0.5 * claimed, 50), 50)
+    np.testing.assert_allclose(half, claimed * (0.5 + 0.5 * NEIGHBOURS / 50), atol=1e-12)
+    all_of_it = averaged_covariance(claimed, white(rng, claimed, 50), 100)
+    np.testing.assert_allclose(all_of_it, claimed * (LASTING_PART + NEIGHBOURS / 100), atol=1e-12)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    values = white(rng, np.diag([0.4, 0.8, 3.0]), 20)
+    there = averaged_covariance(turn @ claimed @ turn.T, values @ turn.T, 20)
+    np.testing.assert_allclose(there, turn @ averaged_covariance(claimed, values, 20) @ turn.T, atol=1e-12)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.8])
+def test_frames_that_err_alike_count_as_fewer(correlation: float):
+    """Averages of series whose neighbours are correlated: their scatter is what a single series says, or less."""
+    rng = np.random.default_rng(2)
+    means, said = [], []
+    for _ in range(400):
+        values = np.zeros(30)
+        values[0] = rng.normal()
+        for k in range(1, 30):
+            values[k] = correlation * values[k - 1] + np.sqrt(1.0 - correlation**2) * rng.normal()
+        means.append(values.mean())
+        said.append(averaged_covariance(np.eye(1), values[:, None], 30)[0, 0] - LASTING_PART)
+    assert np.var(means) < 1.25 * np.mean(said)
 
 
 def test_frames_that_show_the_gripper_elsewhere_do_not_pull_the_average():

@@ -18,8 +18,10 @@ from gripmon.records import Array, EdgeSums
 LASTING = 0.25
 """Part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""
 
-NEIGHBOURS = 2.0
-"""Frames in a row that count as one: their changing errors are alike, too."""
+NEIGHBOURS, MOST_ALIKE = 2.0, 0.9
+"""Frames in a row that count as one at least, since their changing errors are alike, too; and the largest correlation
+of neighbours that a few frames can tell.
+"""
 
 GATE = 22.46
 """Squared normalised error that six normal errors exceed once in a thousand times (chi-square)."""
@@ -89,29 +91,44 @@ def average(frames: list[StillFrame], most_frames: int) -> Average:
     trend = float(way @ np.linalg.solve(scatter * (2.0 * NEIGHBOURS / half) + 1e-6 * claimed, way))
     return Average(
         perturb(middle_T, mean),
-        averaged_covariance(claimed, scatter, len(xis)),
-        averaged_covariance(claimed, scatter, max(most_frames, len(xis))),
+        averaged_covariance(claimed, xis, len(xis)),
+        averaged_covariance(claimed, xis, max(most_frames, len(xis))),
         way,
         trend,
         outlying,
     )
 
 
-def averaged_covariance(claimed: Array, scatter: Array, count: int) -> Array:
-    """Covariance (m, m) of the mean of ``count`` values whose error has the ``claimed`` covariance each, and that show
-    the covariance ``scatter`` about their mean.
+def averaged_covariance(claimed: Array, values: Array, count: int) -> Array:
+    """Covariance (m, m) of the mean of ``count`` values in a row whose error has the ``claimed`` covariance each, as n
+    of them, ``values`` (n, m), show.
 
-    Along each common axis of the two, with v the scatter in units of what is claimed: what doesn't scatter, 1 - v, but
-    at least :data:`LASTING`, stays as it is, and v becomes less as the mean of ``count / NEIGHBOURS`` independent
-    values.
+    Along each common axis of what is claimed and of the values' scatter, with v the scatter in units of what is
+    claimed: what doesn't scatter, 1 - v, but at least :data:`LASTING`, stays as it is, and v becomes less as the mean
+    of so many independent values as the values' own likeness from one to the next leaves.
     """
     factor = np.linalg.cholesky(claimed)
-    inverse = np.linalg.inv(factor)
-    part, axes = np.linalg.eigh(inverse @ scatter @ inverse.T)
+    off = np.linalg.solve(factor, (values - values.mean(axis=0)).T)
+    part, axes = np.linalg.eigh(off @ off.T / (len(values) - 1))
     part = np.maximum(part, 0.0)
-    left = np.maximum(1.0 - part, LASTING) + part * (NEIGHBOURS / count)
+    alike = np.array([_alike(row) for row in axes.T @ off])
+    left = np.maximum(1.0 - part, LASTING) + part * np.minimum(alike / count, 1.0)
     axes = factor @ axes
     return np.asarray((axes * left) @ axes.T)
+
+
+def _alike(values: Array) -> float:
+    """How many values (n,) in a row count as one: from the correlation of neighbours, as if all of it were handed on
+    from one to the next.
+    """
+    squares = float(values @ values)
+    if not squares > 0.0:
+        return NEIGHBOURS
+    count = len(values)
+    correlation = float(values[1:] @ values[:-1]) / squares
+    # A short series shows too little of it (Marriott and Pope 1954).
+    correlation = min(correlation + (1.0 + 3.0 * correlation) / count, MOST_ALIKE)
+    return max((1.0 + correlation) / (1.0 - correlation), NEIGHBOURS)
 
 
 def larger(covariance: Array, other: Array) -> Array:
