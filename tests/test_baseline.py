@@ -3,39 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from gripmon.policy import Baseline, Evidence, Policy, PolicySettings
-from gripmon.records import AlertKind, Cause
+from gripmon.drift import Baseline
 
-SETTINGS = PolicySettings(settle_frames=5)
 REFERENCE_SIGMA = np.array([2e-4] * 3 + [2e-3] * 3)
-NOISE = np.array([5e-6] * 3 + [1e-4] * 3)
-
-
-def drift_alerts(reference_sigma: np.ndarray | None, shift_m: float, later_m: float = 0.0) -> int:
-    """Alerts of kind drift over 200 frames that all stand ``shift_m`` beside the reference, ``later_m`` more from
-    frame 100 on.
-    """
-    policy, alerts = Policy(SETTINGS, reference_sigma), 0
-    for index in range(200):
-        shift = np.zeros(6)
-        shift[0] = shift_m + (later_m if index >= 100 else 0.0)
-        judgement = policy.measured(Evidence(shift, NOISE, abs(shift[0]), 0.0, False, Cause.UNKNOWN))
-        alerts += sum(alert.kind is AlertKind.DRIFT for alert in judgement.alerts)
-    return alerts
-
-
-def test_an_offset_within_the_reference_s_uncertainty_is_no_drift():
-    assert drift_alerts(REFERENCE_SIGMA, 5e-4) == 0
-    assert drift_alerts(None, 5e-4) == 1, "the same offset of an exact reference is one"
-
-
-def test_an_offset_beyond_the_reference_s_uncertainty_is_drift():
-    assert drift_alerts(REFERENCE_SIGMA, 9e-4) == 1
-
-
-def test_motion_after_the_start_is_drift_whatever_the_reference():
-    assert drift_alerts(REFERENCE_SIGMA, 5e-4, later_m=2e-4) == 1
 
 
 def test_the_error_is_the_mean_of_the_first_frames():
@@ -43,4 +15,37 @@ def test_the_error_is_the_mean_of_the_first_frames():
     shifts = rng.normal(0.0, 1e-4, (6, 6))
     results = [baseline.subtract(shift) for shift in shifts]
     assert results[:3] == [None, None, None]
-    np.testing.assert_allclose(results[5], shifts[5] - shifts[:4].mean(axis=0), atol=1e-15)
+    for result, shift in zip(results[3:], shifts[3:], strict=True):
+        assert result is not None
+        np.testing.assert_allclose(result, shift - shifts[:4].mean(axis=0), atol=1e-15)
+    assert baseline.error is not None
+    np.testing.assert_allclose(baseline.error, shifts[:4].mean(axis=0), atol=1e-15)
+
+
+@pytest.mark.parametrize("axis", range(6))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_only_what_the_references_uncertainty_allows_is_its_error(axis: int, sign: float):
+    """Four standard deviations on any axis; beyond, on one axis only, all of it is a shift."""
+    for size, explained in ((3.9, True), (4.1, False)):
+        baseline, shift = Baseline(REFERENCE_SIGMA, 3), 0.5 * REFERENCE_SIGMA
+        shift[axis] = sign * size * REFERENCE_SIGMA[axis]
+        last = [baseline.subtract(shift) for _ in range(3)][-1]
+        assert last is not None
+        np.testing.assert_allclose(last, np.zeros(6) if explained else shift, atol=1e-15)
+
+
+def test_motion_after_the_start_is_none_of_it():
+    baseline, first = Baseline(REFERENCE_SIGMA, 3), np.array([5e-4, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(50):
+        baseline.subtract(first)
+    later = baseline.subtract(first + 2e-4)
+    assert later is not None
+    np.testing.assert_allclose(later, np.full(6, 2e-4))
+
+
+def test_an_error_that_is_known_from_before_counts_from_the_first_frame():
+    error = np.linspace(1e-4, 6e-4, 6)
+    baseline = Baseline(REFERENCE_SIGMA, 20, error)
+    first = baseline.subtract(error + 1e-3)
+    assert first is not None
+    np.testing.assert_allclose(first, np.full(6, 1e-3))

@@ -140,8 +140,9 @@ class Policy:
             cause, causes = self._blocked(explanation), explanation.causes
             occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
             before = book.about(VIEW)
-            if before is None or before.kind is AlertKind.OCCLUDED:  # lost isn't taken back for one frame
-                alerts += book.present(VIEW, occluded, now_s, stamp_ns)
+            # Lost isn't taken back for one frame, nor is it over while frames in between show nothing.
+            told = occluded if before is None or before.kind is AlertKind.OCCLUDED else before
+            alerts += book.present(VIEW, told, now_s, stamp_ns)
         if refusal and lasted_s >= settings.image_alert_after_s:
             text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
             bad = Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text)
