@@ -15,24 +15,27 @@ from gripmon.references import ReferenceBook
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.statefile import StateFile
 
+DIFFERENT = 12
+"""Pictures of one place: so many that one that comes again is not taken for a frozen camera's."""
+
 
 def make_pictures(folder: Path, frames: int, *, knocked_every: int | None = None) -> Path:
     """A folder of many frames: the demo's camera, which stands still, or is knocked to and fro by 3.5 mm."""
     folder.mkdir()
     config = load_config(builtin_config("demo.yaml"))
-    scenario = make_scenario("static", duration_s=0.2, fps=20.0)
+    scenario = make_scenario("static", duration_s=DIFFERENT / 20.0, fps=20.0)
     knocked_T = config.cam_T_grip.copy()
     knocked_T[0, 3] += 0.0035
     for place, cam_T_grip in enumerate((config.cam_T_grip, knocked_T)):
         simulator = Simulator(config.camera, config.gripper, cam_T_grip, scenario, 1)
-        for i in range(4):
+        for i in range(DIFFERENT):
             image = simulator.frame(i).image
-            assert image is not None and cv2.imwrite(str(folder / f"original{place}{i}.bmp"), image)
+            assert image is not None and cv2.imwrite(str(folder / f"original{place}-{i}.bmp"), image)
     links = folder / "frames"
     links.mkdir()
     for i in range(frames):
         place = 0 if knocked_every is None else i // knocked_every % 2
-        (links / f"{i:05d}.bmp").symlink_to(folder / f"original{place}{i % 4}.bmp")
+        (links / f"{i:05d}.bmp").symlink_to(folder / f"original{place}-{i % DIFFERENT}.bmp")
     return links
 
 

@@ -266,7 +266,8 @@ def broken(what: str) -> MonitorState:
     if what == "proposal":
         proposal = change(book.proposal, revision=9)
     last = Transform((0, 0, 0.1), (0, 0, 0, 0)) if what == "last" else None
-    return MonitorState(references, proposal, cam_T_grip=last)
+    errors = {"error of five": (0.0,) * 5, "endless error": (0.0, 0.0, float("inf"), 0.0, 0.0, 0.0)}
+    return MonitorState(references, proposal, cam_T_grip=last, reference_error=errors.get(what))
 
 
 @pytest.mark.parametrize(
@@ -286,6 +287,8 @@ def broken(what: str) -> MonitorState:
         ("far", "no pose"),
         ("proposal", "revision 9 follows revision 3"),
         ("last", "the last transform is no pose"),
+        ("error of five", "the error of the configured reference is no six finite numbers"),
+        ("endless error", "the error of the configured reference is no six finite numbers"),
     ],
 )
 def test_a_state_that_does_not_hold_together_is_told(what: str, reason: str):

@@ -54,7 +54,8 @@ def state_of(*steps: str, probability: float = 0.75) -> MonitorState:
         causes=(CauseWeight(Cause.CAMERA_MOUNT, probability),), tcp_shift_m=(1e-5, -2e-5, 1 / 3),
     )  # fmt: skip
     last = Transform((0.1, 0.2, 0.3), (0.0, 0.6, 0.0, 0.8))
-    return MonitorState(book.history, book.proposal, (OpenAlert("drift", alert),), 2, last)
+    error = (1e-5, -2e-5, 1e-4, 1e-3, 0.0, -1e-3)
+    return MonitorState(book.history, book.proposal, (OpenAlert("drift", alert),), 2, last, error)
 
 
 STATE = state_of("a", "a", "u")

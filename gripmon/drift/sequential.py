@@ -74,7 +74,7 @@ class SequentialTest:
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate: the contract is in days, the thresholds are in frames."""
         if abs(frames_per_s - self._frames_per_s) > 0.05 * self._frames_per_s:
-            self._frames_per_s, self._threshold = frames_per_s, None
+            self._frames_per_s, self._threshold, self._stale = frames_per_s, None, True
 
     def set_reference_covariance(self, covariance: Array) -> None:
         """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is no drift."""
