@@ -22,8 +22,8 @@ SEEN_IN = 1.0 / 3.0
 CONSTANT = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
 
-FEWEST_STRETCHES, FEWEST_SHARE = 3, 0.25
-"""Stretches of a finger, and share of its profiles, with which it counts as seen in a frame."""
+FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
+"""Stretches of a finger, edges that they lie on, and share of its profiles, with which it counts as seen in a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,9 +104,12 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
     """Fingers that should be in view and are not seen."""
-    stretches = np.bincount(gripper.edge_finger[evidence.edge], minlength=len(gripper.finger_ids))
+    count = len(gripper.finger_ids)
+    stretches = np.bincount(gripper.edge_finger[evidence.edge], minlength=count)
+    edges = np.bincount(gripper.edge_finger[np.unique(evidence.edge)], minlength=count)
     sampled = np.isfinite(evidence.finger_share)
-    seen = (stretches >= FEWEST_STRETCHES) & (np.nan_to_num(evidence.finger_share) >= FEWEST_SHARE)
+    seen = (stretches >= FEWEST_STRETCHES) & (edges >= FEWEST_EDGES)
+    seen &= np.nan_to_num(evidence.finger_share) >= FEWEST_SHARE
     return tuple(np.flatnonzero(sampled & ~seen).tolist())
 
 

@@ -57,14 +57,19 @@ class State:
         )
 
 
-def points_cam(gripper: Gripper, state: State) -> tuple[Array, Array, Array]:
+def opened(gripper: Gripper, jaw_opening_m: float) -> tuple[Array, Array]:
+    """All points (p, 3) in the gripper frame at an opening, and their derivative by it (p, 3)."""
+    points = gripper.points_grip_m(jaw_opening_m if gripper.has_jaw else None)
+    return points, gripper.point_motion(jaw_opening_m)
+
+
+def points_cam(gripper: Gripper, state: State, at_opening: tuple[Array, Array]) -> tuple[Array, Array, Array]:
     """All points (p, 3) in the camera frame, their derivative by the opening (p, 3), and the middles of the fingers'
-    points (f, 3) before their own motion.
+    points (f, 3) before their own motion; ``at_opening`` from :func:`opened`.
     """
     rotation = state.cam_T_grip[:3, :3]
-    opening_m = state.jaw_opening_m if gripper.has_jaw else None
-    points = gripper.points_grip_m(opening_m) @ rotation.T + state.cam_T_grip[:3, 3]
-    rate = gripper.point_motion(state.jaw_opening_m) @ rotation.T
+    points = at_opening[0] @ rotation.T + state.cam_T_grip[:3, 3]
+    rate = at_opening[1] @ rotation.T
     middle = np.zeros((len(gripper.finger_ids), 3))
     for finger, motion in enumerate(state.finger):
         own = gripper.point_finger == finger
@@ -79,7 +84,7 @@ def edge_places(gripper: Gripper, state: State, edge: NDArray[np.intp], fraction
     """Ideal image coordinates (s, 2) of places on edges with the calibrated focal length, and the direction (s, 2)
     across them in which offsets count as positive.
     """
-    points, _, _ = points_cam(gripper, state)
+    points, _, _ = points_cam(gripper, state, opened(gripper, state.jaw_opening_m))
     a, b = points[gripper.edge_points[edge, 0]], points[gripper.edge_points[edge, 1]]
     spot = a + fraction[:, None] * (b - a)
     return spot[:, :2] / spot[:, 2:], _across(a, b)
@@ -95,15 +100,20 @@ class EdgeView:
         self._camera = camera
         self._uv_px = camera.distort(evidence.xy)
         self._centre_px = np.array([camera.cx_px, camera.cy_px])
+        # Most models leave the opening and the focal length as they are.
+        self._opened: tuple[float, tuple[Array, Array]] | None = None
+        self._at: tuple[float, tuple[Array, Array]] | None = None
 
     def residual(self, state: State) -> tuple[Array, Array]:
         """(s,) measured minus predicted place of each stretch across its edge, px, and (s, m) the derivative of the
         predicted one by all unknowns.
         """
-        points, rate, middle = points_cam(self._gripper, state)
+        if self._opened is None or self._opened[0] != state.jaw_opening_m:
+            self._opened = state.jaw_opening_m, opened(self._gripper, state.jaw_opening_m)
+        points, rate, middle = points_cam(self._gripper, state, self._opened[1])
         a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
         xy, by_focal = self._ideal(state.log_focal)
-        line = np.cross(a, b)
+        line = _cross(a, b)
         perp = _across(a, b)
         size = np.einsum("si,si->s", line[:, :2], perp)
         off = (np.einsum("si,si->s", line[:, :2], xy) + line[:, 2]) / size
@@ -120,25 +130,35 @@ class EdgeView:
         """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
         *predictions* by.
         """
+        if self._at is not None and self._at[0] == log_focal:
+            return self._at[1]
         from_centre = self._uv_px - self._centre_px
         xy, d_xy = self._camera.undistort_with_jacobian(self._centre_px + from_centre * np.exp(-log_focal))
-        return xy, np.einsum("sij,sj->si", d_xy, from_centre) * np.exp(-log_focal)
+        self._at = log_focal, (xy, np.einsum("sij,sj->si", d_xy, from_centre) * np.exp(-log_focal))
+        return self._at[1]
 
     def _jacobian(
         self, state: State, spot: Array, gradient: Array, rate: Array, middle: Array, by_focal: Array
     ) -> Array:
         out = np.zeros((len(spot), FINGERS + state.finger.size))
         out[:, :3] = gradient
-        out[:, 3:6] = np.cross(spot - state.cam_T_grip[:3, 3], gradient)
+        out[:, 3:6] = _cross(spot - state.cam_T_grip[:3, 3], gradient)
         out[:, JAW] = np.einsum("si,si->s", gradient, rate[self._ends[:, 0]])
         out[:, FOCAL] = by_focal
-        about_middle = np.cross(spot - middle[self._finger] - state.finger[self._finger, :3], gradient)
+        about_middle = _cross(spot - middle[self._finger] - state.finger[self._finger, :3], gradient)
         for finger in range(len(state.finger)):
             own = (self._finger == finger)[:, None]
             start = FINGERS + 6 * finger
             out[:, start : start + 3] = own * gradient
             out[:, start + 3 : start + 6] = own * about_middle
         return out
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross products (s, 3), without NumPy's overhead."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.column_stack([y * w - z * v, z * u - x * w, x * v - y * u])
 
 
 def _across(a: Array, b: Array) -> Array:

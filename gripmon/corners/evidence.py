@@ -29,6 +29,9 @@ CLEARLY_BETTER = 1.2
 SEEN = 0.5
 """Share of a finger's profiles below which it is looked for farther away."""
 
+FOUND = 0.55
+"""Share of a finger's profiles that must agree there: other things have a straight edge or two as well."""
+
 WIDE_ZOOMS = (2, 4)
 """Zooms with which it is looked for there."""
 
@@ -102,7 +105,7 @@ class FingerMeter(Settler):
                 continue
             for pose in (measurement.cam_T_grip, *elsewhere):
                 other = self._farther(image, Expected(pose, opening_m, opening_m), zoom, finger)
-                if other is not None and other.share > CLEARLY_BETTER * best.share:
+                if other is not None and other.share >= max(FOUND, CLEARLY_BETTER * best.share):
                     best = other
             if best.share >= SEEN:
                 break
