@@ -17,7 +17,7 @@ from shown_edges import OPENING_M, REFERENCE_SIGMA, Shown, bend, knocked
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings, PaperLens, make_camera
-from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.causes import BlurWatch, CauseJudge, CauseSettings
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.geometry import perturb
@@ -285,3 +285,14 @@ def test_the_evidence_is_the_integral_over_the_prior():
 def test_settings_refuse_a_probability_that_names_anything():
     with pytest.raises(msgspec.ValidationError, match="probable"):
         msgspec.convert({"probable": 0.4}, CauseSettings)
+
+
+def test_a_blur_that_stays_as_it_is_is_no_news_and_another_one_is():
+    rng = np.random.default_rng(3)
+    watch = BlurWatch()
+    assert not any(watch.add(0.7 + rng.normal(0.0, 0.05)) for _ in range(500))
+    assert not any(watch.add(blur_px) for blur_px in (2.0, 2.1, None))  # two frames decide nothing
+    assert not any(watch.add(0.7) for _ in range(5))
+    assert [watch.add(1.2) for _ in range(5)] == [False, False, True, True, True]
+    assert not [watch.add(0.75) for _ in range(5)][-1]
+    assert [watch.add(0.3) for _ in range(5)][-1]

@@ -7,6 +7,7 @@ moved, one finger bent, jaw elsewhere) are special cases of that.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners.consensus import Consensus, Prior, Votes, agree
-from gripmon.corners.settling import Expected, Measurement, Settler
+from gripmon.corners.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array, EdgeEvidence, Image
 
@@ -85,6 +86,14 @@ class FingerMeter(Settler):
             noise=measurement.candidates.noise / measurement.candidates.full_scale,
             reach_px=zoom * self._settings.sampling.reach_px,
         )
+
+    def blur_px(self, measurement: Measurement) -> float | None:
+        """How blurred the edges of a measured frame are: standard deviation across them, px; None with few of them."""
+        widths_px = measurement.candidates.width_px[measurement.consensus.weight > 0.0]
+        if len(widths_px) < FEWEST_WIDTHS:
+            return None
+        kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
+        return math.sqrt(max(median(widths_px) ** 2 - kernel_px**2, 0.0))
 
     def _finger_place(
         self, image: Image, measurement: Measurement, votes: Votes, finger: int, elsewhere: tuple[Array, ...]

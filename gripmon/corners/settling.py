@@ -204,7 +204,7 @@ class Settler:
         if len(widths_px) < FEWEST_WIDTHS:
             return self._zoom
         kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
-        blur_px = math.sqrt(max(_median(widths_px) ** 2 - kernel_px**2, 0.0))
+        blur_px = math.sqrt(max(median(widths_px) ** 2 - kernel_px**2, 0.0))
         finer, coarser = BLUR_AT_ZOOM
         if blur_px > coarser * self._zoom:
             return min(2 * self._zoom, ZOOMS[-1])
@@ -272,7 +272,7 @@ class Settler:
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
         weights = base_weights(candidates, prediction, self._polarity, self._settings.consensus)
         # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
-        width_px = max(_median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
+        width_px = max(median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
         bevel_px = prediction.edge_spread_m * prediction.pixels_per_m
         spread_px = np.hypot(bevel_px, self._settings.consensus.edge_floor_px * width_px)
         return Votes(candidates, prediction, weights, spread_px, width_px * cut_off_spread(candidates, prediction))
@@ -308,7 +308,7 @@ class Settler:
         return Expected(perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m, expected.jaw_reported_m)
 
 
-def _median(values: Array) -> float:
+def median(values: Array) -> float:
     """The upper one of two middle values; NumPy's own checks for NaN take longer than the rest."""
     middle = len(values) // 2
     return float(np.partition(values, middle)[middle])

@@ -1,4 +1,4 @@
-"""One trial of ``tools/bench causes``: a monitor sees its frames, and in the end a cause is told."""
+"""One trial of ``tools/bench causes``: a monitor sees its frames, and what its alerts name in the end is taken down."""
 
 from __future__ import annotations
 
@@ -8,75 +8,52 @@ import numpy as np
 
 from benchmarks.causes_trials import START_SIGMA, Trial
 from gripmon.camera import make_camera
-from gripmon.causes import CauseJudge, CauseSettings
 from gripmon.drift import DriftSettings
 from gripmon.geometry import to_record
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.recalibrate import RecalibrationSettings
-from gripmon.records import Array, Cause, Frame, FrameRecord, ReferenceRecord
-from gripmon.stream import StreamWatch
-
-LAST = 6
-"""Newest frames of which most decide whether images are refused."""
+from gripmon.records import Alert, AlertEvent, Cause, ReferenceRecord
 
 
 @dataclass(frozen=True)
 class Told:
-    """What was told in the end: ``cause`` UNKNOWN also where nothing seems wrong, ``part`` the finger, ``causes`` as
-    in an alert, in words.
+    """``last``: what the alerts that were open in the end said, ``ever``: all that any said since it went wrong, each
+    a cause and a finger.  ``text`` and ``causes`` (cause, finger, probability) of the alert that named one, or of the
+    last.
     """
 
-    cause: Cause
-    part: str | None
+    last: frozenset[tuple[Cause, str | None]]
+    ever: frozenset[tuple[Cause, str | None]]
     causes: tuple[tuple[str, str | None, float], ...]
     text: str
 
 
 def run(trial: Trial) -> Told:
-    """Show a trial to a monitor with a judge and a stream watch beside it."""
+    """Show a trial to a monitor."""
     rig = trial.rig
-    camera = make_camera(rig.camera_settings)
-    reference = ReferenceRecord(
-        "start", 1, 0, "configuration", to_record(rig.start_cam_T_grip), tuple(np.diag(START_SIGMA**2).ravel().tolist())
-    )
+    covariance = tuple(np.diag(START_SIGMA**2).ravel().tolist())
+    reference = ReferenceRecord("start", 1, 0, "configuration", to_record(rig.start_cam_T_grip), covariance)
     settings = MonitorSettings(
         jaw_sigma_m=rig.jaw_sigma_m,
         drift=DriftSettings(frames_per_s=rig.scenario.fps),
         recalibration=RecalibrationSettings(mode="off"),
     )
-    monitor = Monitor(camera, rig.gripper, settings, reference)
-    judge = CauseJudge(
-        camera, rig.gripper, CauseSettings(), START_SIGMA, settings.jaw_sigma_m, settings.jaw_offset_sigma_m
-    )
-    stream = StreamWatch()
-    records: list[FrameRecord] = []
-    faults = []
+    monitor = Monitor(make_camera(rig.camera_settings), rig.gripper, settings, reference)
+    newest: dict[str, Alert] = {}
+    ever: set[tuple[Cause, str | None]] = set()
     for index, frame in enumerate(trial.frames()):
-        for fault in stream.add(frame):
-            # What happened at some time counts, also when it is over.
-            if fault.kind == "gap":
-                judge.interrupted()
-            else:
-                faults.append(fault)
-        records.append(monitor.process(frame))
-        _judge(monitor, judge, rig.start_cam_T_grip, frame, index < trial.well)
-    if faults:
-        return Told(faults[0].cause, None, (), faults[0].text)
-    return _told(judge, rig.start_cam_T_grip, records[-LAST:])
-
-
-def _judge(monitor: Monitor, judge: CauseJudge, ref_cam_T_grip: Array, frame: Frame, well: bool) -> None:
-    measurement = monitor._newest
-    if measurement is None or (well and not (measurement.trusted and judge.wants_baseline)):
-        return
-    evidence = monitor._tracker.evidence(frame, measurement, ref_cam_T_grip)
-    (judge.well if well else judge.add)(evidence)
-
-
-def _told(judge: CauseJudge, ref_cam_T_grip: Array, newest: list[FrameRecord]) -> Told:
-    refused = [r for r in newest if r.reason is not None and ": " in r.reason]
-    if 2 * len(refused) > len(newest):
-        return Told(Cause.IMAGE_BAD, None, (), refused[-1].reason or "")
-    explanation = judge.explanation(ref_cam_T_grip)
-    weights = tuple((c.cause.value, c.part, c.probability) for c in explanation.causes)
-    return Told(explanation.probable.cause, explanation.probable.part, weights, explanation.text)
+        record = monitor.process(frame)
+        for alert in record.alerts:
+            if alert.event in (AlertEvent.RAISED, AlertEvent.UPDATED) and index >= trial.well:
+                ever.add((alert.cause, alert.part))
+            newest[alert.alert_id or alert.kind] = alert
+    # Also what was over by then: a clock that was set once is right again.
+    told = [a for a in newest.values() if a.event is not AlertEvent.NOTED]
+    named = [a for a in told if a.cause is not Cause.UNKNOWN]
+    alert = (named or told or [None])[-1]
+    return Told(
+        frozenset((a.cause, a.part) for a in told),
+        frozenset(ever),
+        () if alert is None else tuple((c.cause.value, c.part, c.probability) for c in alert.causes),
+        "" if alert is None else alert.text,
+    )

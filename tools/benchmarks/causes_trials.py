@@ -23,7 +23,7 @@ from gripmon.records import Array, Cause, Frame, Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import BentFinger, Cover, Defocus, JawScript, Light, LightStep, Tilt
 
-WELL, AFTER = 16, 12
+WELL, AFTER = 24, 24
 """Frames before and after it."""
 
 START_SIGMA = np.array([1e-4] * 3 + [1e-3] * 3)
@@ -101,7 +101,7 @@ def _rig(rng: Rng, row: Row) -> Rig:
     how = ("exact", "noisy", "unreported")[int(rng.integers(2 if row.reported else 3))]
     later_m = opening_m + (float(rng.uniform(-3e-3, 3e-3)) if rng.random() < 0.3 else 0.0)
     later_m = min(max(later_m, gripper.jaw_min_m + 1e-3), gripper.jaw_max_m - 1e-3)
-    fps = float(rng.uniform(15.0, 60.0))
+    fps = float(rng.uniform(10.0, 30.0))
     background, fingers, sensor = _look(rng)
     motion = ("still", "wander", "linear", "stop_and_go")[int(rng.integers(4))]
     plain = rng.random() < 0.15
