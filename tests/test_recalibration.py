@@ -243,6 +243,12 @@ def test_every_reason_to_refuse_is_given_where_it_applies(reason: RefusalReason)
     assert out.text and out.wait == (reason is RefusalReason.FEW_FRAMES)
 
 
+def test_covariances_that_cannot_be_inverted_are_a_refusal_and_no_crash():
+    frames = [replace(f, covariance_xy=np.zeros_like(f.covariance_xy)) for f in Scene().frames(20)]
+    out = refused(frames)
+    assert out.reason is RefusalReason.ILL_CONDITIONED and "can't be weighed" in out.text
+
+
 def test_a_third_of_the_frames_elsewhere_is_no_standing_camera():
     out = refused(half_elsewhere(Scene().frames(30)))
     assert out.reason is RefusalReason.NOT_STILL and "elsewhere" in out.text

