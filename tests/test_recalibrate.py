@@ -9,7 +9,7 @@ from box_models import random_rotation
 from scipy.spatial.transform import Rotation
 from simulated import nominal_cam_T_grip
 
-from gripmon.recalibrate import RecalibrationRefused, recalibrate
+from gripmon.recalibrate import RecalibrationRefused, recalibrate, rivals, solutions
 
 FOCAL_PX = 962.0
 PLANE_GRIP_M = np.array(
@@ -182,3 +182,42 @@ def test_corners_that_are_all_seen_at_one_place_are_refused_or_say_how_bad_the_f
     except RecalibrationRefused:
         return
     assert found.weighted_rms > 5.0 or found.cam_T_grip[2, 3] > 10.0
+
+
+def test_all_poses_that_a_plane_allows_are_found_best_first_and_in_front_of_the_camera():
+    """Against both minima that OpenCV's refinement reaches from the closed form."""
+    rng = np.random.default_rng(7)
+    twins = 0
+    for _ in range(20):
+        true = random_pose(rng)
+        xy = image(PLANE_GRIP_M, true) + rng.normal(scale=0.05 / FOCAL_PX, size=(5, 2))
+        found = solutions(PLANE_GRIP_M, xy, sigma_xy(5, 0.05))
+        assert [pose.weighted_rms for pose in found] == sorted(pose.weighted_rms for pose in found)
+        assert np.abs(error_of(found[0].cam_T_grip, true)).max() < 0.05
+        for pose in found:
+            assert (PLANE_GRIP_M @ pose.cam_T_grip[2, :3] + pose.cam_T_grip[2, 3] > 0.0).all()
+        theirs = [p for p in both_poses_of_a_plane(PLANE_GRIP_M, xy) if p[2, 3] > 0.0]
+        for pose in found:
+            nearest = min(theirs, key=lambda p: float(np.abs(error_of(pose.cam_T_grip, p)).max()))
+            np.testing.assert_allclose(error_of(pose.cam_T_grip, nearest), 0.0, atol=1e-3)
+        twins += len(found) == 2
+        assert rivals(found, 5) == found[:1], "five corners seen to a twentieth of a pixel tell them apart"
+    assert twins >= 15
+
+
+def test_corners_behind_the_camera_give_no_pose_behind_it():
+    """The image of points behind the camera is that of the same points turned round before it, or of none."""
+    rng = np.random.default_rng(8)
+    for points_grip_m in (PLANE_GRIP_M, GENERAL_GRIP_M):
+        for _ in range(10):
+            behind = random_pose(rng)
+            behind[2, 3] *= -1.0
+            xy = image(points_grip_m, behind)
+            try:
+                found = solutions(points_grip_m, xy, sigma_xy(len(xy)))
+            except RecalibrationRefused:
+                continue
+            for pose in found:
+                assert (points_grip_m @ pose.cam_T_grip[2, :3] + pose.cam_T_grip[2, 3] > 0.0).all()
+            if points_grip_m is GENERAL_GRIP_M:
+                assert found[0].weighted_rms > 5.0, "and no solid looks like its own mirror image"
