@@ -49,7 +49,7 @@ class Recalibration:
 
 
 def recalibrate(
-    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, expected_cam_T_grip: Array, iterations: int = 10
+    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, expected_cam_T_grip: Array, iterations: int = 40
 ) -> Recalibration:
     """Pose from n >= 4 coplanar or n >= 6 general corners.
 
@@ -62,7 +62,7 @@ def recalibrate(
 
 
 def solutions(
-    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, iterations: int = 10
+    points_grip_m: Array, measured_xy: Array, covariance_xy: Array, iterations: int = 40
 ) -> list[Recalibration]:
     """All poses that corners allow, each refined, the best fit first; two for many planes.
 
