@@ -98,6 +98,11 @@ class StreamWatch:
         return tuple(fault for fault in faults if fault is not None)
 
     @property
+    def repeats(self) -> bool:
+        """Whether the last frame's image was seen a few frames ago: it says nothing new, frozen or not yet."""
+        return self._frozen.repeats
+
+    @property
     def frames_per_s(self) -> float | None:
         """Rate at which frames arrive here, from the median interval of their stamps; None until known."""
         return self._rate.frames_per_s
@@ -113,6 +118,10 @@ class _Frozen:
         self._since_ns = 0
         self._longest = 0
         self._frozen = False
+
+    @property
+    def repeats(self) -> bool:
+        return self._run > 0
 
     def add(self, frame: Frame, usual_ns: float | None) -> StreamFault | None:
         image = frame.image

@@ -74,6 +74,7 @@ def test_a_camera_that_hangs_is_told_after_a_second(buffers: int):
     held = [f.image for f in well[-buffers:]]
     frozen = [replace(f, image=held[k % buffers]) for k, f in enumerate(after(well, 60))]
     found = kinds(watch, frozen)
+    assert watch.repeats
     first = found.index({"frozen"})
     assert 28 <= first <= 33
     assert all(f == {"frozen"} for f in found[first:])
