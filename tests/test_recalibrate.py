@@ -202,9 +202,11 @@ def test_all_poses_that_a_plane_allows_are_found_best_first_and_in_front_of_the_
             np.testing.assert_allclose(error_of(pose.cam_T_grip, nearest), 0.0, atol=1e-2)
             rms = np.sqrt(np.mean((image(PLANE_GRIP_M, nearest) - xy) ** 2)) * FOCAL_PX / 0.05
             assert pose.weighted_rms == pytest.approx(rms, rel=1e-5)
-        twins += len(found) == 2
+        two = np.abs(error_of(theirs[0], theirs[-1])).max() > 0.1
+        assert len(found) == (2 if two else 1)
+        twins += two
         assert rivals(found, 5) == found[:1], "five corners seen to a twentieth of a pixel tell them apart"
-    assert twins >= 15
+    assert 5 <= twins <= 15
 
 
 def test_corners_behind_the_camera_give_no_pose_behind_it():
