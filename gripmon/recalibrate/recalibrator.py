@@ -37,7 +37,7 @@ MOST_OUTLYING = 0.25
 OUTLIERS = 0.25
 """Part of the corners that may be left out because the others contradict them; at least one."""
 
-UNLIKELY = 0.01
+UNLIKELY = 0.02
 """Chance below which residuals are believed to say that the fingers don't belong together."""
 
 
@@ -138,8 +138,8 @@ class Recalibrator:
         covariance = larger(tracked.covariance, by_edges) + self._floor
         at_last = larger(tracked.covariance_at_last, by_edges) + self._floor
         tracked = replace(tracked, covariance=covariance)
-        corners, pose = self._by_corners(mean_corners(frames, tracked.cam_T_grip), tracked)
         self._check_fingers(pooled)
+        corners, pose = self._by_corners(mean_corners(frames, tracked.cam_T_grip), tracked)
         sigma_m, sigma_at_last_m = _tcp_sigma_m(covariance), _tcp_sigma_m(at_last)
         more = len(frames) < settings.most_frames
         if sigma_m > settings.largest_sigma_m:
