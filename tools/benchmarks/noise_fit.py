@@ -49,8 +49,12 @@ class _Moments:
     parts: Array
 
 
-def fit(regime: str, series: Series, level_dof: float, provenance: dict[str, Any]) -> NoiseModel:
-    """All numbers of a regime; levels are Student's with so many degrees of freedom."""
+def fit(
+    regime: str, series: Series, level_dof: float, provenance: dict[str, Any], tail_scenes: int = 200
+) -> NoiseModel:
+    """All numbers of a regime; levels are Student's with so many degrees of freedom, and tails are compared on so many
+    simulated scenes.
+    """
     z, factors = whitened(series)
     measured = statistics(z)
     moments = _moments(measured)
@@ -83,7 +87,7 @@ def fit(regime: str, series: Series, level_dof: float, provenance: dict[str, Any
         measured=measured.as_dict(),
         provenance=provenance,
     )
-    return _with_tails(model, measured)
+    return _with_tails(model, measured, tail_scenes)
 
 
 def _moments(measured: Statistics) -> _Moments:
@@ -193,7 +197,7 @@ def _vibration() -> VibrationModel:
     return VibrationModel(2, VIBRATION_HZ, VIBRATION_M, _rows(np.array(columns).T))
 
 
-def _with_tails(model: NoiseModel, measured: Statistics) -> NoiseModel:
+def _with_tails(model: NoiseModel, measured: Statistics, scenes: int) -> NoiseModel:
     """The mildest tails of those on offer that are not milder than the measured ones, seen over all axes and scales."""
     best, smallest = model, np.inf
     for dof, wilder in itertools.product((200.0, 12.0, 8.0, 6.0, 5.0), (0.7, 1.0, 1.25, 1.5, 1.75)):
@@ -202,7 +206,7 @@ def _with_tails(model: NoiseModel, measured: Statistics) -> NoiseModel:
             dof=dof,
             burst_log_sd=round(wilder * model.burst_log_sd, 4),
         )
-        shares = simulated(tried, scenes=200).tails / measured.tails
+        shares = simulated(tried, scenes).tails / measured.tails
         # Too mild costs the contract, too wild only delay.
         logs = np.log(shares)
         loss = float(np.mean(np.where(logs < 0.0, 6.0 * logs**2, logs**2)))
