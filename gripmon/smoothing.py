@@ -1,11 +1,21 @@
-"""The transform averaged over time: a Kalman filter for a camera that stands still or creeps.
+"""The transform averaged over time: a Kalman filter on the manifold for a camera that stands still or creeps.
 
-The state is the pose itself, its covariance that of ``xi = (rho, omega)``.  Between frames the pose may wander like a
-random walk; an innovation that the two covariances don't explain, twice in a row, starts the average anew.
+The state is the pose itself, its covariance that of ``xi = (rho, omega)``; between frames the pose wanders like a
+random walk.  What the filter has to know of the stream it learns from quiet time, by matching covariances (Mehra, "On
+the identification of variances and adaptive Kalman filtering", 1970), axis by axis:
+
+- how far frames scatter about the average, as a share of what their covariance says.  Frames err together, by the same
+  background that stands still behind the same edges, so averaging takes away only what scatters: the rest of the
+  reported variance stays in the average's.  More scatter than reported is vibration, which the average must not hide;
+- how fast the average itself walks: the process noise.
+
+A pose that leaves the average twice in a row starts it anew; while frames lie farther from the average than noise
+explains, the transform follows the frames instead.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from typing import Annotated
 
 import msgspec
@@ -21,15 +31,49 @@ GATE = 37.7
 freedom).
 """
 
-INDEPENDENT_FRAMES = 10.0
-"""Averaging more frames than this doesn't help: background that stands still shifts the edges in all of them."""
+SETTLING, SETTLING_GATE = 20, 14.0
+"""So many frames after a start a frame that is surprising by less starts the average anew, and at once: what has just
+moved may swing.  A needless start costs little then."""
 
-MEMORY = 0.05
-"""Rate of the running means of innovations, per frame."""
+LEAST_KEPT = 0.4
+"""Least variance of the average over that of what scatters about it.  Errors have slow parts that no quiet time is long
+enough to see scatter: before moving background about a third of the whole lasts for ten seconds and longer."""
+
+FOLLOW_MEMORY, FOLLOW_FROM = 0.25, 2.5
+"""How fast the mean square of the distance from the average follows the newest frames; and from how much more of it
+than usual on the average lags: the transform goes along with the frames, and the average catches up."""
+SETTLING_LAG = 0.7
+"""While the average settles, the transform goes along from this part of that on: averaging gains little yet."""
+CATCH_UP = 0.5
+"""What a lag adds to the average's variance, over the square of the lag."""
+
+PRIOR_SCATTER, LEAST_SCATTER, MOST_SCATTER = 0.5, 0.1, 9.0
+"""Share of the reported variance that scatters: before it is known; the least that a lag is compared with; and the most
+that a single frame counts for."""
+VIBRATES_FROM = 1.25
+"""From this share on the scatter is more than the reported covariance may be wrong by."""
+PRIOR_FRAMES, SCATTER_FRAMES = 30.0, 1200.0
+"""So many frames the prior share is worth, and so many are remembered."""
+LEARN_EVERY = 4
+"""Neighbouring frames tell nearly the same."""
+RIPE = 0.6
+"""Below this a young average shows too little of the scatter to learn from: fewer than three frames."""
+
+WALK_S = 4.0
+"""The process noise is seen in how far the average gets in so many seconds."""
+PRIOR_WALKS, MOST_WALKS = 1.0, 64.0
+"""How many such ways the setting is worth, and how many are remembered."""
+WALK_BOUNDS = (1e-3, 10.0)
+"""Learnt process noise (variance) over that of the settings: least and most."""
+
+KEPT_FRAMES = 64
+"""Newest frames from which the average can start anew at the onset of a step."""
 
 
 class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How far the mount may creep between frames."""
+    """How far the mount may creep between frames, until that is learnt: the learnt creep lies within a thirtieth and
+    three times of it.
+    """
 
     creep_m_per_sqrt_s: Annotated[
         float,
@@ -43,66 +87,205 @@ class SmoothingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     ] = 1e-4
 
 
-class PoseAverage:
-    """Running average of ``cam_T_grip``; ``cam_T_grip`` is None until the first measurement."""
+class QuietTime:
+    """What quiet time has taught: ``scatter`` (6,) of frames about the average over their reported variance, and
+    ``walk`` (6,), the variance by which the pose wanders in a second, m² and rad².
+    """
 
     def __init__(self, settings: SmoothingSettings):
         rates = [settings.creep_m_per_sqrt_s] * 3 + [settings.creep_rad_per_sqrt_s] * 3
-        self._variance_per_s = np.square(rates)
-        self.cam_T_grip: Array | None = None
-        self.covariance: Array = np.zeros((6, 6))
-        self._suspicions = 0
-        self._lag: Array = np.zeros(6)
-        self._surprise = 1.0
-        self._newest_covariance: Array = np.zeros((6, 6))
+        self._prior_walk = np.square(rates)
+        self.walk: Array = self._prior_walk
+        self._scatter_frames = PRIOR_FRAMES
+        self._set_scatter(np.full(6, PRIOR_SCATTER))
+        self._walks = PRIOR_WALKS
+        self._way_square: Array | None = None
+        self._start_T: Array | None = None
+        self._since_s = 0.0
 
-    @property
-    def claimed_covariance(self) -> Array:
-        """Covariance (6, 6) of the average's error as it shows: the filter's own, made larger by what innovations say.
-
-        Frames err together, so the average is worth :data:`INDEPENDENT_FRAMES` frames at most; innovations that are
-        larger than they should be, or that all point the same way because the average lags behind a creeping mount,
-        count with the size that they have.
+    def _set_scatter(self, scatter: Array) -> None:
+        """And what follows from it for every frame: ``vibrates``, whether frames scatter more than reported on some
+        axis, by the share ``vibration`` (6,).
         """
-        white = self.covariance + self._newest_covariance / INDEPENDENT_FRAMES
-        return max(1.0, self._surprise) * white + np.outer(self._lag, self._lag)
+        self.scatter = scatter
+        self.vibrates = bool(scatter.max() > VIBRATES_FROM)
+        self.vibration: Array = np.where(scatter > VIBRATES_FROM, scatter - 1.0, 0.0)
+        self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter, LEAST_SCATTER)
+        self._least_kept = LEAST_KEPT * np.minimum(scatter, 1.0)
 
-    def forget(self) -> None:
-        """Start anew with the next measurement."""
-        self.cam_T_grip = None
+    def kept(self, ripe: Array | float) -> Array:
+        """Share (6,) of a frame's reported variance that stays in the average's; all of it while ``ripe`` is 0."""
+        out: Array = np.maximum(1.0 - ripe * self.scatter, self._least_kept)
+        return out
 
-    def wander(self, elapsed_s: float) -> None:
-        """Time passes: the covariance grows by the random walk."""
-        self.covariance.flat[::7] += self._variance_per_s * elapsed_s
+    def wait(self, elapsed_s: float) -> None:
+        """Time passes."""
+        self._since_s += elapsed_s
 
-    def add(self, cam_T_grip: Array, covariance: Array) -> None:
-        """One measurement (4, 4) with the covariance (6, 6) of its error."""
-        if self.cam_T_grip is None:
-            self._restart(cam_T_grip, covariance)
-            return
-        innovation = perturbation_between(self.cam_T_grip, cam_T_grip)
+    def interrupt(self) -> None:
+        """The average was started anew, or time isn't quiet: no way goes on across this."""
+        self._start_T = None
+
+    def add(self, share: Array, ripe: Array, mean_T: Array, variance: Array) -> None:
+        """A quiet frame: its squared distance ``share`` (6,) from the average ``mean_T`` over its ``variance`` (6,), of
+        which an average that is still young shows the part ``ripe`` (6,).
+        """
+        if ripe.min() > RIPE:
+            self._scatter_frames = min(self._scatter_frames + LEARN_EVERY, SCATTER_FRAMES)
+            news = np.minimum(share, MOST_SCATTER) / ripe - self.scatter
+            self._set_scatter(self.scatter + LEARN_EVERY / self._scatter_frames * news)
+        if self._start_T is None:
+            self._start_T, self._since_s = mean_T, 0.0
+        elif self._since_s >= WALK_S:
+            self._walked(np.square(perturbation_between(self._start_T, mean_T)), variance)
+            self._start_T, self._since_s = mean_T, 0.0
+
+    def _walked(self, way_square: Array, variance: Array) -> None:
+        """The mean square of ways is twice that of the average's own error, which is known, and the walk's."""
+        error = 2.0 * self.kept(1.0) * variance
+        if self._way_square is None:
+            self._way_square = self._prior_walk * WALK_S + error
+        self._walks = min(self._walks + 1.0, MOST_WALKS)
+        self._way_square = self._way_square + (way_square - self._way_square) / self._walks
+        least, most = WALK_BOUNDS
+        walk = (self._way_square - error) / self._since_s
+        self.walk = np.minimum(np.maximum(walk, least * self._prior_walk), most * self._prior_walk)
+
+
+class PoseFilter:
+    """A Kalman filter whose state is a pose: ``mean_T`` (4, 4) and the ``covariance`` (6, 6) of its error."""
+
+    def __init__(self, cam_T_grip: Array, covariance: Array):
+        self.mean_T, self.covariance = cam_T_grip, covariance.copy()
+        self.frames = 1
+
+    def wander(self, variance: Array) -> None:
+        """The pose may have moved by a random way with the variances (6,)."""
+        self.covariance.flat[::7] += variance
+
+    def weigh(self, cam_T_grip: Array, covariance: Array) -> tuple[Array, Array, float]:
+        """Innovation (6,) of a measurement (4, 4) with the covariance (6, 6), its gain (6, 6), and the innovation's
+        squared size in units of what is expected.  ValueError for covariances that aren't positive definite.
+        """
+        innovation = perturbation_between(self.mean_T, cam_T_grip)
         # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
         sides = np.empty((6, 7), order="F")  # as LAPACK wants it: no copy
         sides[:, :6], sides[:, 6] = self.covariance, innovation
         _, both, failed = dposv(self.covariance + covariance, sides)
         if failed:
             raise ValueError("a covariance that is not positive definite")
-        surprise = float(innovation @ both[:, 6])
-        self._lag = self._lag + MEMORY * (innovation - self._lag)
-        self._surprise += MEMORY * (surprise / 6.0 - self._surprise)
-        self._newest_covariance = covariance
-        if surprise > GATE:
-            self._suspicions += 1
-            if self._suspicions >= 2:
-                self._restart(cam_T_grip, covariance)
-            return
-        self._suspicions = 0
-        gain = both[:, :6].T
-        self.cam_T_grip = perturb(self.cam_T_grip, gain @ innovation)
-        self.covariance = self.covariance - gain @ self.covariance
-        self.covariance = 0.5 * (self.covariance + self.covariance.T)
+        return innovation, both[:, :6].T, float(innovation @ both[:, 6])
 
-    def _restart(self, cam_T_grip: Array, covariance: Array) -> None:
-        self.cam_T_grip, self.covariance = cam_T_grip, covariance.copy()
-        self._lag, self._surprise, self._newest_covariance = np.zeros(6), 1.0, covariance
+    def correct(self, innovation: Array, gain: Array) -> Array:
+        """Believe the measurement that was weighed; returns what is left of the innovation."""
+        way = gain @ innovation
+        self.mean_T = perturb(self.mean_T, way)
+        covariance = self.covariance - gain @ self.covariance
+        self.covariance = 0.5 * (covariance + covariance.T)
+        self.frames += 1
+        return innovation - way
+
+
+class PoseAverage:
+    """Running average of ``cam_T_grip``; ``cam_T_grip`` is None until the first measurement.
+
+    ``claimed_covariance`` (6, 6) is that of its error; ``learnt`` what quiet time has taught.
+    """
+
+    def __init__(self, settings: SmoothingSettings):
+        self.learnt = QuietTime(settings)
+        self.cam_T_grip: Array | None = None
+        self.claimed_covariance: Array = np.zeros((6, 6))
+        self._filter = PoseFilter(np.eye(4), np.eye(6))
+        self._newest: deque[tuple[Array, Array]] = deque(maxlen=KEPT_FRAMES)
         self._suspicions = 0
+        self._recent: Array = np.zeros(6)
+        self._stays: Array = np.ones(6)
+
+    def forget(self) -> None:
+        """Start anew with the next measurement; what quiet time has taught stays."""
+        self.cam_T_grip = None
+        self._newest.clear()
+        self.learnt.interrupt()
+
+    def step(self, frames: int) -> None:
+        """The pose has stepped, and the newest ``frames`` measurements were made after that: start anew from them."""
+        since = list(self._newest)[-min(frames, KEPT_FRAMES) :] if frames > 0 else []
+        self.forget()
+        for cam_T_grip, covariance in since:
+            self.add(cam_T_grip, covariance, quiet=False)
+
+    def wander(self, elapsed_s: float) -> None:
+        """Time passes: the covariance grows by the random walk."""
+        self._filter.wander(self.learnt.walk * elapsed_s)
+        self.learnt.wait(elapsed_s)
+
+    def add(self, cam_T_grip: Array, covariance: Array, quiet: bool = True) -> None:
+        """One measurement (4, 4) with the covariance (6, 6) of its error; ``quiet``: nothing speaks for a motion, so
+        that it may be learnt from.  ValueError for a covariance that isn't positive definite.
+        """
+        self._newest.append((cam_T_grip, covariance))
+        if self.cam_T_grip is None:
+            self._restart()
+            return
+        settled = self._filter.frames >= SETTLING
+        innovation, gain, surprise = self._filter.weigh(cam_T_grip, self._as_it_scatters(covariance))
+        if surprise <= (GATE if settled else SETTLING_GATE):
+            self._suspicions = 0
+            self._conclude(self._filter.correct(innovation, gain), covariance, quiet, settled)
+            return
+        self._suspicions += 1
+        if self._suspicions >= 2 or not settled:
+            self._restart()
+        else:
+            # Not believed alone, but it may be the first after a step.
+            self.claimed_covariance = self.claimed_covariance + np.outer(innovation, innovation)
+
+    def _restart(self) -> None:
+        """From the newest measurement, and the one before if that was surprising in the same way."""
+        self.learnt.interrupt()
+        self.cam_T_grip, self.claimed_covariance = self._newest[-1]
+        self._filter = PoseFilter(*self._newest[-1])
+        if self._suspicions >= 2:
+            innovation, gain, surprise = self._filter.weigh(*self._newest[-2])
+            if surprise < SETTLING_GATE:
+                self._filter.correct(innovation, gain)
+                self.cam_T_grip = self._filter.mean_T
+        self._recent, self._suspicions = self.learnt.scatter, 0
+
+    def _as_it_scatters(self, covariance: Array) -> Array:
+        """A frame's covariance (6, 6), larger on axes that vibrate: the average doesn't follow vibration."""
+        if not self.learnt.vibrates:
+            return covariance
+        scale = np.sqrt(1.0 + self.learnt.vibration)
+        out: Array = covariance * (scale[:, None] * scale)
+        return out
+
+    def _conclude(self, distance: Array, covariance: Array, quiet: bool, settled: bool) -> None:
+        """What to stand by, ``distance`` (6,) being from the average to the frame."""
+        learnt, mean_T, variance = self.learnt, self._filter.mean_T, covariance.diagonal()
+        share = distance * distance / variance
+        if self._filter.frames % LEARN_EVERY == 0 or not settled:
+            # One over the number of frames that were averaged, in effect.  Errors that last average out more slowly
+            # than independent ones; of those the distance shows all but this.
+            young = np.minimum(self._filter.covariance.diagonal() / variance, 1.0)
+            self._stays = learnt.kept(1.0 - np.sqrt(young))
+            if quiet:
+                learnt.add(share, 1.0 - young, mean_T, variance)
+        if not quiet:
+            learnt.interrupt()
+        stays = self._stays
+        self._recent = self._recent + FOLLOW_MEMORY * (share - self._recent)
+        lag = self._recent - (learnt.lag_from if settled else SETTLING_LAG * learnt.lag_from)
+        self.cam_T_grip = mean_T
+        if learnt.vibrates or lag.max() > 0.0:
+            catch_up = np.maximum(self._recent - learnt.lag_from, 0.0)
+            self._filter.wander(CATCH_UP * catch_up * variance)
+            # As much of the motion as of the frame's error is in the distance: the transform goes along by that share.
+            motion = learnt.vibration + np.maximum(lag, 0.0)
+            follow = motion / (motion + 1.0)
+            self.cam_T_grip = perturb(mean_T, follow * distance)
+            left = 1.0 - follow
+            stays = left * left * (stays + motion) + follow * (follow + 2.0 * left * stays)
+        scale = np.sqrt(stays)
+        self.claimed_covariance = covariance * (scale[:, None] * scale)

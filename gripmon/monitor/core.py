@@ -155,9 +155,13 @@ class Monitor:
         self._cam_T_grip, self._covariance = self._tracker.update(measurement)
         self._measured_s = self._now_s
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
-        if evidence.motion.stepped or evidence.jumped:
+        if evidence.jumped:
             self._average.forget()
-        self._average.add(self._cam_T_grip, self._covariance)
+        motion = evidence.motion
+        quiet = self._policy.state is State.TRACKING and not motion.stepped and motion.vibration is None
+        self._average.add(self._cam_T_grip, self._covariance, quiet)
+        if motion.stepped and not evidence.jumped:
+            self._average.step(motion.step_frames)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         origin, alerts = Origin.UPDATE, judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
