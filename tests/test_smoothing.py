@@ -348,7 +348,7 @@ def test_in_creep_the_average_does_not_fall_behind(speed_m_per_s: float):
 
 
 def test_vibration_is_not_hidden():
-    """A mount that swings by three times a frame's error: the transform goes along, and its covariance says the rest."""
+    """A mount that swings by three times a frame's error: the transform goes along, its covariance says the rest."""
     covariance = spread()
     size = 3.0 * np.sqrt(covariance[1, 1])
     truth = np.outer(np.sin(2.0 * np.pi * 13.0 * np.arange(3600) * PERIOD_S), [0.0, size, 0.0, 0.0, 0.0, 0.0])
