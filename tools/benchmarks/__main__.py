@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, causes, latency, recalibration, recovery, series
+from benchmarks import accuracy, causes, latency, recalibration, recovery, series, smoothing
 
-_BENCHMARKS = (accuracy, causes, latency, recalibration, recovery, series)
+_BENCHMARKS = (accuracy, causes, latency, recalibration, recovery, series, smoothing)
 
 
 def main() -> int:
