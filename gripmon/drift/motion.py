@@ -9,6 +9,7 @@ import numpy as np
 from gripmon.drift.history import History, goes_on
 from gripmon.drift.sequential import SequentialTest
 from gripmon.drift.settings import DriftSettings
+from gripmon.drift.tolerance import square_beyond
 from gripmon.drift.vibration import VibrationWatch
 from gripmon.records import AlertKind, Array, Creep, Motion
 
@@ -116,8 +117,8 @@ class MotionWatch:
         return mean[0], covariance[0]
 
     def _away(self, level: Array, covariance: Array) -> bool:
-        beyond = np.sign(level) * np.maximum(np.abs(level) - self._tolerated, 0.0)
-        return bool(beyond @ np.linalg.solve(covariance, beyond) > RETURNED)
+        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
+        return bool(square_beyond(whitening, level, self._tolerated) > RETURNED)
 
     def _look_back(self, level: Array, covariance: Array) -> None:
         """Step or creep, by the last minutes."""

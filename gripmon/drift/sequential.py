@@ -16,6 +16,7 @@ from scipy import stats
 
 from gripmon.drift.scatter import Scatter
 from gripmon.drift.settings import DriftSettings
+from gripmon.drift.tolerance import square_beyond
 from gripmon.drift.windows import LENGTHS, Windows
 from gripmon.records import Array
 
@@ -34,6 +35,9 @@ SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
 """Differences over the last frames, or windows, that are larger than learnt, up to so many times, raise thresholds."""
 
 REPORTED_MEMORY = 1.0 / 64.0
+
+WORTH = 0.25
+"""Part of its threshold from which a statistic is worth the search for the shift that may be tolerated."""
 
 _COUNT = np.array(LENGTHS, dtype=float)[:, None]
 
@@ -87,18 +91,22 @@ class SequentialTest:
         ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.
         """
         usual = self._report(covariance)
-        self.windows.add(self._without_wild_ones(self._as_far_as_sure(shift, usual)))
         if self._stale or self._frames % REFRESH_FRAMES == 0:
             self._refresh()
+        self.windows.add(self._without_wild_ones(self._as_far_as_sure(shift, usual)))
+        # Of fewer than three frames there is no middle one.
+        self.windows.keep(self._seen < 3, 0)
         self._frames += 1
         mean, before = self.windows.means()
         difference = mean - before
         mean_full, both_full = self.windows.full()
-        square = np.stack(
-            [_square(self._whitening[0], self._beyond_tolerance(mean)), _square(self._whitening[1], difference)]
-        )
+        limit = self._threshold * np.maximum(self._surge, 1.0)
+        square = np.stack([_square(self._whitening[0], mean), _square(self._whitening[1], difference)])
         full = np.stack([mean_full, both_full])
-        beyond = np.where(full, square / (self._threshold * np.maximum(self._surge, 1.0)), 0.0)  # (2, k, s)
+        worth = mean_full & (square[0] > WORTH * limit)
+        if worth.any():
+            square[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
+        beyond = np.where(full, square / limit, 0.0)  # (2, k, s)
         excess = beyond.max(axis=(0, 1))
         moved = excess > 1.0
         if self._frames % LEARNING_FRAMES == 0:
@@ -127,7 +135,7 @@ class SequentialTest:
     def restart(self, streams: np.ndarray, keep: np.ndarray | int = 0) -> None:
         """Forget the frames of some streams (s,) but the last ``keep``; what was learnt about the noise stays."""
         self.windows.keep(streams, keep)
-        self._seen = np.where(streams, np.minimum(self._seen, keep), self._seen)
+        self._seen = np.where(streams & (np.asarray(keep) == 0), 0, self._seen)
 
     def _as_far_as_sure(self, shift: Array, usual: Array) -> Array:
         """A frame that claims more error than usual (s,) moves the series by that much less."""
@@ -145,18 +153,18 @@ class SequentialTest:
         return 1.0 / np.maximum(variances.mean(axis=1), 1.0)
 
     def _without_wild_ones(self, shift: Array) -> Array:
-        """Median of three frames: no single frame can decide, and a step is late by one."""
-        one, two = self._last_two
-        fresh = (self._seen == 0)[:, None]
-        one[:] = np.where(fresh, shift, one)
-        two[:] = np.where(fresh, shift, two)
-        middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), shift))
-        self._last_two[0], self._last_two[1] = two.copy(), shift
-        self._seen += 1
-        return middle
+        """Median of three frames: no single frame can decide, and a step is late by one.
 
-    def _beyond_tolerance(self, mean: Array) -> Array:
-        return np.sign(mean) * np.maximum(np.abs(mean) - self._tolerated, 0.0)
+        In axes in which errors are independent: medians of axes whose errors belong together need not be a shift that
+        any of the frames makes likely.
+        """
+        last = np.where((self._seen == 0)[:, None], shift, self._last_two)
+        self._last_two = np.stack([last[1], shift])
+        self._seen += 1
+        one, two = (_times(self._to_reported, each) for each in last)
+        three = _times(self._to_reported, shift)
+        middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three))
+        return _times(self._from_reported, middle)
 
     def _learn_surge(self, square: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
@@ -165,6 +173,8 @@ class SequentialTest:
 
     def _refresh(self) -> None:
         self._stale = False
+        self._from_reported = np.linalg.cholesky(self._reported)
+        self._to_reported = np.linalg.inv(self._from_reported)
         of_mean, of_difference = self.scatter.covariances(self._reported)
         self._mean_covariance = of_mean + self._reference
         self._whitening = _whitening(np.stack([self._mean_covariance, of_difference]))
@@ -184,8 +194,13 @@ class SequentialTest:
         return np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0)
 
 
+def _times(matrix: Array, values: Array) -> Array:
+    """(..., 6, 6) times (..., 6)."""
+    return np.asarray((matrix @ values[..., None])[..., 0])
+
+
 def _square(whitening: Array, values: Array) -> Array:
-    white = (whitening @ values[..., None])[..., 0]
+    white = _times(whitening, values)
     return np.asarray((white * white).sum(axis=-1))
 
 

@@ -1,0 +1,234 @@
+"""The sequential test: its contract on noise of several kinds, its delay, and what it does not fall for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drift_noise import COVARIANCE, SIGMA, autocorrelated, claimed, feed, vibrating, white
+from scipy import stats
+
+from gripmon.drift import DriftSettings, SequentialTest
+
+PLAIN = DriftSettings(tolerated_m=0.0, tolerated_rad=0.0)
+NOISES = {"white": white, "autocorrelated": autocorrelated, "vibrating": vibrating}
+LENGTHS = [2**k for k in range(13)]
+
+
+def onsets(test: SequentialTest, shifts: np.ndarray) -> np.ndarray:
+    """(n, s) frames in which an alarm begins."""
+    moved = np.array([finding.moved for finding in feed(test, shifts)])
+    moved[1:] &= ~moved[:-1]
+    return moved
+
+
+# --- the contract ---
+
+
+@pytest.mark.parametrize("tolerated", [False, True])
+@pytest.mark.parametrize("noise", NOISES)
+def test_an_unmoved_camera_is_said_to_move_no_more_often_than_stated(noise: str, tolerated: bool):
+    """One alarm in 864 frames is stated here, so that they could be counted: 74 in all of these frames, and from the
+    first frame on, though nothing is known of the noise then.
+    """
+    bounds = {} if tolerated else {"tolerated_m": 0.0, "tolerated_rad": 0.0}
+    settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, **bounds)
+    shifts = NOISES[noise](np.random.default_rng(1), 1000, 64)
+    alarms = onsets(SequentialTest(settings, 64), shifts)
+    assert alarms.sum() <= 64 * 1000 / 864
+    assert alarms[:100].sum() <= 64 * 100 / 864
+    assert alarms[-500:].sum() <= 64 * 500 / 864
+
+
+@pytest.mark.parametrize("noise", NOISES)
+def test_at_a_rate_that_cells_want_there_is_none_in_hours(noise: str):
+    """One alarm a day: 256,000 frames at 60 frames/s are 71 minutes."""
+    shifts = NOISES[noise](np.random.default_rng(2), 1000, 256)
+    assert not onsets(SequentialTest(DriftSettings(), 256), shifts).any()
+
+
+def test_what_may_be_tolerated_is_no_drift_and_errors_that_belong_together_make_none_of_it():
+    """An offset up to the tolerance, in any direction, on top of noise."""
+    settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, tolerated_m=2e-5, tolerated_rad=1e-3)
+    rng = np.random.default_rng(3)
+    offset = rng.uniform(-1.0, 1.0, (64, 6)) * ([2e-5] * 3 + [1e-3] * 3)
+    shifts = white(rng, 1000, 64) + offset
+    assert onsets(SequentialTest(settings, 64), shifts).sum() <= 64 * 1000 / 864
+    exact = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, tolerated_m=0.0, tolerated_rad=0.0)
+    assert feed(SequentialTest(exact, 64), shifts)[-1].moved.mean() > 0.5, "without tolerance it is one"
+
+
+@pytest.mark.parametrize("streams", [1, 64])
+def test_noise_louder_than_frames_claim_is_learnt(streams: int):
+    """Three times the claimed standard deviation: what frames claim doesn't matter once the stream has shown more."""
+    settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0)
+    test = SequentialTest(settings, streams)
+    shifts = 3.0 * autocorrelated(np.random.default_rng(4), 4000, streams)
+    alarms = onsets(test, shifts)
+    assert alarms[2000:].sum() <= 2000 * streams / 864
+    usual = np.linalg.solve(COVARIANCE, test.usual_covariance() - COVARIANCE)
+    assert 0.3 * 9.0 < np.trace(usual) / 6.0 < 3.0 * 9.0
+
+
+# --- delay ---
+
+
+def expected_delay(sizes: float, windows: np.ndarray, *, rate: float = 1.0, frames_per_s: float = 60.0) -> int:
+    """Frames until a step of so many standard deviations is found, where frames claim COVARIANCE but have no noise.
+
+    Then all windows of L frames, of which m lie behind the step, are off by m / L of it with the whole covariance, and
+    their difference from the window before with twice of it; the median of three shows a step one frame late.
+    """
+    chance = rate / (86_400.0 * frames_per_s * 2 * 13)
+    for behind in range(1, 4097):
+        for length, independent in zip(LENGTHS, windows, strict=True):
+            freedom = 1.0 / (1.0 / (independent + 20.0) + 1.0 / (6.0 * length ** (1.0 / 3.0)))
+            limit = 6.0 * stats.f.isf(chance, 6.0, freedom)
+            part = min(behind / length, 1.0) * sizes
+            before = max(0.0, min(behind / length - 1.0, 1.0)) * sizes
+            if part**2 > limit or (part - before) ** 2 / 2.0 > limit:
+                return behind + 1
+    raise AssertionError("never")
+
+
+@pytest.mark.parametrize("sizes", [15.0, 20.0, 30.0, 60.0, 200.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_delay_of_a_step_is_that_of_the_formulas(sizes: float, sign: float):
+    rng, test = np.random.default_rng(5), SequentialTest(PLAIN)
+    feed(test, np.zeros((9000, 1, 6)))
+    direction = np.linalg.cholesky(COVARIANCE) @ rng.normal(size=6)
+    direction /= np.sqrt(direction @ np.linalg.solve(COVARIANCE, direction))
+    expected = expected_delay(sizes, test.scatter.windows[:, 0])
+    found = feed(test, np.tile(sign * sizes * direction, (expected + 50, 1, 1)), np.array([False]))
+    delay = 1 + next(n for n, finding in enumerate(found) if finding.moved[0])
+    # Nothing seen of the noise isn't quite no noise: the prior is forgotten only slowly at the longest lengths.
+    assert delay == pytest.approx(expected, rel=0.05, abs=1)
+
+
+def test_an_offset_without_a_step_is_found_by_the_mean():
+    """Ten normalised standard deviations in noise that is all that frames claim: too little for any short window."""
+    rng, test = np.random.default_rng(6), SequentialTest(PLAIN, 16)
+    feed(test, autocorrelated(rng, 10_000, 16))
+    test.restart(np.full(16, True))
+    offset = 10.0 * np.linalg.cholesky(COVARIANCE)[:, 0]
+    found = feed(test, autocorrelated(rng, 3000, 16) + offset)
+    moved = np.array([finding.moved for finding in found])
+    assert moved[-1].all()
+    assert not any((f.moved & f.stepped).any() for f in found)
+    assert moved.argmax(axis=0).min() > 10
+
+
+def test_a_step_is_told_from_an_offset_and_its_length_dates_it():
+    rng, test = np.random.default_rng(7), SequentialTest(PLAIN)
+    feed(test, white(rng, 3000, 1))
+    found = feed(test, white(rng, 6, 1) + 200.0 * SIGMA)
+    first = next(f for f in found if f.moved[0])
+    assert first.stepped[0]
+    assert first.length[0] <= 2
+    assert first.excess[0] > 1.0
+    assert not any(f.moved[0] for f in found[:1]), "the first frame after the step can't decide"
+
+
+# --- what does not decide ---
+
+
+@pytest.mark.parametrize("sizes", [10.0, 100.0, 1e4])
+def test_one_wild_frame_never_decides(sizes: float):
+    """Not the first one either, and not one every now and then."""
+    rng = np.random.default_rng(8)
+    shifts = white(rng, 1200, 8)
+    shifts[0, :4] += sizes * SIGMA
+    for frame in (1, 40, 500, 503, 1000, 1199):
+        shifts[frame, 4:] += rng.choice([-1.0, 1.0], (4, 6)) * sizes * SIGMA
+    test = SequentialTest(DriftSettings(), 8)
+    assert not any(finding.moved.any() for finding in feed(test, shifts))
+    feed(test, white(rng, 50, 8))
+    test.restart(np.full(8, True))
+    again = white(rng, 50, 8)
+    again[0] += sizes * SIGMA
+    assert not any(finding.moved.any() for finding in feed(test, again))
+
+
+def test_two_wild_frames_of_a_real_step_do():
+    rng, test = np.random.default_rng(9), SequentialTest(DriftSettings())
+    feed(test, white(rng, 1000, 1))
+    found = feed(test, white(rng, 2, 1) + 1e4 * SIGMA)
+    assert [bool(f.moved[0]) for f in found] == [False, True]
+
+
+def test_a_frame_that_claims_more_error_moves_the_mean_less():
+    """Poor frames, and honest about it: twenty times the noise, and the covariance to go with it."""
+    rng = np.random.default_rng(10)
+    test = SequentialTest(DriftSettings(), 16)
+    feed(test, white(rng, 1000, 16))
+    for shift in 20.0 * white(rng, 30, 16):
+        assert not test.add(shift, 400.0 * claimed(16)).moved.any()
+
+
+# --- restart, reference, rate ---
+
+
+def test_after_a_restart_drift_is_reckoned_anew_but_the_noise_is_remembered():
+    rng = np.random.default_rng(11)
+    test = SequentialTest(PLAIN, 2)
+    feed(test, white(rng, 2000, 2))
+    assert feed(test, white(rng, 100, 2) + 100.0 * SIGMA)[-1].moved.all()
+    learnt = test.scatter.windows.copy()
+    test.restart(np.array([True, False]))
+    assert test.windows.frames.tolist() == [0, 2098], "the first two frames make no median of three"
+    np.testing.assert_array_equal(test.scatter.windows, learnt)
+    after = feed(test, white(rng, 100, 2))
+    assert not any(f.moved[0] for f in after)
+    assert any(f.moved[1] for f in after), "the other stream was not restarted: it sees the step back"
+
+
+def test_a_restart_may_keep_the_newest_frames():
+    rng, test = np.random.default_rng(12), SequentialTest(PLAIN)
+    feed(test, white(rng, 1000, 1))
+    feed(test, white(rng, 20, 1) + 100.0 * SIGMA)
+    test.restart(np.array([True]), 10)
+    assert test.windows.frames.tolist() == [10]
+    assert feed(test, white(rng, 1, 1) + 100.0 * SIGMA)[0].moved[0], "it is still away from the reference"
+    mean, _ = test.level(10)
+    np.testing.assert_allclose(mean[0], 100.0 * SIGMA, rtol=0.05)
+
+
+def test_an_uncertain_reference_explains_a_shift_but_no_step():
+    rng, offset = np.random.default_rng(13), 100.0 * SIGMA
+    certain, uncertain = SequentialTest(PLAIN), SequentialTest(PLAIN)
+    uncertain.set_reference_covariance(np.diag(np.square(offset)))
+    shifts = white(rng, 500, 1) + offset
+    assert any(f.moved[0] for f in feed(certain, shifts))
+    assert not any(f.moved[0] for f in feed(uncertain, shifts))
+    assert any(f.moved[0] and f.stepped[0] for f in feed(uncertain, white(rng, 10, 1)))
+    _, covariance = uncertain.level(100)
+    assert (covariance[0].diagonal() >= np.square(offset)).all()
+
+
+def test_the_contract_is_in_days_whatever_the_frame_rate():
+    """The faster the frames come the less often one of them may alarm: the same evidence counts for less."""
+    slow, fast = (SequentialTest(PLAIN) for _ in range(2))
+    rng = np.random.default_rng(14)
+    shifts = white(rng, 40, 1)
+    slow.set_frames_per_s(1.0)
+    fast.set_frames_per_s(1000.0)
+    pairs = zip(feed(slow, shifts), feed(fast, shifts), strict=True)
+    assert all(f.excess[0] < s.excess[0] for s, f in list(pairs)[3:])
+    fast.set_frames_per_s(1.0)  # measured anew in the middle of the stream
+    more = white(rng, 300, 1)
+    pairs = [(s.excess[0], f.excess[0]) for s, f in zip(feed(slow, more), feed(fast, more), strict=True)]
+    np.testing.assert_allclose(*zip(*pairs, strict=True), rtol=0.1)  # what was learnt is taken over now and then
+    np.testing.assert_allclose(*zip(*pairs[260:], strict=True))
+
+
+def test_streams_know_nothing_of_one_another():
+    rng = np.random.default_rng(16)
+    shifts = autocorrelated(rng, 800, 64)
+    shifts[600:, 20:40] += 30.0 * SIGMA
+    together = feed(SequentialTest(DriftSettings(), 64), shifts)
+    for stream in (0, 25, 63):
+        alone = feed(SequentialTest(DriftSettings()), shifts[:, stream : stream + 1])
+        for one, all_of_them in zip(alone, together, strict=True):
+            assert one.moved[0] == all_of_them.moved[stream]
+            assert one.length[0] == all_of_them.length[stream]
+            assert one.stepped[0] == all_of_them.stepped[stream]
+            np.testing.assert_allclose(one.excess[0], all_of_them.excess[stream], rtol=1e-6)
