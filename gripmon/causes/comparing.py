@@ -51,7 +51,7 @@ ABSENT = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 several things happened; with every other cause it is a ``STRAY``."""
 STRAY = 0.02
 
-BLOCKED = 0.1
+BLOCKED = 0.15
 """Probability of a blocked view beforehand, where a finger isn't seen."""
 
 
@@ -122,7 +122,7 @@ def compare(
         for key in log:
             log[key] += _blur_log_likelihood(change_px, may=key[0] in LENS_CHANGES)
     if pooled.absent:
-        log[Cause.VIEW_BLOCKED, None] = log[None, None] + math.log(BLOCKED)
+        log[Cause.VIEW_BLOCKED, None] = fits[None, None].log_evidence + math.log(BLOCKED)
         fits[Cause.VIEW_BLOCKED, None] = fits[None, None]
         for cause, part in log:
             chance = ABSENT.get(cause, STRAY) if cause is not None else STRAY

@@ -20,7 +20,7 @@ FOCAL_SIZES = np.geomspace(1e-3, 5e-2, 6)
 JAW_UNREPORTED_SIGMA_M = 0.02
 """What is known about an opening that nobody reports."""
 
-_MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.2, 0.1, 0.1
+_MOUNT, _FINGER, _JAW, _LENS, _REPLACED, _NOTHING, _SEVERAL = 0.3, 0.25, 0.15, 0.1, 0.3, 0.1, 0.1
 
 
 @dataclass(frozen=True, slots=True)
