@@ -288,6 +288,23 @@ def test_more_frames_are_waited_for_only_where_they_help():
     assert not steady.wait and steady.needs_person is not None, "what doesn't scatter isn't averaged away"
 
 
+def test_what_waits_is_looked_at_again_after_some_frames():
+    scene = Scene(lasting=1e-2 * LASTING, changing=60.0 * CHANGING, corner_px=0.2)
+    recalibrator = Recalibrator(RecalibrationSettings(sure_sigma_m=5e-5), scene.gripper, np.eye(6) * 1e-14)
+    answers = []
+    for frame in scene.frames(60):
+        recalibrator.add(frame)
+        answers.append(recalibrator.outcome(reference()))
+    assert all(isinstance(a, Refusal) and a.wait for a in answers[:19])
+    waiting = [a for a in answers[19:] if a.wait]
+    assert len({id(a) for a in waiting}) <= len(waiting) // 5 + 1
+    done = next(a for a in answers[19:] if not a.wait)
+    assert isinstance(done, Proposal) and done.needs_person is None and 20 < done.inputs.frames < 60
+    recalibrator.forget()
+    again = recalibrator.outcome(reference())
+    assert isinstance(again, Refusal) and again.reason is RefusalReason.FEW_FRAMES
+
+
 def test_the_newest_frames_count_and_forgetting_begins_anew():
     recalibrator = Recalibrator(RecalibrationSettings(frames=10, most_frames=15), Scene().gripper, np.eye(6) * 1e-14)
     frames = Scene().frames(20)

@@ -37,6 +37,9 @@ MOST_OUTLYING = 0.25
 OUTLIERS = 0.25
 """Part of the corners that may be left out because the others contradict them; at least one."""
 
+PATIENCE = 5
+"""Frames until what waits for more frames is looked at again."""
+
 UNLIKELY = 0.02
 """Chance below which residuals are believed to say that the fingers don't belong together."""
 
@@ -100,6 +103,8 @@ class Recalibrator:
         """
         self._settings, self._gripper, self._floor, self._most = settings, gripper, floor, most_corners
         self._frames: deque[StillFrame] = deque(maxlen=max(settings.frames, settings.most_frames))
+        self._waiting: tuple[str, Proposal | Refusal] | None = None  # in place of which reference, and what
+        self._since = 0
 
     @property
     def frames(self) -> int:
@@ -109,13 +114,26 @@ class Recalibrator:
     def add(self, still: StillFrame) -> None:
         """One more measured frame of a camera that hasn't moved since the one before; the oldest ones give way."""
         self._frames.append(still)
+        self._since += 1
 
     def forget(self) -> None:
         """The camera has moved, or may have: begin anew."""
         self._frames.clear()
+        self._waiting = None
 
     def outcome(self, reference: ReferenceRecord) -> Proposal | Refusal:
-        """What the frames say of a new reference in place of the one in force."""
+        """What the frames say of a new reference in place of the one in force.
+
+        An answer that waits for more frames is given again until :data:`PATIENCE` more have come.
+        """
+        if self._waiting is not None and self._waiting[0] == reference.reference_id and self._since < PATIENCE:
+            return self._waiting[1]
+        answer = self._answer(reference)
+        waits = answer.wait and self.frames >= self._settings.frames
+        self._waiting, self._since = (reference.reference_id, answer) if waits else None, 0
+        return answer
+
+    def _answer(self, reference: ReferenceRecord) -> Proposal | Refusal:
         try:
             return self._proposal(from_record(reference.cam_T_grip))
         except _Refused as refused:

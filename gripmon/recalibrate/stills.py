@@ -215,15 +215,19 @@ def _sums(frames: list[StillFrame], off_xy: Array, usable: NDArray[np.bool_]) ->
 
 def _astray(frames: list[StillFrame], off_xy: Array) -> NDArray[np.bool_]:
     """(n, c) corners that lie further from their median over the frames than five standard deviations."""
-    astray = np.zeros(off_xy.shape[:2], dtype=bool)
     usable = np.array([f.usable for f in frames])
+    middle = np.zeros(off_xy.shape[1:])
     for c in np.flatnonzero(usable.any(axis=0)):
-        middle = np.median(off_xy[usable[:, c], c], axis=0)
-        for n in np.flatnonzero(usable[:, c]):
-            k = 2 * int(np.count_nonzero(frames[n].usable[:c]))
-            off = off_xy[n, c] - middle
-            astray[n, c] = off @ np.linalg.solve(frames[n].covariance_xy[k : k + 2, k : k + 2], off) > 25.0
-    return astray
+        middle[c] = np.median(off_xy[usable[:, c], c], axis=0)
+    x, y = np.moveaxis(off_xy - middle, 2, 0)
+    own = np.tile(np.eye(2), (*usable.shape, 1, 1))
+    for n, frame in enumerate(frames):
+        count = int(np.count_nonzero(frame.usable))
+        each = np.arange(count)
+        own[n, frame.usable] = frame.covariance_xy.reshape(count, 2, count, 2)[each, :, each]
+    xx, xy, yy = own[..., 0, 0], own[..., 0, 1], own[..., 1, 1]
+    far = x * x * yy - 2.0 * x * y * xy + y * y * xx > 25.0 * (xx * yy - xy * xy)
+    return np.asarray(usable & far)
 
 
 def _image(points_grip_m: Array, cam_T_grip: Array) -> Array:
