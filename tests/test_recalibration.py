@@ -249,6 +249,28 @@ def test_covariances_that_cannot_be_inverted_are_a_refusal_and_no_crash():
     assert out.reason is RefusalReason.ILL_CONDITIONED and "can't be weighed" in out.text
 
 
+@pytest.mark.parametrize("seen", ["none", "one in turn", "any"])
+def test_frames_may_show_any_of_the_corners(seen: str):
+    """Each frame its own selection, and frames without any: an answer comes of it, whatever it is."""
+    rng = np.random.default_rng(5)
+    frames = []
+    for k, frame in enumerate(Scene().frames(30)):
+        shown = np.flatnonzero(frame.usable)
+        kept = {"none": shown[:0], "one in turn": shown[[k % len(shown)]], "any": shown[rng.random(len(shown)) < 0.6]}[
+            seen
+        ]
+        usable = np.isin(np.arange(len(frame.usable)), kept)
+        among = np.repeat(usable[frame.usable], 2)
+        xy = np.where(usable[:, None], frame.xy, np.nan)
+        frames.append(replace(frame, usable=usable, xy=xy, covariance_xy=frame.covariance_xy[np.ix_(among, among)]))
+    out = outcome(frames)
+    if seen == "any":
+        assert isinstance(out, Proposal) and len(out.inputs.corners) >= 6
+        assert np.linalg.norm(out.cam_T_grip[:3, 3] - TRUE_T[:3, 3]) < 4e-5
+    else:
+        assert isinstance(out, Refusal) and out.reason is RefusalReason.FEW_CORNERS
+
+
 def test_a_third_of_the_frames_elsewhere_is_no_standing_camera():
     out = refused(half_elsewhere(Scene().frames(30)))
     assert out.reason is RefusalReason.NOT_STILL and "elsewhere" in out.text
