@@ -296,3 +296,11 @@ def test_a_blur_that_stays_as_it_is_is_no_news_and_another_one_is():
     assert [watch.add(1.2) for _ in range(5)] == [False, False, True, True, True]
     assert not [watch.add(0.75) for _ in range(5)][-1]
     assert [watch.add(0.3) for _ in range(5)][-1]
+
+
+def test_edges_that_lie_anywhere_tell_nothing():
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    cause, _, text = told(shown, judge, sigma_px=3.0, cam_T_grip=knocked(shown.reference, (1e-3, 0.0, 0.0)))
+    assert cause is Cause.UNKNOWN
+    assert "scatter" in text

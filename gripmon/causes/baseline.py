@@ -20,14 +20,15 @@ from gripmon.records import Array
 @dataclass(frozen=True, slots=True)
 class Baseline:
     """``motion`` (m,) of the unknowns from the reference; ``bias_px`` of each piece of an edge beyond that, and
-    ``sigma_px`` of it, both (pieces,), NaN where none was seen; ``jaw_reported_m`` at the time; blur and noise as in
-    :class:`Pooled`.
+    ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then; blur and
+    noise as in :class:`Pooled`.
     """
 
     motion: Array
     bias_px: Array
     sigma_px: Array
     jaw_reported_m: float | None
+    jaw_opening_m: float
     blur_px2: float | None
     noise: float
 
@@ -35,8 +36,8 @@ class Baseline:
     def of(cls, pooled: Pooled, motion: Array, residual_px: Array, edges: int) -> Baseline:
         bias_px, sigma_px = np.full(edges * PIECES, np.nan), np.full(edges * PIECES, np.nan)
         bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
-        reported_m = pooled.evidence.jaw_reported_m
-        return cls(motion, bias_px, sigma_px, reported_m, pooled.blur_px2, pooled.noise)
+        then = pooled.evidence
+        return cls(motion, bias_px, sigma_px, then.jaw_reported_m, then.jaw_opening_m, pooled.blur_px2, pooled.noise)
 
     def start(self, state: State, reported: bool, gripper: Gripper) -> State:
         """Where everything stands if nothing has moved; ``state``: if the reference and the report are right."""

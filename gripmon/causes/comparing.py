@@ -106,12 +106,16 @@ def compare(
     view = EdgeView(camera, gripper, evidence)
 
     def fitted(suspect: Suspect) -> Weighed:
-        first = start
-        if suspect.cause in FOLLOWED:
-            first = replace(start, cam_T_grip=evidence.cam_T_grip)
+        pose = evidence.cam_T_grip if suspect.cause in FOLLOWED else start.cam_T_grip
         errors = Errors(bias_px, sigma_px, spread_px, edge)
-        return weigh(view, gripper, suspect.model, start, first, errors)
+        firsts = [replace(start, cam_T_grip=pose, jaw_opening_m=opening) for opening in openings_m]
+        fits = [weigh(view, gripper, suspect.model, start, first, errors) for first in firsts]
+        return max(fits, key=lambda fit: fit.log_evidence)
 
+    openings_m = [start.jaw_opening_m]
+    if baseline is not None and not reported and gripper.has_jaw:
+        # What was seen of an opening that nobody reports may be as wrong as the fingers are.
+        openings_m.append(baseline.jaw_opening_m)
     # What even the freest model doesn't explain all pieces share as an error.
     edge = np.unique(evidence.edge, return_inverse=True)[1]
     sigma_px = np.hypot(sigma_px, _shared_px(fitted(models[-1]).residual_px, sigma_px))

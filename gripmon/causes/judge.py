@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from gripmon.camera import Camera
@@ -20,6 +21,9 @@ from gripmon.records import Array, Cause, CauseWeight, EdgeEvidence, Explanation
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""
+
+SCATTERED_PX = 0.4
+"""Standard deviation of most pieces' places beyond which they are not believed: they usually have 0.03 to 0.3."""
 
 ENOUGH, SETTLED = 20, 6
 """Frames in which all was well that make a baseline, and with which a first one is made if it is asked for earlier."""
@@ -106,6 +110,10 @@ class CauseJudge:
         pooled = pool(self._frames, self._camera, self._gripper)
         if len(pooled.piece) < FEWEST_PIECES:
             return self._blind(pooled, baseline)
+        scatter_px = float(np.median(pooled.evidence.sigma_px))
+        if scatter_px > SCATTERED_PX:
+            text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: they don't tell what is wrong"
+            return _explained({(Cause.UNKNOWN, None): 1.0}, self._gripper, self._settings.probable, text)
         comparison = self._compared(pooled, ref_cam_T_grip, baseline)
         top = max(comparison.log.values())
         total = sum(math.exp(value - top) for value in comparison.log.values())

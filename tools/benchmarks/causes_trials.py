@@ -365,7 +365,7 @@ def _rate(rng: Rng, rig: Rig) -> Trial:
             return frame
         return replace(frame, stamp_ns=last.stamp_ns + round((after + 1) * 1e9 / rig.scenario.fps / factor))
 
-    return _ring(rig, _seconds(rig, 4.0 * max(factor, 1.0)), change, _seconds(rig, 3.0), f"{factor:.2f} times")
+    return _ring(rig, _seconds(rig, 3.0 * max(factor, 1.0)), change, _seconds(rig, 3.0), f"{factor:.2f} times")
 
 
 def _replaced(rng: Rng, rig: Rig) -> Trial:
