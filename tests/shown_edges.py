@@ -45,6 +45,7 @@ class Shown:
         blur_px: float = 0.7,
         hidden: tuple[str, ...] = (),
         noise: float = 0.004,
+        brightest: float = 0.7,
     ) -> EdgeEvidence:
         """``bent``: 4x4 motion of a finger's points in the gripper frame; ``camera``: the one that really looks;
         ``outliers``: so many pieces are off by up to 5 px.
@@ -89,6 +90,7 @@ class Shown:
             across=across_px,
             finger_share=np.array([0.05 if name in hidden else 0.8 for name in gripper.finger_ids]),
             noise=noise,
+            brightest=brightest,
             reach_px=7.0,
         )
 

@@ -185,6 +185,9 @@ def test_nothing_seen_at_all_is_a_blocked_view_or_a_noisy_image():
     everything = ("left", "right")
     assert told(shown, shown.judge(), hidden=everything)[0] is Cause.VIEW_BLOCKED
     assert told(shown, shown.judge(), hidden=everything, noise=0.08)[0] is Cause.IMAGE_BAD
+    cause, _, text = told(shown, shown.judge(), hidden=everything, brightest=0.05)
+    assert cause is Cause.IMAGE_BAD
+    assert "dark" in text
 
 
 def test_another_camera_is_thought_of_only_after_an_interruption():

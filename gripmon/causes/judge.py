@@ -33,9 +33,9 @@ CONTRADICTED = 8.0
 
 BLIND = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02}
 """Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
-NOISY = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
-"""And in one with more than that: so many times the usual, at least a share of the full scale."""
-MUCH_NOISE, LEAST_NOISE = 4.0, 0.02
+BAD_IMAGE = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
+"""And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
+MUCH_NOISE, LEAST_NOISE, DARK = 4.0, 0.02, 0.08
 
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -155,9 +155,10 @@ class CauseJudge:
     def _blind(self, pooled: Pooled, baseline: Baseline | None) -> Explanation:
         """No finger is seen."""
         usual = 0.0 if baseline is None else baseline.noise
-        if pooled.noise > max(MUCH_NOISE * usual, LEAST_NOISE):
-            shares, text = NOISY, f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
-        else:
+        shares, text = BAD_IMAGE, f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
+        if pooled.brightest < DARK:
+            text = f"the image is dark: hardly a pixel above {100.0 * pooled.brightest:.0f} % of the full scale"
+        elif pooled.noise <= max(MUCH_NOISE * usual, LEAST_NOISE):
             shares, text = BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place"
         return _explained({(c, None): p for c, p in shares.items()}, self._gripper, self._settings.probable, text)
 

@@ -29,8 +29,8 @@ FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
 @dataclass(frozen=True, slots=True)
 class Pooled:
     """``evidence`` of the newest frame's time with a stretch for each piece ``piece`` (s,) of an edge; ``absent``:
-    fingers in view that are not seen, ``blur_px2``: of the lens, None where it can't be told, ``noise`` as in
-    ``EdgeEvidence``; ``frames`` that it was made of.
+    fingers in view that are not seen; ``blur_px2``: of the lens, None where it can't be told; ``noise`` and
+    ``brightest`` as in ``EdgeEvidence``; ``frames`` that it was made of.
     """
 
     evidence: EdgeEvidence
@@ -38,6 +38,7 @@ class Pooled:
     absent: tuple[int, ...]
     blur_px2: float | None
     noise: float
+    brightest: float
     frames: int
 
 
@@ -64,10 +65,10 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     absences = [absent_fingers(frame, gripper) for frame in frames]
     often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
     noise = float(np.median([frame.noise for frame in frames]))
+    brightest = float(np.median([frame.brightest for frame in frames]))
     if not places:
-        return Pooled(
-            _only(newest, np.zeros(len(newest.edge), dtype=bool)), np.zeros(0, np.intp), often, None, noise, 0
-        )
+        nothing = _only(newest, np.zeros(len(newest.edge), dtype=bool))
+        return Pooled(nothing, np.zeros(0, np.intp), often, None, noise, brightest, len(frames))
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -99,7 +100,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         blur_px2=other[:, 2],
         across=other[:, 3:],
     )
-    return Pooled(evidence, numbers, often, isotropic_blur_px2(evidence), noise, len(frames))
+    return Pooled(evidence, numbers, often, isotropic_blur_px2(evidence), noise, brightest, len(frames))
 
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:

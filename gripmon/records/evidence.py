@@ -23,7 +23,8 @@ class EdgeEvidence:
     and ``across`` (s, 2) that direction in the image.
 
     ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where none
-    was sampled; ``noise``: of a pixel, part of the full scale; ``reach_px``: how far from the measured pose edges were
+    was sampled; ``noise``: of a pixel, and ``brightest``: what only one pixel in
+    a hundred exceeds, parts of the full scale; ``reach_px``: how far from the measured pose edges were
     looked for at first.
     """
 
@@ -40,6 +41,7 @@ class EdgeEvidence:
     across: Array
     finger_share: Array
     noise: float
+    brightest: float
     reach_px: float
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.causes_trials import START_SIGMA, Trial
+from benchmarks.causes_rigs import START_SIGMA
+from benchmarks.causes_trials import Trial
 from gripmon.camera import make_camera
 from gripmon.drift import DriftSettings
 from gripmon.geometry import to_record
