@@ -19,8 +19,13 @@ from gripmon.drift.windows import LENGTHS
 from gripmon.records import Array
 
 PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
-"""Pairs of windows that a part of the reported covariance counts for at every length, before the stream has shown its
-own: bias may come and go as slowly as it likes.
+"""Pairs of windows that a small part of the reported covariance counts for at every length, before the stream has shown
+its own: until then nearly all of what is claimed is a bias that may change.
+"""
+
+LONGER = 4
+"""Lengths, each twice the one before, from a window's own on: noise that is seen in these is always there.  What shows
+only in yet longer ones comes in rare steps, of which the next may come at any moment.
 """
 
 MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
@@ -65,16 +70,28 @@ class Scatter:
         outer = (tame[..., None] * difference)[..., :, None] * difference[..., None, :]
         self._of_difference += gain[..., None, None] * (outer - self._of_difference)
 
-    def covariances(self, reported: Array) -> tuple[Array, Array]:
+    @property
+    def of_differences(self) -> Array:
+        """(k, s, 6, 6) of the differences between neighbouring windows, as learnt."""
+        return self._of_difference
+
+    def covariances(self, reported: Array, inflation: Array) -> tuple[Array, Array]:
         """(k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones.
 
-        ``reported`` (s, 6, 6) is what a frame claims for itself.
+        ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (k, s) by how much more the variance of
+        what the stream has shown counts.
         """
         parts = 0.25 * self._of_difference
         parts[-1] *= 2.0  # beyond the longest, windows count as independent
-        seen = np.cumsum(parts[::-1], axis=0)[::-1]
-        bias = _what_is_missing(seen[0], reported)
-        return seen + bias, self._of_difference + 2.0 * bias
+        total = np.cumsum(parts[::-1], axis=0)[::-1]
+        # What was only assumed has not been seen.
+        learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
+        seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
+        rare = np.concatenate([seen[LONGER:], np.zeros_like(seen[:LONGER])])
+        # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
+        missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
+        inflation = inflation[..., None, None]
+        return inflation * total + missing[0], inflation * self._of_difference + 2.0 * missing[1:]
 
     def of_single_frames(self) -> Array:
         """(s, 6, 6) of frames about their mean, as the stream has shown it."""
@@ -82,7 +99,7 @@ class Scatter:
 
 
 def _what_is_missing(seen: Array, claimed: Array) -> Array:
-    """The part of a claimed covariance (s, 6, 6), direction by direction, that exceeds the one that was seen."""
+    """The part of a claimed covariance (s, 6, 6), direction by direction, that exceeds what was seen (..., s, 6, 6)."""
     root = np.linalg.cholesky(claimed)
     inverse = np.linalg.inv(root)
     share, directions = np.linalg.eigh(inverse @ seen @ np.swapaxes(inverse, -1, -2))

@@ -23,16 +23,13 @@ from gripmon.records import Array
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
 """Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""
 
-FREEDOM, FREEDOM_GROWTH = 6.0, 1.0 / 3.0
+FREEDOM, FREEDOM_GROWTH = 10.0, 1.0 / 3.0
 """Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
 number of frames with which those of a mean grow: the mean of many is more nearly normal.
 """
 
-PRIOR_FREEDOM = 20.0
-"""Degrees of freedom that what frames claim adds to what the stream has shown."""
-
-SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
-"""Differences over the last frames, or windows, that are larger than learnt, up to so many times, raise thresholds."""
+SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 16, 16, 4.0
+"""Differences over the last frames, or windows, that are larger than learnt, up to so many times, count as noise."""
 
 REPORTED_MEMORY = 1.0 / 64.0
 
@@ -73,12 +70,13 @@ class SequentialTest:
         self._frames = 0
         self._surge = np.ones((len(LENGTHS), streams))
         self._stale = True
-        self._threshold: Array | None = None
+        self._threshold = 1.0
+        self._inflation: Array | None = None
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate: the contract is in days, the thresholds are in frames."""
         if abs(frames_per_s - self._frames_per_s) > 0.05 * self._frames_per_s:
-            self._frames_per_s, self._threshold, self._stale = frames_per_s, None, True
+            self._frames_per_s, self._inflation, self._stale = frames_per_s, None, True
 
     def set_reference_covariance(self, covariance: Array) -> None:
         """Covariance (6, 6) or (s, 6, 6) of the reference's own error: so much of a mean shift is no drift."""
@@ -100,13 +98,12 @@ class SequentialTest:
         mean, before = self.windows.means()
         difference = mean - before
         mean_full, both_full = self.windows.full()
-        limit = self._threshold * np.maximum(self._surge, 1.0)
         square = np.stack([_square(self._whitening[0], mean), _square(self._whitening[1], difference)])
         full = np.stack([mean_full, both_full])
-        worth = mean_full & (square[0] > WORTH * limit)
+        worth = mean_full & (square[0] > WORTH * self._threshold)
         if worth.any():
             square[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
-        beyond = np.where(full, square / limit, 0.0)  # (2, k, s)
+        beyond = np.where(full, square / self._threshold, 0.0)  # (2, k, s)
         excess = beyond.max(axis=(0, 1))
         moved = excess > 1.0
         if self._frames % LEARNING_FRAMES == 0:
@@ -114,8 +111,9 @@ class SequentialTest:
             usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
             if learn is not None:
                 usable &= learn
-            self.scatter.learn(difference, square[1], usable, LEARNING_FRAMES)
-            self._learn_surge(square[1], usable)
+            normalised = _square(self._learnt_whitening, difference)
+            self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
+            self._learn_surge(normalised, usable)
         # The shortest window that is beyond its threshold dates the motion best.
         index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
         stepped = beyond[1, index, np.arange(self._streams)] > 1.0
@@ -175,23 +173,27 @@ class SequentialTest:
         self._stale = False
         self._from_reported = np.linalg.cholesky(self._reported)
         self._to_reported = np.linalg.inv(self._from_reported)
-        of_mean, of_difference = self.scatter.covariances(self._reported)
+        # Slow to compute, slow to change.
+        if self._inflation is None or self._frames % (16 * REFRESH_FRAMES) == 0:
+            self._threshold, self._inflation = self._rarity(self.scatter.windows)
+        inflation = self._inflation * np.maximum(self._surge, 1.0)
+        of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
         self._mean_covariance = of_mean + self._reference
         self._whitening = _whitening(np.stack([self._mean_covariance, of_difference]))
-        # Slow to compute, slow to change.
-        if self._threshold is None or self._frames % (16 * REFRESH_FRAMES) == 0:
-            self._threshold = self._thresholds(self.scatter.windows)
+        self._learnt_whitening = _whitening(self.scatter.of_differences)
 
-    def _thresholds(self, windows: Array) -> Array:
-        """(k, s) what T² exceeds by chance so rarely that all lengths together keep the contract.
+    def _rarity(self, windows: Array) -> tuple[float, Array]:
+        """What the squares of six normal errors exceed by chance so rarely that all lengths together keep the contract;
+        and (k, s) by how much larger the variance of the stream's own scatter must be taken for the same.
 
-        T² / 6 of a covariance from m samples is distributed as F(6, m - 5), nearly (Hotelling), and so is that of
-        errors with Student's distribution, with its degrees of freedom: both count.
+        T² / 6 of a covariance from m samples is distributed as F(6, m), nearly (Hotelling), and so is that of errors
+        with Student's distribution, with its degrees of freedom: both count.
         """
         a_day = 86_400.0 * self._frames_per_s
         chance = self._settings.false_alarms_per_day / (a_day * 2 * len(LENGTHS))
-        freedom = 1.0 / (1.0 / (windows + PRIOR_FREEDOM) + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
-        return np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0)
+        freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
+        threshold = float(stats.chi2.isf(chance, 6))
+        return threshold, np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0 / threshold)
 
 
 def _times(matrix: Array, values: Array) -> Array:
