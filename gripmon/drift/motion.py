@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 
@@ -43,6 +44,7 @@ class MotionWatch:
         self._kind = AlertKind.DRIFT
         self._present = False
         self._creep: Creep | None = None
+        self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
 
     def reset(self, reference_covariance: Array) -> None:
         """There is a new reference, with the covariance (6, 6) of its error: drift is reckoned from zero."""
@@ -52,10 +54,12 @@ class MotionWatch:
         self._newest.clear()
         self._vibration.forget()
         self._present, self._kind, self._creep = False, AlertKind.DRIFT, None
+        self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
 
     def resume(self, moved: bool) -> None:
         """After a restart: whether the camera was not where the reference has it."""
         self._present = moved
+        self._last = replace(self._last, present=moved)
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate."""
@@ -68,7 +72,8 @@ class MotionWatch:
         None for a shift while the reference's error isn't known yet.
         """
         if shift is None:
-            return Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
+            self._last = Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
+            return self._last
         test = self.test
         finding = test.add(shift[None], covariance[None])
         moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
@@ -92,7 +97,7 @@ class MotionWatch:
             self._look_back(level, level_covariance)
         frames = min(frames, NEWEST_FRAMES)
         newest, newest_covariance = self._level(frames)
-        return Motion(
+        self._last = Motion(
             present=self._present,
             kind=self._kind,
             shift=newest,
@@ -105,6 +110,11 @@ class MotionWatch:
             vibration=vibration,
             suspicious=bool(finding.excess[0] > SUSPICIOUS),
         )
+        return self._last
+
+    def skip(self) -> Motion:
+        """A frame whose transform is doubtful tells nothing: all is as it was."""
+        return replace(self._last, begun=False, stepped=False, suspicious=False)
 
     def _goes_on(self, length: int) -> bool:
         """Whether the frames about a difference between windows of ``length`` frames show a creep, not a step."""

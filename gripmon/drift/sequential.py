@@ -23,12 +23,12 @@ from gripmon.records import Array
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
 """Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""
 
-FREEDOM, FREEDOM_GROWTH = 10.0, 1.0 / 3.0
+FREEDOM, FREEDOM_GROWTH = 7.0, 1.0 / 3.0
 """Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
 number of frames with which those of a mean grow: the mean of many is more nearly normal.
 """
 
-SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 16, 16, 4.0
+SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
 """Differences over the last frames, or windows, that are larger than learnt, up to so many times, count as noise."""
 
 REPORTED_MEMORY = 1.0 / 64.0

@@ -210,10 +210,12 @@ class Monitor:
         reach_px = self._settings.corners.sampling.reach_px
         jumped = looked_far and self._tracker.moved_px(measurement, before_T) > reach_px
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
-        since_start = self._baseline.subtract(shift)
-        motion = self._watch.add(since_start, self._covariance, self._now_s)
         sigma = np.sqrt(self._covariance.diagonal())
         astray = self._gripper_astray(measurement)
+        if astray or sigma[:3].max() > self._settings.policy.suspect_sigma_m:
+            motion = self._watch.skip()
+        else:
+            motion = self._watch.add(self._baseline.subtract(shift), self._covariance, self._now_s)
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)

@@ -16,6 +16,7 @@ from gripmon.drift import DriftSettings, SequentialTest
 
 FRAMES_PER_S = 60.0
 FRAMES_PER_DAY = 86_400.0 * FRAMES_PER_S
+ALERT_FRAMES = 60
 CHUNK = 256
 BLOCK_FRAMES = 1024
 """The largest statistic of so many frames is one value for the tail."""
@@ -119,19 +120,21 @@ def count_alarms(
 ) -> dict[str, Alarms]:
     """Every chart on the same ``frames`` of each of ``streams`` streams in which the camera doesn't move.
 
-    After an alarm the stream's chart begins anew, so that an alarm that lasts counts once for each time that it would
-    be raised again.
+    After an alarm the stream's chart begins anew; alarms that follow one another within a second are one alert, as in
+    the monitor.
     """
     counts = dict.fromkeys(charts, 0)
     maxima: dict[str, list[np.ndarray]] = {name: [] for name in charts}
     newest = {name: np.zeros(streams) for name in charts}
+    alarmed = {name: np.full(streams, -(10**9)) for name in charts}
     for number, (shift, covariance) in enumerate(frames_of(model, streams, frames, rng), 1):
         for name, chart in charts.items():
             excess = chart.add(shift, covariance)
             np.maximum(newest[name], excess, out=newest[name])
             moved = excess > 1.0
             if moved.any():
-                counts[name] += int(np.count_nonzero(moved))
+                counts[name] += int(np.count_nonzero(moved & (number - alarmed[name] > ALERT_FRAMES)))
+                alarmed[name][moved] = number
                 chart.restart(moved)
         if number % BLOCK_FRAMES == 0:
             for name in charts:

@@ -76,6 +76,11 @@ class Series:
         with np.load(path) as arrays:
             return cls(*(arrays[name] for name in ("error", "motion", "covariance", "valid")))
 
+    def valid_only(self) -> Series:
+        """The same without the errors of frames that the monitor itself doubted."""
+        error = np.where(self.valid.astype(bool)[..., None], self.error, np.nan)
+        return Series(error, self.motion, self.covariance, self.valid)
+
     def save(self, path: Path) -> None:
         np.savez(path, error=self.error, motion=self.motion, covariance=self.covariance, valid=self.valid, fps=FPS)
 
