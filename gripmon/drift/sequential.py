@@ -23,7 +23,7 @@ from gripmon.records import Array
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
 """Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""
 
-FREEDOM, FREEDOM_GROWTH = 7.0, 1.0 / 3.0
+FREEDOM, FREEDOM_GROWTH = 9.0, 1.0 / 3.0
 """Student's degrees of freedom of a single frame's error, which simulated images in clutter show, and the power of the
 number of frames with which those of a mean grow: the mean of many is more nearly normal.
 """
@@ -178,8 +178,9 @@ class SequentialTest:
             self._threshold, self._inflation = self._rarity(self.scatter.windows)
         inflation = self._inflation * np.maximum(self._surge, 1.0)
         of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
-        self._mean_covariance = of_mean + self._reference
-        self._whitening = _whitening(np.stack([self._mean_covariance, of_difference]))
+        self._whitening = _whitening(np.stack([of_mean + self._reference, of_difference]))
+        # What is told of a mean is its standard deviation, not what would be too rare.
+        self._mean_covariance = self.scatter.covariances(self._reported, np.ones_like(inflation))[0] + self._reference
         self._learnt_whitening = _whitening(self.scatter.of_differences)
 
     def _rarity(self, windows: Array) -> tuple[float, Array]:
