@@ -61,7 +61,7 @@ RIPE = 0.6
 
 WALK_S = 4.0
 """The process noise is seen in how far the average gets in so many seconds."""
-PRIOR_WALKS, MOST_WALKS = 1.0, 64.0
+PRIOR_WALKS, MOST_WALKS = 0.25, 64.0
 """How many such ways the setting is worth, and how many are remembered."""
 WALK_BOUNDS = (1e-3, 10.0)
 """Learnt process noise (variance) over that of the settings: least and most."""
@@ -110,7 +110,9 @@ class QuietTime:
         self.scatter = scatter
         self.vibrates = bool(scatter.max() > VIBRATES_FROM)
         self.vibration: Array = np.where(scatter > VIBRATES_FROM, scatter - 1.0, 0.0)
-        self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter, LEAST_SCATTER)
+        # While little is known, up to all of the reported variance may scatter.
+        unknown = (1.0 - PRIOR_SCATTER) * PRIOR_FRAMES / self._scatter_frames
+        self.lag_from: Array = FOLLOW_FROM * np.maximum(scatter + unknown, LEAST_SCATTER)
         self._least_kept = LEAST_KEPT * np.minimum(scatter, 1.0)
 
     def kept(self, ripe: Array | float) -> Array:
