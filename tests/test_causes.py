@@ -17,7 +17,7 @@ from shown_edges import OPENING_M, REFERENCE_SIGMA, Shown, bend, knocked
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings, PaperLens, make_camera
-from gripmon.causes import BlurWatch, CauseJudge, CauseSettings
+from gripmon.causes import BlurWatch, CauseJudge, CauseSettings, FingerWatch
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.geometry import perturb
@@ -307,3 +307,12 @@ def test_edges_that_lie_anywhere_tell_nothing():
     cause, _, text = told(shown, judge, sigma_px=3.0, cam_T_grip=knocked(shown.reference, (1e-3, 0.0, 0.0)))
     assert cause is Cause.UNKNOWN
     assert "scatter" in text
+
+
+def test_a_finger_of_which_fewer_profiles_agree_is_worth_asking_about():
+    rng = np.random.default_rng(4)
+    watch = FingerWatch(2)
+    assert not any(watch.add([0.8 + rng.normal(0.0, 0.04), 0.5 + rng.normal(0.0, 0.04)]) for _ in range(300))
+    assert not any(watch.add([0.1, 0.5]) for _ in range(2))  # two frames decide nothing
+    assert not any(watch.add([0.8, 0.5]) for _ in range(5))
+    assert [watch.add([0.8, 0.3]) for _ in range(5)] == [False, False, True, True, True]

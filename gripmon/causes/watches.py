@@ -1,0 +1,69 @@
+"""What tells, for next to nothing a frame, that the judge should be asked although no drift shows.
+
+A lens that lost its focus moves nothing; and a finger that is bent by some tenths of a millimetre may be left aside by a
+joint fit that follows the others.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections import deque
+from collections.abc import Sequence
+
+LEARNT, NEWEST = 20, 5
+"""Frames from which the usual value is learnt, and newest ones that are held against it."""
+
+CHANGED_PX, CHANGED = 0.25, 0.3
+"""By how much the blur must differ, px, and part of the usual one."""
+
+FEWER = 0.8
+"""Part of the usual share of a finger's profiles that agree, below which the finger may be elsewhere."""
+
+
+class _Usual:
+    """Middle of the first values, and of the newest."""
+
+    def __init__(self) -> None:
+        self._first: list[float] = []
+        self._newest: deque[float] = deque(maxlen=NEWEST)
+        self.usual: float | None = None
+
+    def add(self, value: float) -> float:
+        """The newest frames' middle."""
+        self._newest.append(value)
+        if self.usual is None:
+            self._first.append(value)
+            if len(self._first) == LEARNT:
+                self.usual = statistics.median(self._first)
+        return statistics.median(self._newest)
+
+
+class BlurWatch:
+    """Whether the edges' blur is another than usual.  What has changed is told by
+    :class:`gripmon.causes.CauseJudge`: motion smears edges, too.
+    """
+
+    def __init__(self) -> None:
+        self._blur_px = _Usual()
+
+    def add(self, blur_px: float | None) -> bool:
+        """Whether the last frames' blur isn't the usual one; ``blur_px`` of one frame, None where it can't be told."""
+        if blur_px is None:
+            return False
+        now_px, usual_px = self._blur_px.add(blur_px), self._blur_px.usual
+        return usual_px is not None and abs(now_px - usual_px) > max(CHANGED_PX, CHANGED * usual_px)
+
+
+class FingerWatch:
+    """Whether clearly fewer profiles of a finger agree with the fit than usually."""
+
+    def __init__(self, fingers: int) -> None:
+        self._shares = [_Usual() for _ in range(fingers)]
+
+    def add(self, shares: Sequence[float]) -> bool:
+        """``shares`` of each finger's profiles that agree in one frame."""
+        fewer = False
+        for known, share in zip(self._shares, shares, strict=True):
+            now = known.add(share)
+            fewer |= known.usual is not None and now < FEWER * known.usual
+        return fewer
