@@ -1,7 +1,7 @@
 """What tells, for next to nothing a frame, that the judge should be asked although no drift shows.
 
-A lens that lost its focus moves nothing; and a finger that is bent by some tenths of a millimetre may be left aside by a
-joint fit that follows the others.
+A lens that lost its focus moves nothing; and a finger that is bent by some tenths of a millimetre may be left aside by
+a joint fit that follows the others.
 """
 
 from __future__ import annotations
