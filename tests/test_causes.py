@@ -17,7 +17,7 @@ from shown_edges import OPENING_M, REFERENCE_SIGMA, Shown, bend, knocked
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings, PaperLens, make_camera
-from gripmon.causes import BlurWatch, CauseJudge, CauseSettings, FingerWatch
+from gripmon.causes import BlurWatch, CauseJudge, CauseSettings, FingerWatch, ResidualWatch
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.geometry import perturb
@@ -316,3 +316,17 @@ def test_a_finger_of_which_fewer_profiles_agree_is_worth_asking_about():
     assert not any(watch.add([0.1, 0.5]) for _ in range(2))  # two frames decide nothing
     assert not any(watch.add([0.8, 0.5]) for _ in range(5))
     assert [watch.add([0.8, 0.3]) for _ in range(5)] == [False, False, True, True, True]
+
+
+def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_about():
+    rng = np.random.default_rng(5)
+    bias_px = np.array([0.3, -0.2, 0.0, 0.1, np.nan])
+    watch = ResidualWatch()
+
+    def frame(shift_px: Any = 0.0) -> np.ndarray:
+        return bias_px + shift_px + rng.normal(0.0, 0.02, 5)
+
+    assert not any(watch.add(frame()) for _ in range(300))
+    assert not any(watch.add(frame([0.3, 0.0, 0.0, 0.0, 0.0])) for _ in range(10))  # one edge: the background's
+    assert not any(watch.add(frame()) for _ in range(5))
+    assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]

@@ -10,6 +10,10 @@ import statistics
 from collections import deque
 from collections.abc import Sequence
 
+import numpy as np
+
+from gripmon.records import Array
+
 LEARNT, NEWEST = 20, 5
 """Frames from which the usual value is learnt, and newest ones that are held against it."""
 
@@ -18,6 +22,10 @@ CHANGED_PX, CHANGED = 0.25, 0.3
 
 FEWER = 0.8
 """Part of the usual share of a finger's profiles that agree, below which the finger may be elsewhere."""
+
+
+RESIDUAL_PX, RESIDUAL_SIGMAS, FEWEST_EDGES = 0.08, 5.0, 2
+"""By how much the mean residuals of so many edges must differ from the usual ones: px, and standard deviations."""
 
 
 class _Usual:
@@ -67,3 +75,28 @@ class FingerWatch:
             now = known.add(share)
             fewer |= known.usual is not None and now < FEWER * known.usual
         return fewer
+
+
+class ResidualWatch:
+    """Whether edges contradict the joint fit otherwise than usually: it may split the difference between a finger that
+    is bent and the others.
+    """
+
+    def __init__(self) -> None:
+        self._first: list[Array] = []
+        self._newest: deque[Array] = deque(maxlen=NEWEST)
+        self._usual: tuple[Array, Array] | None = None
+
+    def add(self, residual_px: Array) -> bool:
+        """``residual_px`` (e,) mean of each edge in one frame, NaN for edges that are not seen."""
+        self._newest.append(residual_px)
+        if self._usual is None:
+            self._first.append(residual_px)
+            if len(self._first) == LEARNT:
+                self._usual = np.mean(self._first, axis=0), np.std(self._first, axis=0)
+            return False
+        usual_px, scatter_px = self._usual
+        differs_px = np.abs(np.mean(self._newest, axis=0) - usual_px)
+        # Means of five frames before a background that stands still scatter as much as one.
+        beyond = differs_px > np.maximum(RESIDUAL_PX, RESIDUAL_SIGMAS * scatter_px)
+        return len(self._newest) == NEWEST and int(np.count_nonzero(beyond)) >= FEWEST_EDGES

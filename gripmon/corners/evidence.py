@@ -96,6 +96,15 @@ class FingerMeter(Settler):
         kernel_px = measurement.candidates.zoom * self._settings.edges.blur_px
         return math.sqrt(max(median(widths_px) ** 2 - kernel_px**2, 0.0))
 
+    def edge_residuals_px(self, measurement: Measurement) -> Array:
+        """(e,) weighted mean of each edge's residuals in the joint fit, px; NaN for edges that none of them shows."""
+        consensus, edges = measurement.consensus, len(self._gripper.edge_ids)
+        edge = measurement.prediction.layout.edge[measurement.candidates.sample]
+        total = np.bincount(edge, consensus.weight, edges)
+        moment = np.bincount(edge, consensus.weight * consensus.residual_px, edges)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.where(total > 0.0, moment / np.where(total > 0.0, total, 1.0), np.nan))
+
     def _finger_place(
         self, image: Image, measurement: Measurement, votes: Votes, finger: int, elsewhere: tuple[Array, ...]
     ) -> _Place | None:
