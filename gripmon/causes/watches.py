@@ -24,7 +24,7 @@ FEWER = 0.8
 """Part of the usual share of a finger's profiles that agree, below which the finger may be elsewhere."""
 
 
-RESIDUAL_PX, RESIDUAL_SIGMAS, FEWEST_EDGES = 0.08, 5.0, 2
+RESIDUAL_PX, RESIDUAL_SIGMAS, FEWEST_EDGES = 0.05, 4.0, 2
 """By how much the mean residuals of so many edges must differ from the usual ones: px, and standard deviations."""
 
 
