@@ -16,7 +16,7 @@ from watched import frames_of, new_monitor, reference_of, replaced
 from gripmon.camera import make_camera
 from gripmon.gripper import gripper_from_dict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.records import AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict, to_json
+from gripmon.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict, to_json
 
 HEIGHT, WIDTH = PAPER_LENS.height_px, PAPER_LENS.width_px
 
@@ -138,10 +138,13 @@ def test_bad_frames_that_last_give_one_alert_and_none_while_they_are_few():
     assert all(not record.alerts for record in records[:19]), "nothing in the first second"
     assert records[-1].state is State.LOST and records[-1].verdict is Verdict.UNKNOWN
     back = [
-        monitor.process(replaced(frames[5], seq=65 + k, stamp_ns=records[-1].stamp_ns + (k + 1) * 50_000_000))
+        monitor.process(replaced(frames[5 + k], seq=65 + k, stamp_ns=records[-1].stamp_ns + (k + 1) * 50_000_000))
         for k in range(25)
     ]
-    assert [alert.kind for record in back for alert in record.alerts] == [AlertKind.RECOVERED]
+    told = [alert for record in records + back for alert in record.alerts]
+    for kind in (AlertKind.IMAGE, AlertKind.LOST):
+        assert [alert.event for alert in told if alert.kind is kind] == [AlertEvent.RAISED, AlertEvent.CLEARED]
+        assert len({alert.alert_id for alert in told if alert.kind is kind}) == 1
 
 
 @pytest.mark.parametrize("opening_m", [-0.0005, 0.0605, 0.06, 0.0])

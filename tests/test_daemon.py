@@ -106,7 +106,10 @@ def test_a_missing_camera_is_said_on_the_network_and_its_return_too():
     assert not stale.camera_connected and stale.verdict is Verdict.UNKNOWN and stale.frames_per_s == 0.0
     assert stale.message == "no frames: camera 0 can't be opened"
     assert [state for state, _ in bench.states].count(State.STALE) == 2  # and at the end
-    assert bench.alerts == [(AlertKind.SOURCE, Cause.NO_CAMERA), (AlertKind.RECOVERED, Cause.NO_CAMERA)]
+    assert bench.alerts == [(AlertKind.SOURCE, Cause.NO_CAMERA)] * 2
+    raised, cleared = bench.network.alerts
+    assert (raised.event, cleared.event) == (AlertEvent.RAISED, AlertEvent.CLEARED)
+    assert raised.alert_id == cleared.alert_id and raised.alert_id and raised.since_ns
     assert bench.network.alerts[0].severity is Severity.ERROR
     assert bench.recording.alerts == bench.network.alerts
     assert (bench.network.states[-2].state, bench.network.states[-2].camera_connected) == (State.TRACKING, True)
@@ -161,9 +164,10 @@ def test_an_alert_has_the_stamp_of_its_frame():
     script = [0, 1, 2, pause(0.05), Waiting("unplugged"), 3]
     bench = Bench(script, ScriptedMonitor(lambda seq: told.get(seq, {})), no_camera_alert_after_s=0.04)
     bench.run()
-    jump, lost, missing, back = bench.network.alerts
-    assert [(a.kind, a.stamp_ns) for a in (jump, lost, back)] == [
-        (AlertKind.STEP, 1_001), (AlertKind.LOST, 1_002), (AlertKind.RECOVERED, 1_003)
+    step, lost, missing, back, judged = bench.network.alerts
+    assert [(a.kind, a.event, a.stamp_ns) for a in (step, lost, back, judged)] == [
+        (AlertKind.STEP, AlertEvent.NOTED, 1_001), (AlertKind.LOST, AlertEvent.RAISED, 1_002),
+        (AlertKind.SOURCE, AlertEvent.CLEARED, 1_003), (AlertKind.LOST, AlertEvent.CLEARED, 1_003),
     ]  # fmt: skip
     assert abs(missing.stamp_ns - time.time_ns()) < 60e9
 

@@ -233,7 +233,7 @@ def test_states_are_recorded_where_they_change(told: Recorded) -> None:
 def test_alerts_are_in_the_log_with_their_level_and_time(told: Recorded) -> None:
     events = [(c.seq, c.stamp_ns, c.values["level"][0], c.values["text"][0]) for c in told.timed("events")]
     jump = [e for e in events if "moved by 4.5 mm" in e[3]]
-    assert jump == [(10, START_NS + 10 * INTERVAL_NS, "ERROR", "jump [camera_mount_moved] moved by 4.5 mm")]
+    assert jump == [(10, START_NS + 10 * INTERVAL_NS, "ERROR", "step [camera_mount_moved] moved by 4.5 mm")]
     assert (COUNT, START_NS + COUNT * INTERVAL_NS, "WARN", "source [no_camera] unplugged") in events
     assert any(e[0] == 20 and "drifting (suspect) → lost (unknown)" in e[3] for e in events)
 

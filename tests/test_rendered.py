@@ -127,7 +127,7 @@ def test_the_bump_is_found_when_it_happens(replayed: dict[str, Lines]):
     """
     lines, frames = replayed["bump_y"], truth("bump_y")
     alerts = [(line["seq"], alert["kind"], alert["cause"]) for line in lines for alert in line["alerts"]]
-    assert alerts[0][0] == 45 and alerts[0][1] in ("step", "occluded")
+    assert alerts[0][0] in (45, 46) and alerts[0][1] in ("step", "occluded")
     [(found, _, cause)] = [alert for alert in alerts if alert[1] == "step"]
     assert 45 <= found <= 47 and cause == "camera_mount_moved"
     assert [kind for _, kind, _ in alerts].count("step") == 1

@@ -12,6 +12,7 @@ from gripmon.records import (
     State,
 )
 
+RAISED, CLEARED = "source raised", "source cleared"
 GOOD, BAD, NONE = "good", "bad", "none"
 SETTINGS = DaemonSettings(stale_after_s=0.5, no_camera_alert_after_s=3.0)
 
@@ -24,11 +25,11 @@ SETTINGS = DaemonSettings(stale_after_s=0.5, no_camera_alert_after_s=3.0)
         ([(0.1, GOOD), (0.61, NONE)], [], State.STALE),
         ([(0.6, NONE)], [], State.STALE),
         ([(0.6, NONE), (2.9, NONE)], [], State.STALE),
-        ([(2.0, NONE), (3.0, NONE), (9.0, NONE)], [(3.0, "source")], State.STALE),
-        ([(3.0, NONE), (5.0, GOOD), (5.1, GOOD)], [(3.0, "source"), (5.0, "recovered")], State.TRACKING),
+        ([(2.0, NONE), (3.0, NONE), (9.0, NONE)], [(3.0, RAISED)], State.STALE),
+        ([(3.0, NONE), (5.0, GOOD), (5.1, GOOD)], [(3.0, RAISED), (5.0, CLEARED)], State.TRACKING),
         ([(1.0, NONE), (1.5, GOOD)], [], State.TRACKING),
-        ([(3.0, NONE), (4.0, GOOD), (7.1, NONE)], [(3.0, "source"), (4.0, "recovered"), (7.1, "source")], State.STALE),
-        ([(1.0, BAD), (4.0, NONE), (4.1, BAD)], [(4.0, "source"), (4.1, "recovered")], State.TRACKING),
+        ([(3.0, NONE), (4.0, GOOD), (7.1, NONE)], [(3.0, RAISED), (4.0, CLEARED), (7.1, RAISED)], State.STALE),
+        ([(1.0, BAD), (4.0, NONE), (4.1, BAD)], [(4.0, RAISED), (4.1, CLEARED)], State.TRACKING),
         ([(1.0, BAD), (2.9, BAD), (9.0, BAD)], [], State.TRACKING),
     ],
 )  # fmt: skip
@@ -37,12 +38,29 @@ def test_what_the_watch_says(events: list[tuple[float, object]], alerts: list[tu
     said: list[tuple[float, str]] = []
     for now_s, event in events:
         if event == NONE:
-            due = watch.no_frame("unplugged", now_s)
+            due = watch.no_frame("unplugged", now_s, round(1e9 * now_s))
         else:
             due = watch.frame(frame_record(**({} if event == GOOD else REFUSED)), now_s)
-        said += [(now_s, alert.kind.value) for alert in due]
+        said += [(now_s, f"{alert.kind} {alert.event}") for alert in due]
     assert said == alerts
     assert watch.state is state
+
+
+def test_a_silence_and_a_failure_have_one_id_each_from_beginning_to_end():
+    watch = Watch(SETTINGS, now_s=0.0)
+    [silent] = watch.no_frame("unplugged", 3.0, 30)
+    assert (silent.event, silent.severity, silent.since_ns) == ("raised", "error", 30)
+    [heard] = watch.frame(frame_record(), 4.0)
+    assert (heard.event, heard.severity, heard.alert_id, heard.since_ns) == ("cleared", "info", silent.alert_id, 30)
+    [failed] = watch.end_of_frame("internal error: so", "", 4.0, 40)
+    assert watch.end_of_frame("internal error: so", "", 4.1, 41) == []
+    assert (failed.kind, failed.event) == ("lost", "raised")
+    assert (watch.state, watch.verdict) == (State.LOST, "unknown")
+    [judged] = watch.end_of_frame("", "", 4.2, 42)
+    assert (judged.event, judged.alert_id) == ("cleared", failed.alert_id)
+    assert watch.end_of_frame("", "the network: closed", 4.3, 43) == [], "said in the state"
+    [again] = watch.no_frame("unplugged", 9.0, 90)
+    assert len({silent.alert_id, failed.alert_id, again.alert_id}) == 3
 
 
 def test_a_refusal_is_said_once_though_its_figures_change():

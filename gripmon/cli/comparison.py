@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon.records import AlertKind, Array, FrameRecord, Origin, Verdict
+from gripmon.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
 from gripmon.simulator import FrameTruth
 
 EVENT_NAMES = {
@@ -23,7 +23,7 @@ EVENT_NAMES = {
     "sheet": "occlusion",
     "object_between": "grasp",
 }
-NO_ALARMS = frozenset({AlertKind.RECALIBRATED, AlertKind.RECOVERED})
+NO_ALARMS = frozenset({AlertKind.RECALIBRATED, AlertKind.RESTORED, AlertKind.RESTARTED, AlertKind.PROPOSED})
 HARMLESS = frozenset({"shadow", "light step"})
 
 
@@ -76,6 +76,31 @@ class Comparison(msgspec.Struct, frozen=True):
 class _Pair(NamedTuple):
     record: FrameRecord
     truth: FrameTruth
+    alarm: bool
+
+
+class _Alarms:
+    """Tells bad news from what else alerts say: that something is over, or goes on."""
+
+    def __init__(self) -> None:
+        self._said: dict[str, tuple[AlertKind, Severity]] = {}
+
+    def among(self, alerts: Iterable[Alert]) -> bool:
+        """Whether alerts, of one frame, say of something new, or of something that has become another or worse."""
+        alarms = [self._is_one(alert) for alert in alerts]  # each of them counts for what follows
+        return any(alarms)
+
+    def _is_one(self, alert: Alert) -> bool:
+        before = self._said.get(alert.alert_id)
+        if alert.event is AlertEvent.CLEARED or alert.kind in NO_ALARMS:
+            return False
+        if alert.event is AlertEvent.NOTED:
+            return alert.severity is not Severity.INFO
+        self._said[alert.alert_id] = (alert.kind, alert.severity)
+        if before is None:
+            return True
+        ranks = list(Severity)
+        return alert.kind is not before[0] or ranks.index(alert.severity) > ranks.index(before[1])
 
 
 def compare(records: Iterable[FrameRecord], truth_of: Callable[[int], FrameTruth]) -> Comparison:
@@ -83,7 +108,8 @@ def compare(records: Iterable[FrameRecord], truth_of: Callable[[int], FrameTruth
 
     ``after_correction`` and ``smoothed`` are over the frames whose verdict is valid: those that a controller would use.
     """
-    pairs = [_Pair(record, truth_of(record.seq)) for record in records]
+    alarms = _Alarms()
+    pairs = [_Pair(record, truth_of(record.seq), alarms.among(record.alerts)) for record in records]
     valid = [pair for pair in pairs if pair.record.verdict is Verdict.VALID]
     verdicts = {verdict.value: sum(p.record.verdict is verdict for p in pairs) for verdict in Verdict}
     return Comparison(
@@ -141,8 +167,7 @@ def _events(pairs: list[_Pair]) -> tuple[EventReport, ...]:
 
 def _event_report(name: str, during: list[_Pair], until_next: list[_Pair], origin_s: float) -> EventReport:
     valid = [pair for pair in during if pair.record.verdict is Verdict.VALID]
-    alarms = (pair for pair in until_next if any(a.kind not in NO_ALARMS for a in pair.record.alerts))
-    noticed = next(alarms, None)
+    noticed = next((pair for pair in until_next if pair.alarm), None)
     return EventReport(
         event=name,
         start_s=during[0].truth.time_s - origin_s,
@@ -153,5 +178,10 @@ def _event_report(name: str, during: list[_Pair], until_next: list[_Pair], origi
         largest_tcp_shift_mm=1e3 * max(float(np.linalg.norm(p.truth.tcp_shift_m)) for p in during),
         after_correction=_errors([error for p in valid if (error := _error(p)) is not None]),
         noticed_after_s=None if noticed is None else noticed.truth.time_s - during[0].truth.time_s,
-        alerts=tuple(f"{alert.kind} ({alert.cause})" for p in until_next for alert in p.record.alerts),
+        alerts=tuple(_in_short(alert) for p in until_next for alert in p.record.alerts),
     )
+
+
+def _in_short(alert: Alert) -> str:
+    event = "" if alert.event is AlertEvent.NOTED else f" {alert.event}"
+    return f"{alert.kind}{event} ({alert.cause})"

@@ -21,6 +21,7 @@ from gripmon.publish import Publisher
 from gripmon.recording import Recorder
 from gripmon.records import (
     Alert,
+    AlertEvent,
     AlertKind,
     AlertRecord,
     Cause,
@@ -184,7 +185,7 @@ class Daemon:
         if item is None:
             return False
         if isinstance(item, Waiting):
-            for alert in self._watch.no_frame(item.reason, time.monotonic()):
+            for alert in self._watch.no_frame(item.reason, time.monotonic(), time.time_ns()):
                 self._alert(alert, self._watch.state)
         else:
             self._handle(item)
@@ -206,7 +207,8 @@ class Daemon:
             self._alert(alert, record.state, frame.stamp_ns)
         self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace)
         self._deliver("estimates", self._estimates.write, record)
-        for alert in self._watch.end_of_frame(failure, "; ".join(self._faults.values())):
+        undelivered = "; ".join(self._faults.values())
+        for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
             self._alert(alert, record.state, frame.stamp_ns)
 
     def _judge(self, frame: Frame) -> tuple[Frame, FrameRecord, str]:
@@ -295,7 +297,8 @@ class Daemon:
         ``stamp_ns`` is that of the frame that the alert belongs to, if there is one; ``recorded`` if the frame's record
         carries it into the recording.
         """
-        _log.log(_LEVELS[alert.severity], "%s: %s", alert.kind.value, alert.text)
+        about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
+        _log.log(_LEVELS[alert.severity], "%s: %s", about, alert.text)
         message = AlertRecord(
             robot=self._robot,
             camera=self._camera,

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 from gripmon.daemon.settings import DaemonSettings
+from gripmon.policy import AlertBook
 from gripmon.records import Alert, AlertKind, Cause, CornerFault, FrameRecord, Origin, Severity, State, Verdict
 
 _RATE_OVER_FRAMES = 64
+_SILENCE, _FAILURE = "silence", "failure"
 
 
 class Watch:
     """Keeps count, and judges from records and times alone; it has no clock.  All times are monotonic seconds.
 
     ``state``, ``verdict``, ``message`` and ``undelivered`` are what the state message says now.  Alerts about images
-    are the monitor's, those about their absence come from here: one when it has lasted, one when it is over.
+    are the monitor's, those about their absence come from here: raised when it has lasted, cleared when it is over.
     """
 
     def __init__(self, settings: DaemonSettings, now_s: float) -> None:
@@ -27,10 +30,9 @@ class Watch:
         self.frames_usable = 0
         self.undelivered = ""
         self.errors_in_a_row = 0
-        self._failed = False
+        self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
-        self._silence_alerted = False
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; the alerts that are due beside the record's own."""
@@ -47,30 +49,29 @@ class Watch:
             self._keep_message(record.reason or "")
         return alerts
 
-    def no_frame(self, reason: str, now_s: float) -> list[Alert]:
-        """The source waits, for the reason that it gives."""
+    def no_frame(self, reason: str, now_s: float, stamp_ns: int) -> list[Alert]:
+        """The source waits, for the reason that it gives; ``stamp_ns``: Unix time."""
         silence_s = now_s - self._last_frame_s
         if silence_s >= self._settings.stale_after_s:
             self.state, self.verdict = State.STALE, Verdict.UNKNOWN
             self.message = f"no frames: {reason}"
-        if self._silence_alerted or silence_s < self._settings.no_camera_alert_after_s:
+        if silence_s < self._settings.no_camera_alert_after_s:
             return []
-        self._silence_alerted = True
-        text = f"no frame for {silence_s:.1f} s: {reason}"
-        return [Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, text)]
+        silent = Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, f"no frame for {silence_s:.1f} s: {reason}")
+        return list(self._alerts.present(_SILENCE, silent, now_s, stamp_ns))
 
-    def end_of_frame(self, failure: str, undelivered: str) -> list[Alert]:
+    def end_of_frame(self, failure: str, undelivered: str, now_s: float, stamp_ns: int) -> list[Alert]:
         """What failed here, not in the camera: the monitor on the frame, or passing on what it had to say.
 
         Only the first says something about the transform.
         """
         self.undelivered = undelivered
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure or undelivered else 0
-        failed_before, self._failed = self._failed, bool(failure)
         if not failure:
-            return []
+            return list(self._alerts.absent(_FAILURE, "frames are judged again", now_s))
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
-        return [] if failed_before else [Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)]
+        failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
+        return list(self._alerts.present(_FAILURE, failed, now_s, stamp_ns))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""
@@ -96,11 +97,8 @@ class Watch:
     def _end_of_silence(self, now_s: float) -> list[Alert]:
         if now_s - self._last_frame_s >= self._settings.stale_after_s:
             self._frame_times_s.clear()
-        if not self._silence_alerted:
-            return []
-        self._silence_alerted = False
         text = f"frames again after {now_s - self._last_frame_s:.1f} s"
-        return [Alert(AlertKind.RECOVERED, Cause.NO_CAMERA, Severity.INFO, text)]
+        return list(self._alerts.absent(_SILENCE, text, now_s))
 
 
 def _kind(message: str) -> str:

@@ -17,6 +17,9 @@ KEPT_BLOCKS = 256
 FEWEST_BLOCKS = 6
 """Blocks below which a creep isn't told from a step."""
 
+LASTING_BLOCKS = 3
+"""Blocks that must have come after a step."""
+
 BETTER = 0.6
 """A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
 
@@ -77,7 +80,10 @@ class History:
         if count < FEWEST_BLOCKS:
             return False
         along = np.array(self._means) @ towards
-        return _best(along, _steps(count))[0] <= BETTER * _best(along, _ramps(np.array(self._times_s)))[0]
+        step, before = _best(along, _steps(count))
+        # Of a creep that has just begun the first block is a step, too.
+        lasts = count - 1 - before >= LASTING_BLOCKS
+        return lasts and step <= BETTER * _best(along, _ramps(np.array(self._times_s)))[0]
 
 
 def goes_on(values: Array) -> bool:

@@ -12,7 +12,7 @@ from gripmon.drift.sequential import SequentialTest
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.tolerance import square_beyond
 from gripmon.drift.vibration import VibrationWatch
-from gripmon.records import AlertKind, Array, Creep, Motion
+from gripmon.records import AlertKind, Array, Creep, Motion, Vibration
 
 LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
 """Frames at most, and since the last step, whose mean tells whether the camera is back, and of which the present shift
@@ -26,6 +26,16 @@ RETURNED = 12.6
 
 SUSPICIOUS = 0.4
 """Part of the threshold from which the evidence is looked at more closely, before it is decided."""
+
+VIBRATING_FRAMES, VIBRATING_LEVEL = 256, 512
+"""While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone, and
+:data:`LEVEL_FRAMES` then.
+"""
+
+BEYOND_VIBRATION = 4.0
+"""Times a vibration's root mean square by which two frames must be off to be a step nevertheless: a sinusoid swings by
+1.4 to either side.
+"""
 
 STEP_S = 0.5
 """A change of the mean that took no longer is a step."""
@@ -43,7 +53,9 @@ class MotionWatch:
         self._newest: deque[Array] = deque(maxlen=4 * int(STEP_S * 240.0))
         self._kind = AlertKind.DRIFT
         self._present = False
+        self._held = 0
         self._creep: Creep | None = None
+        self._vibrates: Vibration | None = None
         self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
 
     def reset(self, reference_covariance: Array) -> None:
@@ -53,7 +65,8 @@ class MotionWatch:
         self._history.clear()
         self._newest.clear()
         self._vibration.forget()
-        self._present, self._kind, self._creep = False, AlertKind.DRIFT, None
+        self._held = 0
+        self._present, self._kind, self._creep, self._vibrates = False, AlertKind.DRIFT, None, None
         self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
 
     def resume(self, moved: bool) -> None:
@@ -75,39 +88,38 @@ class MotionWatch:
             self._last = Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
             return self._last
         test = self.test
-        finding = test.add(shift[None], covariance[None])
+        finding = test.add(shift[None], covariance[None], at_least=self._shortest_window(shift))
         moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
         length = int(finding.length[0])
         self._newest.append(shift)
         at_once = stepped and length <= STEP_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
-        if at_once:
-            self._vibration.forget()
-        vibration = self._vibration.add(shift, now_s, test.usual_covariance())
+        self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance())
         frames = max(int(test.windows.frames[0]), 1)
-        level, level_covariance = self._level(min(frames, LEVEL_FRAMES))
+        level, level_covariance = self._level(min(frames, VIBRATING_LEVEL if self._vibrates else LEVEL_FRAMES))
         before = self._present
-        self._present = moved or (before and self._away(level, level_covariance))
+        # Those that have shown it are forgotten if it was a difference: as many more may show it again.
+        self._held = 2 * length if moved else max(self._held - 1, 0)
+        self._present = moved or (before and (self._held > 0 or self._away(level, level_covariance)))
         complete = self._history.add(shift, now_s)
         begun = moved and not before
         if begun or at_once:
             self._kind, self._creep = (AlertKind.STEP if at_once else AlertKind.DRIFT), None
         if self._present and (complete or begun) and not at_once:
             self._look_back(level, level_covariance)
-        frames = min(frames, NEWEST_FRAMES)
-        newest, newest_covariance = self._level(frames)
+        newest, newest_covariance = self._level(min(frames, NEWEST_FRAMES))
         self._last = Motion(
             present=self._present,
             kind=self._kind,
             shift=newest,
             sigma=np.sqrt(newest_covariance.diagonal()),
-            frames=frames,
+            frames=min(int(test.windows.frames[0]), NEWEST_FRAMES),
             begun=begun,
             stepped=at_once,
             step_frames=length if at_once else 0,
             creep=self._creep,
-            vibration=vibration,
+            vibration=self._vibrates,
             suspicious=bool(finding.excess[0] > SUSPICIOUS),
         )
         return self._last
@@ -115,6 +127,15 @@ class MotionWatch:
     def skip(self) -> Motion:
         """A frame whose transform is doubtful tells nothing: all is as it was."""
         return replace(self._last, begun=False, stepped=False, suspicious=False)
+
+    def _shortest_window(self, shift: Array) -> int:
+        """Frames of the shortest window that may decide: the swings of a vibration are no steps."""
+        if self._vibrates is None or not self._newest:
+            return 1
+        frames = min(int(self.test.windows.frames[0]), VIBRATING_FRAMES)
+        middle = self._level(frames)[0] if frames > 1 else np.zeros(6)
+        off_m = min(float(np.linalg.norm((each - middle)[:3])) for each in (shift, self._newest[-1]))
+        return 1 if off_m > BEYOND_VIBRATION * self._vibrates.rms_m else VIBRATING_FRAMES
 
     def _goes_on(self, length: int) -> bool:
         """Whether the frames about a difference between windows of ``length`` frames show a creep, not a step."""

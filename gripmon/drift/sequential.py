@@ -83,10 +83,13 @@ class SequentialTest:
         self._reference = np.broadcast_to(covariance, (self._streams, 6, 6)).copy()
         self._stale = True
 
-    def add(self, shift: Array, covariance: Array, learn: np.ndarray | None = None) -> Finding:
+    def add(
+        self, shift: Array, covariance: Array, learn: np.ndarray | None = None, at_least: int = LENGTHS[0]
+    ) -> Finding:
         """One frame's shift (s, 6) against the reference, m and rad, with its reported covariance (s, 6, 6).
 
-        ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.
+        ``learn`` (s,): whether the frame may count as one in which nothing moves; all of them if left out.  Windows of
+        fewer than ``at_least`` frames decide nothing now.
         """
         usual = self._report(covariance)
         if self._stale or self._frames % REFRESH_FRAMES == 0:
@@ -100,12 +103,12 @@ class SequentialTest:
         mean_full, both_full = self.windows.full()
         square = np.stack([_square(self._whitening[0], mean), _square(self._whitening[1], difference)])
         full = np.stack([mean_full, both_full])
-        worth = mean_full & (square[0] > WORTH * self._threshold)
+        # What is tolerated can only matter between these two.
+        surely = np.sqrt(self._threshold) + self._most_tolerated
+        worth = mean_full & (square[0] > WORTH * self._threshold) & (square[0] <= surely * surely)
         if worth.any():
             square[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
         beyond = np.where(full, square / self._threshold, 0.0)  # (2, k, s)
-        excess = beyond.max(axis=(0, 1))
-        moved = excess > 1.0
         if self._frames % LEARNING_FRAMES == 0:
             # An offset that stays says nothing against what differences show.
             usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
@@ -114,10 +117,12 @@ class SequentialTest:
             normalised = _square(self._learnt_whitening, difference)
             self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
             self._learn_surge(normalised, usable)
+        beyond = beyond[:, LENGTHS.index(at_least) :]
+        excess = beyond.max(axis=(0, 1))
         # The shortest window that is beyond its threshold dates the motion best.
         index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
         stepped = beyond[1, index, np.arange(self._streams)] > 1.0
-        return Finding(moved, np.array(LENGTHS)[index], stepped, excess)
+        return Finding(excess > 1.0, np.array(LENGTHS)[LENGTHS.index(at_least) :][index], stepped, excess)
 
     def level(self, frames: int) -> tuple[Array, Array]:
         """Mean shift (s, 6) over the last ``frames`` frames, and its covariance (s, 6, 6) (that of the next shorter
@@ -179,6 +184,7 @@ class SequentialTest:
         inflation = self._inflation * np.maximum(self._surge, 1.0)
         of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
         self._whitening = _whitening(np.stack([of_mean + self._reference, of_difference]))
+        self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
         # What is told of a mean is its standard deviation, not what would be too rare.
         self._mean_covariance = self.scatter.covariances(self._reported, np.ones_like(inflation))[0] + self._reference
         self._learnt_whitening = _whitening(self.scatter.of_differences)

@@ -15,6 +15,8 @@ KEPT_FRAMES = 128
 LOOK_FRAMES = 32
 """Looked at once in so many frames."""
 
+PARTS = 4
+
 TIMES = 6.0
 """Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
 
@@ -51,17 +53,26 @@ class VibrationWatch:
 
     def _look(self, usual: Array) -> Vibration | None:
         shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
-        line = np.column_stack([np.ones(KEPT_FRAMES), times_s - times_s.mean()])
-        shifts = shifts - line @ np.linalg.lstsq(line, shifts, rcond=None)[0]  # a creep is no vibration
-        # The loudest direction; half of the windows must show it, so that one step in them does not.
-        parts = [part.T @ part / len(part) for part in np.split(shifts, 4)]
-        direction = _loudest(np.mean(parts, axis=0), usual)
-        loud = [float(direction @ part @ direction) for part in parts]
+        # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
+        parts = [_about_its_line(part) for part in np.split(shifts, PARTS)]
+        direction = _loudest(np.mean([part.T @ part / len(part) for part in parts], axis=0), usual)
+        loud = sorted(float(np.square(part @ direction).mean()) for part in parts)
         expected = float(direction @ usual @ direction)
-        excess = float(np.median(loud)) - expected
-        if excess < (TIMES - 1.0) * expected or excess < self._smallest_m**2:
+        if loud[1] < TIMES * expected:
             return None
-        return Vibration(math.sqrt(excess), _frequency_hz(shifts @ direction, times_s))
+        # A part may hold less than a period: the size is that about a line through all of them.
+        along = _about_its_line(shifts) @ direction
+        excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected
+        if excess < self._smallest_m**2:
+            return None
+        return Vibration(math.sqrt(excess), _frequency_hz(along, times_s))
+
+
+def _about_its_line(values: Array) -> Array:
+    """(n, 3) what is left of values (n, 3) that grow evenly: a creep is no vibration."""
+    index = np.arange(len(values)) - 0.5 * (len(values) - 1)
+    line = np.column_stack([np.ones(len(values)), index])
+    return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
 
 
 def _loudest(covariance: Array, usual: Array) -> Array:

@@ -5,6 +5,8 @@ A pure function of the frames so far: no clock, no I/O, no threads.  Time is the
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 
@@ -165,8 +167,11 @@ class Monitor:
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         origin, alerts = Origin.UPDATE, judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
-            self._restarted = False
-            alerts = (self._after_restart(evidence), *alerts)
+            if evidence.motion.frames == 0 and self._baseline.error is not None:
+                judgement = replace(judgement, verdict=Verdict.SUSPECT)  # too few frames to say whether it fits
+            else:
+                self._restarted = False
+                alerts = (self._after_restart(evidence), *alerts)
         if judgement.state is not State.RECALIBRATING or self._policy.still_frames <= 1:
             self._renewal.moved()
         if judgement.state is State.RECALIBRATING:

@@ -30,7 +30,17 @@ from gripmon.recording import palette
 from gripmon.recording.overlay import OverlayWriter
 from gripmon.recording.rig import RigWriter
 from gripmon.recording.wire import Scene, TraceNote
-from gripmon.records import Alert, AlertRecord, FrameRecord, ReferenceRecord, Severity, State, Verdict, to_json
+from gripmon.records import (
+    Alert,
+    AlertEvent,
+    AlertRecord,
+    FrameRecord,
+    ReferenceRecord,
+    Severity,
+    State,
+    Verdict,
+    to_json,
+)
 
 _LONGEST_SILENCE_NS = 86_400_000_000_000  # between a frame and an alert that belongs to no frame: a day
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
@@ -252,7 +262,9 @@ def _edge_point_counts(trace: TraceNote) -> tuple[float, float]:
 
 
 def _event(stamp_ns: int, seq: int, alert: Alert | AlertRecord) -> Event:
-    return Event(stamp_ns, seq, _LEVELS[alert.severity], f"{alert.kind} [{alert.cause}] {alert.text}")
+    event = "" if alert.event is AlertEvent.NOTED else f" {alert.event}"
+    said = f"{alert.kind}{event} [{alert.cause}] {alert.text}"
+    return Event(stamp_ns, seq, _LEVELS[alert.severity], f"{said} ({alert.alert_id})" if alert.alert_id else said)
 
 
 def _configuration(colours: dict[State, palette.Colour] | dict[Verdict, palette.Colour]) -> rr.StateConfiguration:

@@ -48,7 +48,6 @@ class AlertKind(enum.StrEnum):
     IMAGE = "image"
     STREAM = "stream"
     SOURCE = "source"
-    RECOVERED = "recovered"
 
 
 class AlertEvent(enum.StrEnum):

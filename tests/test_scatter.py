@@ -1,0 +1,117 @@
+"""What window means scatter by: Haar's identity on simulated noise, and what of a claimed covariance is missing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drift_noise import COVARIANCE, autocorrelated, claimed
+
+from gripmon.drift.scatter import PRIOR_SHARE, PRIOR_WINDOWS, Scatter
+from gripmon.drift.windows import LENGTHS, Windows
+
+FRAMES, STREAMS = 12_000, 24
+NO_MORE = np.ones((len(LENGTHS), STREAMS))
+
+
+def learnt(shifts: np.ndarray, every: int = 4) -> Scatter:
+    """Scatter of the differences between windows over shifts (n, s, 6)."""
+    streams = shifts.shape[1]
+    windows, scatter = Windows(streams), Scatter(streams)
+    scatter.begin(claimed(streams))
+    for number, values in enumerate(shifts):
+        windows.add(values)
+        if number % every == 0:
+            mean, before = windows.means()
+            _, usable = windows.full()
+            scatter.learn(mean - before, np.zeros(usable.shape), usable, every)
+    return scatter
+
+
+def share(covariance: np.ndarray) -> float:
+    """Mean over the directions of a covariance (..., 6, 6) in units of the claimed one."""
+    white = np.linalg.solve(COVARIANCE, covariance.reshape(-1, 6, 6))
+    return float(np.trace(white, axis1=1, axis2=2).mean() / 6.0)
+
+
+def mean_variance(memory: float, frames: int) -> float:
+    """Of the mean of so many values of an AR(1) with variance one, by the sum over all pairs."""
+    lags = np.abs(np.subtract.outer(np.arange(frames), np.arange(frames)))
+    return float(np.mean(memory**lags))
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.9])
+def test_means_of_windows_scatter_as_those_of_an_ar_process(memory: float):
+    """Twice the claimed standard deviation, so that nothing of it is missing."""
+    rng = np.random.default_rng(1)
+    scatter = learnt(2.0 * autocorrelated(rng, FRAMES, STREAMS, memory))
+    of_mean, _ = scatter.covariances(claimed(STREAMS), NO_MORE)
+    for k, frames in enumerate(LENGTHS[:7]):  # longer ones still show the prior
+        # Neighbours a and b of one length: var(a - b) = 2 var(a) + 2 var(b) - 4 var((a + b) / 2).
+        expected = 4.0 * mean_variance(memory, frames)
+        difference = 4.0 * expected - 16.0 * mean_variance(memory, 2 * frames)
+        pairs = 0.5 * FRAMES / frames
+        difference = (pairs * difference + PRIOR_WINDOWS * PRIOR_SHARE) / (pairs + PRIOR_WINDOWS)
+        assert share(scatter.of_differences[k]) == pytest.approx(difference, rel=0.07)
+        rest = 0.25 * PRIOR_SHARE * 8.0  # of the lengths that have not shown themselves yet
+        assert share(of_mean[k]) == pytest.approx(expected, rel=0.15, abs=rest)
+
+
+def test_the_sum_over_octaves_is_the_variance_of_the_means():
+    """Haar: what is left of the mean's variance at the longest length, plus all differences over four."""
+    rng = np.random.default_rng(2)
+    scatter = learnt(3.0 * autocorrelated(rng, FRAMES, STREAMS, 0.5))
+    of_mean, of_difference = scatter.covariances(1e-6 * claimed(STREAMS), NO_MORE)
+    for k in range(len(LENGTHS) - 1):
+        np.testing.assert_allclose(of_mean[k], of_mean[k + 1] + 0.25 * of_difference[k], rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(of_mean[-1], 0.5 * of_difference[-1], rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(scatter.of_single_frames() + 0.25 * scatter.of_differences[-1], of_mean[0], rtol=1e-4)
+    more, _ = scatter.covariances(1e-6 * claimed(STREAMS), 5.0 * NO_MORE)
+    np.testing.assert_allclose(more, 5.0 * of_mean, rtol=1e-4)
+
+
+def test_what_frames_claim_but_do_not_show_counts_as_bias_at_every_length():
+    """Noise with a fourth of the claimed variance in three directions, and four times of it in the others."""
+    rng = np.random.default_rng(3)
+    factor = np.linalg.cholesky(COVARIANCE)
+    size = np.array([0.5, 0.5, 0.5, 2.0, 2.0, 2.0])
+    shifts = (rng.normal(size=(FRAMES, STREAMS, 6)) * size) @ factor.T
+    of_mean, of_difference = learnt(shifts).covariances(claimed(STREAMS), NO_MORE)
+    inverse = np.linalg.inv(factor)
+    white = (inverse @ of_mean.mean(axis=1) @ inverse.T).diagonal(axis1=1, axis2=2)
+    assert white[0, :3] == pytest.approx(np.full(3, 1.15), abs=0.2), "single frames: what they claim, at least"
+    assert white[0, 3:] == pytest.approx(np.full(3, 4.0), rel=0.2), "and what they show where that is more"
+    long = LENGTHS.index(256)
+    assert (white[long, :3] > 0.4).all(), "bias is not averaged away"
+    assert (white[long, 3:] < 0.4).all(), "noise is"
+    assert share(of_difference[long]) > 2.0 * 0.4 * 0.5, "two backgrounds have two biases"
+
+
+def test_before_anything_was_seen_means_are_worth_about_what_frames_claim():
+    scatter = Scatter(1)
+    scatter.begin(claimed(1))
+    of_mean, _ = scatter.covariances(claimed(1), NO_MORE[:, :1])
+    assert 1.0 <= share(of_mean[0]) < 2.5
+    assert (np.array([share(each) for each in of_mean]) >= 1.0).all()
+    assert (np.diff([share(each) for each in of_mean]) <= 0.0).all()
+
+
+def test_one_wild_difference_hardly_counts():
+    """Beyond four times what is expected a square counts as that much."""
+    calm, wild = Scatter(1), Scatter(1)
+    for scatter, size in ((calm, 1.0), (wild, 1e3)):
+        scatter.begin(claimed(1))
+        difference = np.tile(size * np.linalg.cholesky(COVARIANCE)[:, 0], (len(LENGTHS), 1, 1))
+        normalised = np.full((len(LENGTHS), 1), 6.0 * size**2)
+        scatter.learn(difference, normalised, np.full((len(LENGTHS), 1), True), 4)
+    assert share(wild.of_differences) < share(calm.of_differences) + 4.0 / 13.0
+
+
+def test_what_is_not_usable_is_not_learnt():
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    before, windows = scatter.of_differences.copy(), scatter.windows.copy()
+    usable = np.tile([True, False], (len(LENGTHS), 1))
+    scatter.learn(np.ones((len(LENGTHS), 2, 6)), np.ones((len(LENGTHS), 2)), usable, 4)
+    np.testing.assert_array_equal(scatter.of_differences[:, 1], before[:, 1])
+    np.testing.assert_array_equal(scatter.windows[:, 1], windows[:, 1])
+    assert (scatter.of_differences[:, 0] != before[:, 0]).all()
