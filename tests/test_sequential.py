@@ -72,41 +72,34 @@ def test_noise_louder_than_frames_claim_is_learnt(streams: int):
 # --- delay ---
 
 
-def expected_delay(test: SequentialTest, step: np.ndarray, *, rate: float = 1.0, frames_per_s: float = 60.0) -> int:
-    """Frames until a step (6,) without noise is found by a test (of one stream) that has learnt its covariances.
+def expected_delay(sizes: float, *, rate: float = 1.0, frames_per_s: float = 60.0) -> int:
+    """Frames until a step of so many standard deviations is found, where frames claim COVARIANCE but have no noise.
 
     All windows of L frames, of which m lie behind the step, are off by m / L of it; the median of three shows it one
     frame late.
     """
-    chance = rate / (86_400.0 * frames_per_s * 2 * 13)
-    limit = stats.chi2.isf(chance, 6)
-    lengths = np.array(LENGTHS, dtype=float)
-    freedom = 1.0 / (1.0 / test.scatter.windows[:, 0] + 1.0 / (9.0 * lengths ** (1.0 / 3.0)))
-    inflation = 6.0 * stats.f.isf(chance, 6.0, freedom) / limit
-    means, differences = test.scatter.covariances(claimed(1), inflation[:, None])
+    limit = stats.chi2.isf(rate / (86_400.0 * frames_per_s * 2 * 13), 6)
     for behind in range(1, 4097):
-        for length, mean, difference in zip(LENGTHS, means[:, 0], differences[:, 0], strict=True):
-            now = min(behind / length, 1.0) * step
-            before = max(0.0, min(behind / length - 1.0, 1.0)) * step
-            if now @ np.linalg.solve(mean, now) > limit:
-                return behind + 1
-            if (now - before) @ np.linalg.solve(difference, now - before) > limit:
+        for length in LENGTHS:
+            part = min(behind / length, 1.0) * sizes
+            before = max(0.0, min(behind / length - 1.0, 1.0)) * sizes
+            if part**2 > limit or (part - before) ** 2 / 2.0 > limit:
                 return behind + 1
     raise AssertionError("never")
 
 
-@pytest.mark.parametrize("sizes", [10.0, 15.0, 30.0, 200.0])
+@pytest.mark.parametrize("sizes", [11.0, 15.0, 20.0, 60.0, 200.0])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_the_delay_of_a_step_is_that_of_the_formulas(sizes: float, sign: float):
     rng, test = np.random.default_rng(5), SequentialTest(PLAIN)
     feed(test, np.zeros((9000, 1, 6)))
     direction = np.linalg.cholesky(COVARIANCE) @ rng.normal(size=6)
     direction /= np.sqrt(direction @ np.linalg.solve(COVARIANCE, direction))
-    step = sign * sizes * direction
-    expected = expected_delay(test, step)
-    found = feed(test, np.tile(step, (expected + 50, 1, 1)), np.array([False]))
+    expected = expected_delay(sizes)
+    found = feed(test, np.tile(sign * sizes * direction, (expected + 50, 1, 1)), np.array([False]))
     delay = 1 + next(n for n, finding in enumerate(found) if finding.moved[0])
-    assert delay == pytest.approx(expected, rel=0.05, abs=1), "what was learnt is taken over now and then"
+    # Nothing seen of the noise isn't quite no noise: the prior is forgotten only slowly at the longest lengths.
+    assert expected <= delay <= expected + 1
 
 
 def test_an_offset_without_a_step_is_found_by_the_mean():

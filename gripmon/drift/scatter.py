@@ -83,15 +83,14 @@ class Scatter:
         """
         parts = 0.25 * self._of_difference
         parts[-1] *= 2.0  # beyond the longest, windows count as independent
-        total = np.cumsum(parts[::-1], axis=0)[::-1]
+        total = np.cumsum((inflation[..., None, None] * parts)[::-1], axis=0)[::-1]
         # What was only assumed has not been seen.
         learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
         seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
         rare = np.concatenate([seen[LONGER:], np.zeros_like(seen[:LONGER])])
         # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
         missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
-        inflation = inflation[..., None, None]
-        return inflation * total + missing[0], inflation * self._of_difference + 2.0 * missing[1:]
+        return total + missing[0], inflation[..., None, None] * self._of_difference + 2.0 * missing[1:]
 
     def of_single_frames(self) -> Array:
         """(s, 6, 6) of frames about their mean, as the stream has shown it."""

@@ -28,6 +28,16 @@ FREEDOM, FREEDOM_GROWTH = 9.0, 1.0 / 3.0
 number of frames with which those of a mean grow: the mean of many is more nearly normal.
 """
 
+TAIL, TAIL_WINDOWS, NORMAL_SQUARE = 0.01, 500.0, 16.8
+"""How far out the noise's own distribution is compared with the normal one, over how many windows, and where that is
+for six normal errors (chi-square).
+"""
+
+STUDENT_TAIL, HEAVY = 1.6, (0.25, 1.5)
+"""The ratio for Student's distribution with :data:`FREEDOM`, which is assumed at first; a stream with less heavy, or
+heavier, tails has this much of the logarithm of its inflation at least and at most.
+"""
+
 SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
 """Differences over the last frames, or windows, that are larger than learnt, up to so many times, count as noise."""
 
@@ -69,6 +79,7 @@ class SequentialTest:
         self._reference: Array = np.zeros((streams, 6, 6))
         self._frames = 0
         self._surge = np.ones((len(LENGTHS), streams))
+        self._tail = np.full((len(LENGTHS), streams), STUDENT_TAIL)
         self._stale = True
         self._threshold = 1.0
         self._inflation: Array | None = None
@@ -117,6 +128,7 @@ class SequentialTest:
             normalised = _square(self._learnt_whitening, difference)
             self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
             self._learn_surge(normalised, usable)
+            self._learn_tail(normalised, usable)
         beyond = beyond[:, LENGTHS.index(at_least) :]
         excess = beyond.max(axis=(0, 1))
         # The shortest window that is beyond its threshold dates the motion best.
@@ -174,6 +186,14 @@ class SequentialTest:
         rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * _COUNT), 0.0)
         self._surge += rate * (np.minimum(square / 6.0, SURGE_MOST) - self._surge)
 
+    def _learn_tail(self, square: Array, usable: np.ndarray) -> None:
+        """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
+        ones.
+        """
+        share = np.minimum(LEARNING_FRAMES / (2.0 * _COUNT), 1.0) / TAIL_WINDOWS
+        beyond = (square > self._tail * NORMAL_SQUARE) / TAIL - 1.0
+        self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
+
     def _refresh(self) -> None:
         self._stale = False
         self._from_reported = np.linalg.cholesky(self._reported)
@@ -181,7 +201,8 @@ class SequentialTest:
         # Slow to compute, slow to change.
         if self._inflation is None or self._frames % (16 * REFRESH_FRAMES) == 0:
             self._threshold, self._inflation = self._rarity(self.scatter.windows)
-        inflation = self._inflation * np.maximum(self._surge, 1.0)
+        heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
+        inflation = self._inflation**heavy * np.maximum(self._surge, 1.0)
         of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
         self._whitening = _whitening(np.stack([of_mean + self._reference, of_difference]))
         self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)

@@ -35,6 +35,10 @@ class Inquiry:
         self._judge.rebase(reference_sigma)
         self._forget()
 
+    def interrupted(self) -> None:
+        """No frames came for long: somebody may have exchanged the camera meanwhile."""
+        self._judge.interrupted()
+
     def ask(self, wrong: bool, evidence: Callable[[], EdgeEvidence], ref_cam_T_grip: Array) -> Explanation:
         """One frame in which something looks ``wrong`` or not; ``evidence`` is gathered only if it is needed."""
         if wrong:

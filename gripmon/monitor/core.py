@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.camera import Camera
-from gripmon.causes import CauseJudge
+from gripmon.causes import BlurWatch, CauseJudge, FingerWatch, ResidualWatch
 from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
@@ -30,6 +30,7 @@ from gripmon.records import (
     AlertKind,
     Array,
     Cause,
+    CauseWeight,
     Command,
     CommandName,
     CommandReply,
@@ -85,6 +86,7 @@ class Monitor:
             camera, gripper, settings.causes, np.zeros(6), settings.jaw_sigma_m, settings.jaw_offset_sigma_m
         )
         self._inquiry = Inquiry(judge)
+        self._blur, self._fingers, self._residuals = BlurWatch(), FingerWatch(len(gripper.finger_ids)), ResidualWatch()
         self._average = PoseAverage(settings.smoothing)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
@@ -145,7 +147,13 @@ class Monitor:
         refusal = inspect(frame, self._camera, self._gripper) or _frozen(faults)
         if refusal is not None:
             self._newest = None
-            return self._unmeasured(frame, f"{refusal[0]}: {refusal[1]}", CornerFault.FRAME_REFUSED, refusal=refusal[0])
+            return self._unmeasured(
+                frame,
+                f"{refusal[0]}: {refusal[1]}",
+                CornerFault.FRAME_REFUSED,
+                refusal=refusal[0],
+                explanation=_of_stream(faults),
+            )
         measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip)
         if not measurement.trusted:
             explanation = self._explain(frame, measurement, wrong=True)
@@ -201,6 +209,8 @@ class Monitor:
     def _look_at_stream(self, frame: Frame) -> tuple[StreamFault, ...]:
         """What is wrong with the stream, told of in the next record; its rate, for the drift test."""
         faults = self._stream.add(frame)
+        if any(fault.kind == "gap" for fault in faults):
+            self._inquiry.interrupted()
         told = tuple((fault.kind, fault.cause, fault.text) for fault in faults)
         self._due += self._policy.stream(told, self._now_s, frame.stamp_ns)
         if self._stream.frames_per_s is not None:
@@ -221,7 +231,10 @@ class Monitor:
             motion = self._watch.skip()
         else:
             motion = self._watch.add(self._baseline.subtract(shift), self._covariance, self._now_s)
-        explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious)
+        odd = self._blur.add(self._tracker.blur_px(measurement))
+        odd |= self._fingers.add(agreeing_fingers(measurement, self._gripper))
+        odd |= self._residuals.add(self._tracker.edge_residuals_px(measurement))
+        explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)
 
@@ -364,3 +377,12 @@ class Monitor:
 def _frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
     """An image that repeats an earlier one shows what was, not what is."""
     return next(((Refusal.FROZEN, fault.text) for fault in faults if fault.kind == "frozen"), None)
+
+
+def _of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
+    """What the stream says of images that are refused: that they come from another camera, or are no new ones."""
+    for fault in faults:
+        if fault.kind in ("replaced", "frozen"):
+            known = CauseWeight(fault.cause, 1.0)
+            return Explanation((known,), known, fault.text)
+    return Explanation()

@@ -132,6 +132,14 @@ class Tracker:
         """How far the measured edges are from where ``before_T`` (4, 4) would have them."""
         return self._meter.moved_px(measurement, before_T)
 
+    def blur_px(self, measurement: Measurement) -> float | None:
+        """How blurred the edges are, px; None where too few are seen."""
+        return self._meter.blur_px(measurement)
+
+    def edge_residuals_px(self, measurement: Measurement) -> Array:
+        """(e,) mean residual of each edge, px; NaN where it isn't seen."""
+        return self._meter.edge_residuals_px(measurement)
+
     def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
         """What the fingers show one by one in a frame that was measured; takes as long as the measurement."""
         assert frame.image is not None

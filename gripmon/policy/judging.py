@@ -129,7 +129,7 @@ class Policy:
         probable = explanation.probable
         if self.state is State.LOST:
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
-            cause = Cause.IMAGE_BAD if refusal else Cause.UNKNOWN if measured_s is None else self._blocked(explanation)
+            cause = self._bad(explanation) if refusal else probable.cause
             why = "" if refusal else explanation.text
             text = f"{what} for {lasted_s:.1f} s; no transform is given" + (f"; {why}" if why else "")
             lost = Alert(AlertKind.LOST, cause, Severity.ERROR, text, part=probable.part, causes=explanation.causes)
@@ -137,7 +137,7 @@ class Policy:
         elif self.state is State.OCCLUDED:
             text = "too few edges of the gripper are seen; the last transform is held"
             text += f"; {explanation.text}" if explanation.text else ""
-            cause, causes = self._blocked(explanation), explanation.causes
+            cause, causes = probable.cause, explanation.causes
             occluded = Alert(AlertKind.OCCLUDED, cause, Severity.WARNING, text, part=probable.part, causes=causes)
             before = book.about(VIEW)
             # Lost isn't taken back for one frame, nor is it over while frames in between show nothing.
@@ -145,7 +145,7 @@ class Policy:
             alerts += book.present(VIEW, told, now_s, stamp_ns)
         if refusal and lasted_s >= settings.image_alert_after_s:
             text = f"frames are refused for {lasted_s:.1f} s: {refusal}"
-            bad = Alert(AlertKind.IMAGE, Cause.IMAGE_BAD, Severity.ERROR, text)
+            bad = Alert(AlertKind.IMAGE, self._bad(explanation), Severity.ERROR, text)
             alerts += book.present(IMAGE, bad, now_s, stamp_ns)
         elif not refusal:
             alerts += book.absent(IMAGE, "images are good again", now_s)
@@ -164,9 +164,9 @@ class Policy:
         return alerts
 
     @staticmethod
-    def _blocked(explanation: Explanation) -> Cause:
-        """Why the gripper isn't seen, where nothing else is known: something is before it."""
-        return explanation.probable.cause if explanation.text else Cause.VIEW_BLOCKED
+    def _bad(explanation: Explanation) -> Cause:
+        """Why images are refused: by themselves, unless the stream says otherwise."""
+        return explanation.probable.cause if explanation.text else Cause.IMAGE_BAD
 
     def recalibrated(self, now_s: float) -> tuple[Alert, ...]:
         """The reference was replaced: drift is reckoned from zero, and what was said of it is over."""

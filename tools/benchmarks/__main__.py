@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, causes, latency, recalibration, recovery, series, smoothing
+from benchmarks import accuracy, causes, drift, latency, recalibration, recovery, series, smoothing
 
-_BENCHMARKS = (accuracy, causes, latency, recalibration, recovery, series, smoothing)
+_BENCHMARKS = (accuracy, causes, drift, latency, recalibration, recovery, series, smoothing)
 
 
 def main() -> int:
