@@ -56,6 +56,9 @@ from gripmon.stream import StreamFault, StreamWatch
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
 
+DOUBTED_FRAMES = 5
+"""Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
+
 JAW_SURPRISE = 5.0
 """Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
 
@@ -94,6 +97,7 @@ class Monitor:
         self._measured_s: float | None = None
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
+        self._astray = 0
         self._restarted = state is not None  # and not yet said whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
@@ -227,7 +231,9 @@ class Monitor:
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
         sigma = np.sqrt(self._covariance.diagonal())
         astray = self._gripper_astray(measurement)
-        if astray or sigma[:3].max() > self._settings.policy.suspect_sigma_m:
+        self._astray = self._astray + 1 if astray else 0
+        # Few doubtful frames tell nothing; many are how it is now.
+        if 0 < self._astray < DOUBTED_FRAMES:
             motion = self._watch.skip()
         else:
             motion = self._watch.add(self._baseline.subtract(shift), self._covariance, self._now_s)

@@ -267,7 +267,7 @@ def main() -> int:
     parser.add_argument("directory", type=Path, metavar="DIR", help="where benchmarks.noise_measured put its series")
     folder: Path = parser.parse_args().directory
     FOLDER.mkdir(exist_ok=True)
-    # What the monitor itself holds for doubtful does not reach its drift test.
+    # Single frames that the monitor itself holds for doubtful don't reach its drift test.
     measured = {regime: Series.load(folder / f"{regime}.npz").valid_only() for regime in REGIMES}
     # A level is the same thing in all regimes, and the quiet one has the most scenes.
     level_dof = level_freedom(measured["quiet"])
