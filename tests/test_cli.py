@@ -22,7 +22,7 @@ from gripmon.cli import demo, main
 from gripmon.cli.comparison import compare
 from gripmon.config import builtin_config, load_config
 from gripmon.geometry import from_record, make_transform, to_record
-from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
 from gripmon.simulator import FrameTruth
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -358,6 +358,33 @@ def truth(seq: int) -> FrameTruth:
         corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(), finger_bend=np.zeros((0, 4, 4)),
         events=events, exposure=1.0, defocus_px=0.0,
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("alerts", "noticed"),
+    [
+        ([("raised", "info", "step")], True),
+        ([("cleared", "info", "step")], False),
+        ([("updated", "warning", "creep")], False),
+        ([("updated", "error", "creep")], True),
+        ([("updated", "warning", "step")], True),
+        ([("noted", "warning", "restarted")], False),
+        ([("noted", "warning", "recalibrated")], False),
+        ([("cleared", "info", "step"), ("raised", "warning", "occluded")], True),
+    ],
+)
+def test_of_alerts_what_is_new_or_worse_is_noticed(alerts: list[tuple[str, str, str]], noticed: bool):
+    """A creep was told of, as a warning, before the bump at frame 4."""
+
+    def alert(event: str, severity: str, kind: str) -> Alert:
+        name = "1-creep" if event != "raised" or kind == "creep" else "2-new"
+        return Alert(AlertKind(kind), Cause.UNKNOWN, Severity(severity), "", event=AlertEvent(event), alert_id=name)
+
+    records = [record(i, (0.0, 0.0, 0.0)) for i in range(7)]
+    records[1] = record(1, (0.0, 0.0, 0.0), alerts=(alert("raised", "warning", "creep"),))
+    records[5] = record(5, (0.0, 0.0, 0.0), alerts=tuple(alert(*each) for each in alerts))
+    [bump] = compare(records, truth).events
+    assert bump.noticed_after_s == (pytest.approx(0.1) if noticed else None)
 
 
 def test_the_comparison_counts_by_hand():
