@@ -177,24 +177,37 @@ class Monitor:
         if motion.stepped and not evidence.jumped:
             self._average.step(motion.step_frames)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
-        origin, alerts = Origin.UPDATE, judgement.alerts
+        alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
             if evidence.motion.frames == 0 and self._baseline.error is not None:
                 judgement = replace(judgement, verdict=Verdict.SUSPECT)  # too few frames to say whether it fits
             else:
                 self._restarted = False
                 alerts = (self._after_restart(evidence), *alerts)
-        if judgement.state is not State.RECALIBRATING or self._policy.still_frames <= 1:
-            self._renewal.moved()
-        if judgement.state is State.RECALIBRATING:
-            self._renewal.still(frame, measurement, self._cam_T_grip, self._covariance)
-        if judgement.recalibrate:
-            before = self.reference
-            alerts += self._renewal.recalibrate(self._drift(), evidence.explanation, self._now_s, frame.stamp_ns)
-            if self.reference is not before:
-                origin = Origin.RECALIBRATION
-                self._begin()
+        before = self.reference
+        alerts += self._renew(frame, measurement, evidence, judgement)
+        origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
         return self._record(frame, judgement, origin, alerts, measurement)
+
+    def _renew(
+        self, frame: Frame, measurement: Measurement, evidence: Evidence, judgement: Judgement
+    ) -> tuple[Alert, ...]:
+        """Past the limit, or when an operator wants it: still frames are collected, and become a new reference."""
+        assert self._covariance is not None
+        renewal, still_frames = self._renewal, self._policy.still_frames
+        collects = judgement.state is State.RECALIBRATING or renewal.wanted
+        if not collects or still_frames <= 1:
+            renewal.moved()
+        if not collects:
+            return ()
+        renewal.still(frame, measurement, self._cam_T_grip, self._covariance)
+        if not (judgement.recalibrate or (renewal.wanted and still_frames >= self._settings.policy.settle_frames)):
+            return ()
+        before = self.reference
+        alerts = renewal.recalibrate(self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns)
+        if self.reference is not before:
+            self._begin()
+        return alerts
 
     def trace(self) -> MeasurementTrace | None:
         """The pixels behind the newest record; None if its frame was refused."""
@@ -285,13 +298,10 @@ class Monitor:
                 raise CommandRefused(f"{which} that isn't acknowledged")
             return "acknowledged: " + ", ".join(alert.alert_id for alert in seen), seen
         if name is not CommandName.RECALIBRATE:
-            return self._renewal.obey(command, self._now_s, stamp_ns)
+            return self._renewal.obey(command, self._cam_T_grip, self._now_s, stamp_ns)
         if self._newest is None or not self._newest.trusted:
             raise CommandRefused("nothing was measured in the newest frame")
-        alerts = self._renewal.recalibrate(self._drift(), Explanation(), self._now_s, stamp_ns, asked=True)
-        if self.reference is reference:
-            raise CommandRefused(alerts[-1].text if alerts else "not calibrated anew now")
-        return f"calibrated anew: {self.reference.reference_id}, revision {self.reference.revision}", alerts
+        return self._renewal.want(), ()
 
     def _begin(self) -> None:
         """Drift is reckoned from the reference in force."""

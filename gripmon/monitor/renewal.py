@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from gripmon.corners import Measurement, edge_sums
-from gripmon.geometry import from_record
+from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
@@ -41,12 +43,14 @@ class Renewal:
         state: MonitorState | None,
     ):
         """``floor`` (6, 6): covariance of the systematic error.  ValueError for a state that doesn't hold together."""
-        self._gripper, self._policy = gripper, policy
+        self._gripper, self._policy, self._settings = gripper, policy, settings.recalibration
         self._recalibrator = Recalibrator(
             settings.recalibration, gripper, floor, CORNER_COUNTS[settings.recalibrate_corners]
         )
         self.outcome: Proposal | Refusal | None = None
         """What came of the newest attempt at a new reference; None before the first one."""
+        self.wanted = False
+        """Whether an operator wants a new reference."""
         self.book = (
             ReferenceBook(reference) if state is None else ReferenceBook.restored(state.references, state.proposal)
         )
@@ -72,33 +76,47 @@ class Renewal:
             )
         )
 
+    def want(self) -> str:
+        """An operator wants a new reference: it is measured as soon as the camera stands still for long enough.
+
+        Raises :class:`CommandRefused` where recalibration is switched off.
+        """
+        if self._settings.mode == "off":
+            raise CommandRefused("recalibration is switched off (monitor.recalibration.mode)")
+        self.wanted = True
+        return (
+            f"as soon as the camera has stood still for {self._settings.frames} frames; an alert says what came of it"
+        )
+
     def recalibrate(
-        self, drift: Drift, explanation: Explanation, now_s: float, stamp_ns: int, *, asked: bool = False
+        self, drift: Drift, cam_T_grip: Array, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
         """The frames since the camera came to rest become the reference, or a proposal, or neither: what there is to
-        say of it.  ``asked``: an operator wants it, so that a doubt is told and not waited out.
+        say of it.  ``cam_T_grip`` (4, 4) is where the gripper is now.
         """
-        outcome = self.outcome = self._recalibrator.outcome(self.book.current)
-        if outcome.wait and not asked:
+        if self._waits(cam_T_grip):
             return ()
+        outcome = self.outcome = self._recalibrator.outcome(self.book.current)
+        if outcome.wait:
+            return ()
+        asked, self.wanted = self.wanted, False
         if isinstance(outcome, Refusal):
             self._policy.not_recalibrated()
-            return self._policy.refused(outcome.text, explanation, now_s, stamp_ns)
+            why = "as an operator wanted" if asked else "though past the limit"
+            return self._policy.refused(f"not calibrated anew, {why}: {outcome.text}", explanation, now_s, stamp_ns)
         moved = (
             f"the TCP has moved by {1e3 * math.hypot(*drift.tcp_shift_m):.2f} mm, turned by "
             f"{math.degrees(drift.rotation_rad):.2f} degrees"
         )
         cause = explanation.probable.cause
         draft = self.book.draft(outcome.cam_T_grip, outcome.covariance, stamp_ns, cause=cause, inputs=outcome.inputs)
-        asks = [] if outcome.needs_person is None or asked else [outcome.needs_person]
+        asks = [] if outcome.needs_person is None else [outcome.needs_person]
         if self.book.chosen_by_operator and not asked:
             asks.append("an operator chose the reference in force")
         if asks:
-            if self.book.proposal is not None:
-                return ()
             self.book.propose(draft)
-            text = f"{moved}; the new reference {draft.reference_id} waits to be accepted: {'; '.join(asks)}"
-            return self._policy.proposed(text, explanation, now_s, stamp_ns)
+            parts = [f"{moved}; the new reference {draft.reference_id} waits to be accepted", *asks, explanation.text]
+            return self._policy.proposed("; ".join(p for p in parts if p), explanation, now_s, stamp_ns)
         self.book.adopt(draft)
         text = (
             f"{moved}; it was calibrated anew from {outcome.inputs.frames} frames, corners "
@@ -107,7 +125,17 @@ class Renewal:
         done = Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)
         return (*self._policy.recalibrated(now_s), done)
 
-    def obey(self, command: Command, now_s: float, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
+    def _waits(self, cam_T_grip: Array) -> bool:
+        """Whether a proposal waits that still holds."""
+        return self.book.proposal is not None and self._holds(self.book.proposal, cam_T_grip)
+
+    def _holds(self, proposal: ReferenceRecord, cam_T_grip: Array) -> bool:
+        """Whether the gripper is where a proposal has it, by half of what would be worth a warning at least."""
+        away = perturbation_between(from_record(proposal.cam_T_grip), cam_T_grip)
+        sigma = np.sqrt(np.reshape(proposal.covariance, (6, 6)).diagonal())
+        return bool((np.abs(away) <= np.maximum(6.0 * sigma, self._policy.worth_a_warning)).all())
+
+    def obey(self, command: Command, cam_T_grip: Array, now_s: float, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
         """Accept, reject, undo or reset: what was done, in words, and what there is to tell.
 
         Raises :class:`CommandRefused`; then nothing has changed.
@@ -119,6 +147,9 @@ class Renewal:
             self._policy.not_recalibrated()
             return f"{rejected.reference_id} is rejected", self._policy.decided("the proposal was rejected", now_s)
         if name is CommandName.ACCEPT:
+            proposal = self.book.proposal
+            if proposal is not None and not self._holds(proposal, cam_T_grip):
+                raise CommandRefused(f"the camera has moved since {proposal.reference_id} was proposed")
             self.book.accept(argument)
         elif name is CommandName.UNDO:
             self.book.undo(stamp_ns, argument)

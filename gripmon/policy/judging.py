@@ -179,9 +179,8 @@ class Policy:
         self._still = 0
 
     def refused(self, why: str, explanation: Explanation, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
-        """Past the limit, but there is no new reference."""
-        text = f"past the limit, but not calibrated anew: {why}"
-        return self._about_renewal(AlertKind.REFUSED, Severity.ERROR, text, explanation, now_s, stamp_ns)
+        """There is no new reference, though one is needed or wanted."""
+        return self._about_renewal(AlertKind.REFUSED, Severity.ERROR, why, explanation, now_s, stamp_ns)
 
     def proposed(self, text: str, explanation: Explanation, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
         """A new reference waits for an operator."""
@@ -210,6 +209,11 @@ class Policy:
         return np.square(rates) * held_s
 
     @property
+    def worth_a_warning(self) -> Array:
+        """(6,) shifts of the TCP and turns from which a drift is a warning, m and rad."""
+        return np.array([self._settings.warn_m] * 3 + [self._settings.warn_rad] * 3)
+
+    @property
     def still_frames(self) -> int:
         """For how many frames the transform has not left its place."""
         return self._still
@@ -218,9 +222,7 @@ class Policy:
         """Frames since the transform last left the place where it came to rest: by half of what is worth a warning, and
         beyond its noise.
         """
-        settings = self._settings
-        worth = np.array([settings.warn_m] * 3 + [settings.warn_rad] * 3)
-        leeway = np.maximum(0.5 * worth, 5.0 * evidence.sigma)
+        leeway = np.maximum(0.5 * self.worth_a_warning, 5.0 * evidence.sigma)
         if evidence.jumped or self._still == 0 or (np.abs(evidence.shift - self._still_shift) > leeway).any():
             self._still, self._still_shift = 1, evidence.shift
         else:
