@@ -74,7 +74,9 @@ def test_a_creep_is_called_one_and_has_its_rate(seed: int, mm_per_min: float):
     after = stream.feed(along_x(rate_m_per_s * np.arange(2400) / FPS, 2400))
     first = next(n for n, motion in enumerate(after) if motion.present)
     assert rate_m_per_s * first / FPS < 1.5e-4, "long before it is large"
-    assert all(motion.present for motion in after[first:])
+    present = [n for n, motion in enumerate(after) if motion.present]
+    assert max(np.diff([*present, len(after)])) < FPS, "no alert would be cleared in between"
+    assert all(motion.present for motion in after[first + 300 :])
     assert not any(motion.stepped for motion in after)
     assert AlertKind.STEP not in {m.kind for m in after[first:]}
     known = next(n for n, motion in enumerate(after) if motion.kind is AlertKind.CREEP)
