@@ -14,6 +14,7 @@ _DIRECTIONS = (
     "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
 )  # fmt: skip
 _POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
+_STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is told
 _JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is told
 
 
@@ -33,12 +34,13 @@ def accuracy(config: Config) -> dict[str, Any]:
         "recalibration": _recalibration(config, outlook),
     }
     if not outlook.enough:
-        return {**out, "expected": None, "weakest": None, "jaw": None}
+        return {**out, "expected": None, "weakest": None, "jaw": None, "drift": None}
     return {
         **out,
         "expected": _split(outlook.sigma),
         "weakest": _split(outlook.weakest),
         "jaw": None if outlook.jaw is None else _jaw(outlook.jaw, outlook.lever_m, settings.jaw_sigma_m),
+        "drift": _drift(config, outlook),
     }
 
 
@@ -55,6 +57,23 @@ def _jaw(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> dict[str, 
         "like": _DIRECTIONS[per_m.index(max(per_m))],
         "correlation": jaw.correlation,
         "growth": jaw.growth,
+    }
+
+
+def _drift(config: Config, outlook: Outlook) -> dict[str, Any]:
+    """What the drift test notices, and after how many frames."""
+    from gripmon.drift import CORRELATION_FRAMES, foresee
+
+    settings = config.settings.monitor.drift
+    foresight = foresee(outlook.covariance, settings)
+    return {
+        "false_alarms_per_day": settings.false_alarms_per_day,
+        "frames_per_s": settings.frames_per_s,
+        "correlation_frames": CORRELATION_FRAMES,
+        "smallest": _split(foresight.smallest),
+        "delay_frames": {
+            f"{size_m:g}": [foresight.delay_frames(size_m, axis) for axis in range(3)] for size_m in _STEPS_M
+        },
     }
 
 
@@ -89,7 +108,8 @@ def accuracy_lines(values: dict[str, Any]) -> list[str]:
             f"weakest    TCP by {_mm(weakest['tcp_m'])} mm while turned by {turn}°",
         ]
     jaw = [] if values["jaw"] is None else _jaw_lines(values["jaw"])
-    return [*accuracy, *jaw, f"new pose   {_recalibration_text(values['recalibration'])}"]
+    drift = [] if values["drift"] is None else _drift_lines(values["drift"])
+    return [*accuracy, *jaw, *drift, f"new pose   {_recalibration_text(values['recalibration'])}"]
 
 
 def _jaw_lines(jaw: dict[str, Any]) -> list[str]:
@@ -103,6 +123,22 @@ def _jaw_lines(jaw: dict[str, Any]) -> list[str]:
         f"           the image {told}: correlation {jaw['correlation']:.2f}, {less}",
         f"           taken as exact but wrong by {1e3 * _JAW_ERROR_M:.3f} mm it shifts the TCP by {_mm(shift_m)} mm",
     ]
+
+
+def _drift_lines(drift: dict[str, Any]) -> list[str]:
+    alarms, frames_per_s = drift["false_alarms_per_day"], drift["frames_per_s"]
+    lines = [
+        f"drift      at most {alarms:g} false alarms a day at {frames_per_s:g} frames/s; where errors last for",
+        f"           {drift['correlation_frames']:.0f} frames the smallest step that is noticed: "
+        + _sigmas(drift["smallest"]),
+    ]
+    for size, delays in drift["delay_frames"].items():
+        told = ", ".join(
+            f"{axis} {'not at all' if frames is None else f'in {frames} frames'}"
+            for axis, frames in zip("xyz", delays, strict=True)
+        )
+        lines.append(f"           a step of the TCP by {1e3 * float(size):g} mm along {told}")
+    return lines
 
 
 def _recalibration_text(values: dict[str, Any]) -> str:

@@ -2,14 +2,18 @@
 was."""
 
 from gripmon.drift.baseline import Baseline
+from gripmon.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
 from gripmon.drift.motion import MotionWatch
 from gripmon.drift.sequential import Finding, SequentialTest
 from gripmon.drift.settings import DriftSettings
 
 __all__ = [
+    "CORRELATION_FRAMES",
     "Baseline",
     "DriftSettings",
     "Finding",
+    "Foresight",
     "MotionWatch",
     "SequentialTest",
+    "foresee",
 ]

@@ -200,7 +200,9 @@ class SequentialTest:
         self._to_reported = np.linalg.inv(self._from_reported)
         # Slow to compute, slow to change.
         if self._inflation is None or self._frames % (16 * REFRESH_FRAMES) == 0:
-            self._threshold, self._inflation = self._rarity(self.scatter.windows)
+            self._threshold, self._inflation = rarity(
+                self._settings.false_alarms_per_day, self._frames_per_s, self.scatter.windows
+            )
         heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
         inflation = self._inflation**heavy * np.maximum(self._surge, 1.0)
         of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
@@ -210,18 +212,19 @@ class SequentialTest:
         self._mean_covariance = self.scatter.covariances(self._reported, np.ones_like(inflation))[0] + self._reference
         self._learnt_whitening = _whitening(self.scatter.of_differences)
 
-    def _rarity(self, windows: Array) -> tuple[float, Array]:
-        """What the squares of six normal errors exceed by chance so rarely that all lengths together keep the contract;
-        and (k, s) by how much larger the variance of the stream's own scatter must be taken for the same.
 
-        T² / 6 of a covariance from m samples is distributed as F(6, m), nearly (Hotelling), and so is that of errors
-        with Student's distribution, with its degrees of freedom: both count.
-        """
-        a_day = 86_400.0 * self._frames_per_s
-        chance = self._settings.false_alarms_per_day / (a_day * 2 * len(LENGTHS))
-        freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
-        threshold = float(stats.chi2.isf(chance, 6))
-        return threshold, np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0 / threshold)
+def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> tuple[float, Array]:
+    """What the squares of six normal errors exceed by chance so rarely that all lengths together keep the contract; and
+    (k, s) by how much larger the variance of the stream's own scatter, known from so many ``windows`` (k, s), must be
+    taken for the same.
+
+    T² / 6 of a covariance from m samples is distributed as F(6, m), nearly (Hotelling), and so is that of errors with
+    Student's distribution, with its degrees of freedom: both count.
+    """
+    chance = false_alarms_per_day / (86_400.0 * frames_per_s * 2 * len(LENGTHS))
+    freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
+    threshold = float(stats.chi2.isf(chance, 6))
+    return threshold, np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0 / threshold)
 
 
 def _times(matrix: Array, values: Array) -> Array:
