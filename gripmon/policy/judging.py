@@ -24,6 +24,9 @@ NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 where it was, and is not calibrated anew.
 """
 
+HIDES_NOTHING = (Cause.CAMERA_MOUNT, Cause.JAW_OPENING)
+"""Causes that are found by where the gripper is seen: none of them is why it is not."""
+
 MOTION, VIBRATION, VIEW, IMAGE, GRIPPER, RENEWAL = "motion", "vibration", "view", "image", "gripper", "renewal"
 STREAM = "stream:"
 """What alerts are about; of each there is one open at a time."""
@@ -126,6 +129,8 @@ class Policy:
             self.state = State.LOST
         alerts: tuple[Alert, ...] = ()
         explanation = explanation or NO_EXPLANATION
+        if explanation.probable.cause in HIDES_NOTHING:
+            explanation = NO_EXPLANATION  # of a motion before
         probable = explanation.probable
         if self.state is State.LOST:
             what = f"frames refused ({refusal})" if refusal else "the gripper was not found"
