@@ -77,6 +77,8 @@ class ScriptedMonitor:
     def state(self) -> MonitorState:
         return MonitorState((self.reference,))
 
+    def ponder(self) -> None: ...
+
     def trace(self) -> MeasurementTrace | None:
         return None
 

@@ -15,9 +15,9 @@ holds.
 FEWEST_FRAMES = 5
 """Frames that must look wrong before it is said why: a change of light spoils one or two."""
 
-AT_FIRST, EVERY = (1, 2, 3, 5, 8, 12, 20), 16
-"""Frames after which the first conclusions are drawn, and after how many more each further one: gathering evidence
-takes as long as measuring, and concluding from it longer.
+GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
+"""Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn, and
+after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
 """
 
 
@@ -29,10 +29,12 @@ class Inquiry:
         self._asked = 0
         self._calm = CALM_FRAMES
         self._explanation = Explanation()
+        self._pending: tuple[bool, Callable[[], EdgeEvidence], Array] | None = None
 
     def rebase(self, reference_sigma: Array) -> None:
         """There is a new reference, with standard deviations (6,), m and rad."""
         self._judge.rebase(reference_sigma)
+        self._pending = None
         self._forget()
 
     def interrupted(self) -> None:
@@ -40,22 +42,33 @@ class Inquiry:
         self._judge.interrupted()
 
     def ask(self, wrong: bool, evidence: Callable[[], EdgeEvidence], ref_cam_T_grip: Array) -> Explanation:
-        """One frame in which something looks ``wrong`` or not; ``evidence`` is gathered only if it is needed."""
+        """One frame in which something looks ``wrong`` or not; ``evidence`` is gathered only if it is needed.
+
+        What the frames before have shown; this one is thought about in :meth:`ponder`.
+        """
+        self._pending = (wrong, evidence, ref_cam_T_grip)
+        if not wrong:
+            self._calm += 1
+        return self._told()
+
+    def ponder(self) -> None:
+        """Think about the last frame that was asked about; nothing if that has been done."""
+        if self._pending is None:
+            return
+        (wrong, evidence, ref_cam_T_grip), self._pending = self._pending, None
         if wrong:
             self._calm = 0
             self._asked += 1
-            concluded = self._asked in AT_FIRST or self._asked % EVERY == 0
-            if self._asked <= AT_FIRST[-1] or concluded:
+            again = self._asked % EVERY == 0
+            if again or self._asked in GATHERED_AT:
                 self._judge.add(evidence())
-            if concluded:
+            if again or self._asked in CONCLUDED_AT:
                 self._explanation = self._judge.explanation(ref_cam_T_grip)
-            return self._told()
-        self._calm += 1
+            return
         if self._calm == CALM_FRAMES:
             self._forget()
         if self._calm >= CALM_FRAMES and self._judge.wants_baseline:
             self._judge.well(evidence())
-        return self._told()
 
     def _told(self) -> Explanation:
         return self._explanation if self._asked >= FEWEST_FRAMES and self._calm <= LULL_FRAMES else Explanation()

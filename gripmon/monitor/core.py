@@ -146,6 +146,7 @@ class Monitor:
 
     def process(self, frame: Frame) -> FrameRecord:
         """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
+        self.ponder()
         self._tick(frame)
         faults = self._look_at_stream(frame)
         refusal = inspect(frame, self._camera, self._gripper) or _frozen(faults)
@@ -208,6 +209,13 @@ class Monitor:
         if self.reference is not before:
             self._begin()
         return alerts
+
+    def ponder(self) -> None:
+        """Think about what moved, which takes the time of some frames, while nothing is urgent.
+
+        The next :meth:`process` does it first if nobody has; the records are the same.
+        """
+        self._inquiry.ponder()
 
     def trace(self) -> MeasurementTrace | None:
         """The pixels behind the newest record; None if its frame was refused."""

@@ -74,6 +74,8 @@ class AlertBook:
             self._keep(topic, raised, now_s)
             return (raised,)
         known = entry.alert
+        if alert.cause is Cause.UNKNOWN:  # a doubt later on takes nothing back
+            alert = msgspec.structs.replace(alert, cause=known.cause, part=known.part, causes=known.causes)
         updated = msgspec.structs.replace(
             alert,
             event=AlertEvent.UPDATED,
