@@ -16,8 +16,8 @@ FEWEST_FRAMES = 5
 """Frames that must look wrong before it is said why: a change of light spoils one or two."""
 
 GATHERED_AT, CONCLUDED_AT, EVERY = (1, 2, 3, 4, 5, 7, 9, 12, 16, 20), (5, 9, 20), 60
-"""Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn, and
-after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
+"""Of the frames that look wrong, those whose evidence is gathered at first, those after which a conclusion is drawn,
+and after how many more each further one: gathering takes as long as measuring, and concluding as many frames' time.
 """
 
 
@@ -36,6 +36,12 @@ class Inquiry:
         self._judge.rebase(reference_sigma)
         self._pending = None
         self._forget()
+
+    def moved_again(self) -> None:
+        """The evidence so far is of another place."""
+        self._pending = None
+        self._judge.reset()
+        self._asked, self._explanation = 0, Explanation()
 
     def interrupted(self) -> None:
         """No frames came for long: somebody may have exchanged the camera meanwhile."""

@@ -257,13 +257,26 @@ class Monitor:
         if 0 < self._astray < DOUBTED_FRAMES:
             motion = self._watch.skip()
         else:
-            motion = self._watch.add(self._baseline.subtract(shift), self._covariance, self._now_s)
+            motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
+        if motion.stepped:
+            self._inquiry.moved_again()
         odd = self._blur.add(self._tracker.blur_px(measurement))
         odd |= self._fingers.add(agreeing_fingers(measurement, self._gripper))
         odd |= self._residuals.add(self._tracker.edge_residuals_px(measurement))
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)
+
+    def _since_start(self, shift: Array) -> Array | None:
+        """The shift (6,) less the reference's error; None while that isn't known yet."""
+        assert self._covariance is not None
+        since_start = self._baseline.subtract(shift)
+        if since_start is not None and not self._baseline_weighed:
+            self._baseline_weighed = True
+            if self._baseline.error is not None and self._baseline.error.any():
+                # It was measured before one background: what such a frame claims, it is uncertain by.
+                self._watch.test.set_reference_covariance(self._covariance)
+        return since_start
 
     def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
         return self._inquiry.ask(
@@ -317,10 +330,10 @@ class Monitor:
         covariance = np.reshape(self.reference.covariance, (6, 6))
         self._ref_cam_T_grip = self._renewal.ref_cam_T_grip
         if book.in_force == book.configured:
-            # What the first frames show of a configured reference's error is no longer uncertain.
             self._baseline, covariance = self._configured_baseline, np.zeros((6, 6))
         else:
             self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
+        self._baseline_weighed = False
         self._watch.reset(covariance)
         self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
 
