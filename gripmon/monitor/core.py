@@ -98,6 +98,7 @@ class Monitor:
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
         self._astray = 0
+        self._baseline_weighed = False
         self._restarted = state is not None  # and not yet said whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
