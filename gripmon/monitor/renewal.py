@@ -11,7 +11,7 @@ from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
-from gripmon.policy import Policy
+from gripmon.policy import NOT_THE_CAMERA, Policy
 from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
 from gripmon.records import (
     Alert,
@@ -51,6 +51,7 @@ class Renewal:
         """What came of the newest attempt at a new reference; None before the first one."""
         self.wanted = False
         """Whether an operator wants a new reference."""
+        self._rejected: ReferenceRecord | None = None  # by an operator, in place of the reference in force
         self.book = (
             ReferenceBook(reference) if state is None else ReferenceBook.restored(state.references, state.proposal)
         )
@@ -94,7 +95,12 @@ class Renewal:
         """The frames since the camera came to rest become the reference, or a proposal, or neither: what there is to
         say of it.  ``cam_T_grip`` (4, 4) is where the gripper is now.
         """
-        if self._waits(cam_T_grip):
+        cause = explanation.probable.cause
+        if self.wanted and cause in NOT_THE_CAMERA:
+            self.wanted = False
+            text = f"not calibrated anew, as an operator wanted: {explanation.text or cause}"
+            return self._policy.refused(text, explanation, now_s, stamp_ns)
+        if not self.wanted and any(self._holds(known, cam_T_grip) for known in (self.book.proposal, self._rejected)):
             return ()
         outcome = self.outcome = self._recalibrator.outcome(self.book.current)
         if outcome.wait:
@@ -102,13 +108,14 @@ class Renewal:
         asked, self.wanted = self.wanted, False
         if isinstance(outcome, Refusal):
             self._policy.not_recalibrated()
+            if self.book.proposal is not None:
+                self.book.reject()  # of another place, and no longer told of
             why = "as an operator wanted" if asked else "though past the limit"
             return self._policy.refused(f"not calibrated anew, {why}: {outcome.text}", explanation, now_s, stamp_ns)
         moved = (
             f"the TCP has moved by {1e3 * math.hypot(*drift.tcp_shift_m):.2f} mm, turned by "
             f"{math.degrees(drift.rotation_rad):.2f} degrees"
         )
-        cause = explanation.probable.cause
         draft = self.book.draft(outcome.cam_T_grip, outcome.covariance, stamp_ns, cause=cause, inputs=outcome.inputs)
         asks = [] if outcome.needs_person is None else [outcome.needs_person]
         if self.book.chosen_by_operator and not asked:
@@ -118,6 +125,7 @@ class Renewal:
             parts = [f"{moved}; the new reference {draft.reference_id} waits to be accepted", *asks, explanation.text]
             return self._policy.proposed("; ".join(p for p in parts if p), explanation, now_s, stamp_ns)
         self.book.adopt(draft)
+        self._rejected = None
         text = (
             f"{moved}; it was calibrated anew from {outcome.inputs.frames} frames, corners "
             f"{', '.join(outcome.inputs.corners)}: revision {self.book.current.revision}"
@@ -125,12 +133,10 @@ class Renewal:
         done = Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)
         return (*self._policy.recalibrated(now_s), done)
 
-    def _waits(self, cam_T_grip: Array) -> bool:
-        """Whether a proposal waits that still holds."""
-        return self.book.proposal is not None and self._holds(self.book.proposal, cam_T_grip)
-
-    def _holds(self, proposal: ReferenceRecord, cam_T_grip: Array) -> bool:
-        """Whether the gripper is where a proposal has it, by half of what would be worth a warning at least."""
+    def _holds(self, proposal: ReferenceRecord | None, cam_T_grip: Array) -> bool:
+        """Whether there is a proposal and the gripper is where it has it, by what would be worth a warning at least."""
+        if proposal is None:
+            return False
         away = perturbation_between(from_record(proposal.cam_T_grip), cam_T_grip)
         sigma = np.sqrt(np.reshape(proposal.covariance, (6, 6)).diagonal())
         return bool((np.abs(away) <= np.maximum(6.0 * sigma, self._policy.worth_a_warning)).all())
@@ -142,7 +148,8 @@ class Renewal:
         """
         name, argument = command.name, command.argument
         if name is CommandName.REJECT:
-            rejected = self.book.reject(argument)
+            rejected = self._rejected = self.book.reject(argument)
+            self.wanted = False
             self.moved()
             self._policy.not_recalibrated()
             return f"{rejected.reference_id} is rejected", self._policy.decided("the proposal was rejected", now_s)
@@ -157,6 +164,8 @@ class Renewal:
             self.book.reset(stamp_ns)
         else:
             raise CommandRefused(f"{name} doesn't concern the reference")
+        # What was wanted before is overtaken: it must not undo what was just asked for.
+        self.wanted, self._rejected = False, None
         current = self.book.current
         text = f"{current.reference_id} is in force, revision {current.revision}"
         if current.restores:

@@ -198,9 +198,13 @@ class Policy:
     def _about_renewal(
         self, kind: AlertKind, severity: Severity, text: str, explanation: Explanation, now_s: float, stamp_ns: int
     ) -> tuple[Alert, ...]:
-        probable = explanation.probable
+        probable, before = explanation.probable, self.alerts.about(RENEWAL)
         alert = Alert(kind, probable.cause, severity, text, part=probable.part, causes=explanation.causes)
-        return self.alerts.present(RENEWAL, alert, now_s, stamp_ns)
+        over: tuple[Alert, ...] = ()
+        if before is not None and (before.kind is not kind or (kind is AlertKind.PROPOSED and before.text != text)):
+            # It is said once only: no update that may be too soon, or of something that was acknowledged.
+            over = self.decided("overtaken by what follows", now_s)
+        return over + self.alerts.present(RENEWAL, alert, now_s, stamp_ns)
 
     @property
     def drifting(self) -> bool:
