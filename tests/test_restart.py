@@ -142,6 +142,16 @@ def test_a_gripper_that_is_not_seen_after_a_restart_is_never_valid():
         assert AlertKind.RESTARTED not in [alert.kind for alert in record.alerts]
 
 
+def test_where_the_gripper_was_is_not_forgotten_by_a_restart_that_sees_nothing():
+    frames, _ = frames_of("static")
+    first = new_monitor()
+    first.process(frames[0])
+    kept = first.state().cam_T_grip
+    again = restarted(restarted(first.state()).state()).state().cam_T_grip
+    assert kept is not None and again is not None
+    np.testing.assert_allclose(pose_of(again), pose_of(kept), atol=1e-12)
+
+
 def test_the_state_revision_grows_with_every_change_and_only_then():
     frames, _ = frames_of("static")
     monitor = restarted(with_reference((2e-5, 0.0, 0.0)))

@@ -106,6 +106,7 @@ class Monitor:
         self._configured_baseline = Baseline(sigma, settings.policy.settle_frames, error)
         self._begin()
         last = None if state is None else state.cam_T_grip
+        self._located = last is not None  # here, or before a restart
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
@@ -141,7 +142,7 @@ class Monitor:
             self._renewal.book.proposal,
             alerts=self._policy.alerts.open,
             alerts_raised=self._policy.alerts.raised,
-            cam_T_grip=None if self._covariance is None else to_record(self._cam_T_grip),
+            cam_T_grip=to_record(self._cam_T_grip) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
         )
 
@@ -169,7 +170,7 @@ class Monitor:
         before_T = self._cam_T_grip
         measurement = self._newest = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
         self._cam_T_grip, self._covariance = self._tracker.update(measurement)
-        self._measured_s = self._now_s
+        self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
         if evidence.jumped:
             self._average.forget()
@@ -181,7 +182,7 @@ class Monitor:
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
-            if evidence.motion.frames == 0 and self._baseline.error is not None:
+            if evidence.motion.frames == 0:
                 judgement = replace(judgement, verdict=Verdict.SUSPECT)  # too few frames to say whether it fits
             else:
                 self._restarted = False
