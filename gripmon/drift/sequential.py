@@ -1,4 +1,4 @@
-"""The sequential test: a generalised likelihood ratio over windows of 2 to 4096 frames.
+"""The sequential test: a generalised likelihood ratio over windows of 1 to 4096 frames.
 
 For every window length two hypotheses are tested against an unmoved camera: its mean lies off the reference (which
 finds creeps, and any shift in the end), and it differs from the mean of the window before (which finds steps soon, for

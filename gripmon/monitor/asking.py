@@ -44,8 +44,9 @@ class Inquiry:
         self._asked, self._explanation = 0, Explanation()
 
     def interrupted(self) -> None:
-        """No frames came for long: somebody may have exchanged the camera meanwhile."""
+        """No frames came for long: somebody may have exchanged the camera meanwhile, until all has been calm again."""
         self._judge.interrupted()
+        self._calm = min(self._calm, LULL_FRAMES + 1)
 
     def ask(self, wrong: bool, evidence: Callable[[], EdgeEvidence], ref_cam_T_grip: Array) -> Explanation:
         """One frame in which something looks ``wrong`` or not; ``evidence`` is gathered only if it is needed.
