@@ -78,7 +78,7 @@ def expected_delay(sizes: float, *, rate: float = 1.0, frames_per_s: float = 60.
     All windows of L frames, of which m lie behind the step, are off by m / L of it; the median of three shows it one
     frame late.
     """
-    limit = 1.35 * stats.chi2.isf(rate / (86_400.0 * frames_per_s * 2 * 13), 6)
+    limit = 1.55 * stats.chi2.isf(rate / (86_400.0 * frames_per_s * 2 * 13), 6)
     for behind in range(1, 4097):
         for length in LENGTHS:
             part = min(behind / length, 1.0) * sizes
