@@ -94,6 +94,18 @@ def test_it_ends_when_it_ends():
     assert not any(found[560:])
 
 
+def test_one_that_goes_on_is_not_over_when_it_has_been_learnt_as_noise():
+    shifts = noise(3, 1200) + np.concatenate([wave(10.0, 800, np.array([2e-4, 0.0, 0.0])), np.zeros((400, 6))])
+    learnt = COVARIANCE.copy()
+    learnt[0, 0] += 0.5 * 2e-4**2
+    watch, found, news = VibrationWatch(2e-5), [], []
+    for index, shift in enumerate(shifts):
+        found.append(watch.add(shift, index / FPS, COVARIANCE if index < 400 else learnt))
+        news.append(watch.is_news)
+    assert all(found[160:800]) and not any(found[960:])
+    assert all(news[160:400]) and not any(news[440:])
+
+
 def test_what_is_forgotten_is_over():
     watch = VibrationWatch(2e-5)
     for index, shift in enumerate(noise(4, 300) + wave(10.0, 300, np.array([2e-4, 0.0, 0.0]))):

@@ -97,7 +97,7 @@ class MotionWatch:
             test.restart(np.array([True]), length)
         self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance())
         frames = max(int(test.windows.frames[0]), 1)
-        level, level_covariance = self._level(min(frames, VIBRATING_LEVEL if self._vibrates else LEVEL_FRAMES))
+        level, level_covariance = self._level(min(frames, VIBRATING_LEVEL if self.vibrates_anew else LEVEL_FRAMES))
         before = self._present
         # Those that have shown it are forgotten if it was a difference: as many more may show it again.
         self._held = 2 * length if moved else max(self._held - 1, 0)
@@ -124,13 +124,18 @@ class MotionWatch:
         )
         return self._last
 
+    @property
+    def vibrates_anew(self) -> bool:
+        """Whether it vibrates, and what was learnt of the stream's noise doesn't hold that yet."""
+        return self._vibration.is_news
+
     def skip(self) -> Motion:
         """A frame whose transform is doubtful tells nothing: all is as it was."""
         return replace(self._last, begun=False, stepped=False, suspicious=False)
 
     def _shortest_window(self, shift: Array) -> int:
         """Frames of the shortest window that may decide: the swings of a vibration are no steps."""
-        if self._vibrates is None or not self._newest:
+        if self._vibrates is None or not self.vibrates_anew or not self._newest:
             return 1
         frames = min(int(self.test.windows.frames[0]), VIBRATING_FRAMES)
         middle = self._level(frames)[0] if frames > 1 else np.zeros(6)

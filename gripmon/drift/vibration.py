@@ -21,6 +21,10 @@ TIMES = 6.0
 """Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
 
 
+STILL_THERE = 0.5
+"""Part of what it takes to find a vibration from which one that was found goes on."""
+
+
 class VibrationWatch:
     """Looks at the last :data:`KEPT_FRAMES` shifts of the TCP."""
 
@@ -31,6 +35,13 @@ class VibrationWatch:
         self._times_s: deque[float] = deque(maxlen=KEPT_FRAMES)
         self._since_look = 0
         self._found: Vibration | None = None
+        self._before: Array = np.eye(3)
+        self._learnt = True
+
+    @property
+    def is_news(self) -> bool:
+        """Whether it vibrates by more than the stream's noise, as learnt by now, explains."""
+        return self._found is not None and not self._learnt
 
     def forget(self) -> None:
         """The camera has moved: the step is no vibration."""
@@ -41,29 +52,32 @@ class VibrationWatch:
     def add(self, shift: Array, now_s: float, usual: Array) -> Vibration | None:
         """One frame's shift (6,); ``usual`` (6, 6): covariance of an unmoved camera's shifts about their mean.
 
-        What is going on; None for no vibration.
+        What is going on; None for no vibration.  One that goes on is learnt as noise sooner or later, and goes on.
         """
         self._shifts.append(shift)
         self._times_s.append(now_s)
         self._since_look += 1
         if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
             self._since_look = 0
-            self._found = self._look(usual[:3, :3])
+            if self._found is None:
+                self._before = usual[:3, :3].copy()
+            self._found = self._look(self._before, usual[:3, :3], 1.0 if self._found is None else STILL_THERE)
         return self._found
 
-    def _look(self, usual: Array) -> Vibration | None:
+    def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
         shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
         # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
         parts = [_about_its_line(part) for part in np.split(shifts, PARTS)]
         direction = _loudest(np.mean([part.T @ part / len(part) for part in parts], axis=0), usual)
         loud = sorted(float(np.square(part @ direction).mean()) for part in parts)
         expected = float(direction @ usual @ direction)
-        if loud[1] < TIMES * expected:
+        if loud[1] < ease * TIMES * expected:
             return None
+        self._learnt = loud[1] < TIMES * float(direction @ learnt @ direction)
         # A part may hold less than a period: the size is that about a line through all of them.
         along = _about_its_line(shifts) @ direction
         excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected
-        if excess < self._smallest_m**2:
+        if excess < ease * self._smallest_m**2:
             return None
         return Vibration(math.sqrt(excess), _frequency_hz(along, times_s))
 

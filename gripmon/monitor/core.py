@@ -175,7 +175,7 @@ class Monitor:
         if evidence.jumped:
             self._average.forget()
         motion = evidence.motion
-        quiet = self._policy.state is State.TRACKING and not motion.stepped and motion.vibration is None
+        quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
         self._average.add(self._cam_T_grip, self._covariance, quiet)
         if motion.stepped and not evidence.jumped:
             self._average.step(motion.step_frames)
