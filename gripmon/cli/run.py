@@ -158,13 +158,20 @@ class _FixedJaw:
 
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     """The file for what survives a restart; None without one."""
+    from gripmon.records import MonitorState
     from gripmon.statefile import StateFile, StateFileError
 
+    path = config.state_path
+    if path is None:
+        return None
     try:
-        path = config.state_path
-        return None if path is None else StateFile(path, config.state_owner, config.reference, fresh=fresh)
+        kept = StateFile(path, config.state_owner, config.reference, fresh=fresh)
     except StateFileError as error:
         raise common.CommandFailedError(f"{config.path}: state.file: {error}", common.EXIT_USAGE) from None
+    if kept.configured.revision != config.reference.revision:
+        # The one who knew the revisions so far was set aside, and what follows may fail: a camera that can't be opened.
+        kept.write(MonitorState((kept.configured,)))
+    return kept
 
 
 def _notices(kept: StateFile | None) -> list[Alert]:
