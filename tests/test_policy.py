@@ -23,6 +23,7 @@ from policy_runs import (
     VALID,
     Nothing,
     Run,
+    alerts_of,
     explained,
     kinds,
     seen,
@@ -314,6 +315,14 @@ def test_causes_and_the_part_are_in_the_alerts():
     assert KNOCKED.text in moved.text
     [unknown] = settled().feed(seen(0.3)).alerts
     assert unknown.cause is Cause.UNKNOWN
+
+
+def test_a_drift_at_the_edge_of_a_limit_is_not_told_again_and_again():
+    run = settled()
+    warned = run.feed_all([seen(0.105 if i % 60 < 30 else 0.095) for i in range(600)])
+    assert kinds(warned) == [(K.STEP, RAISED)]
+    eased = alerts_of(run.feed_all([seen(0.075)] * 60))
+    assert [a.severity for a in eased] == ["info"]
 
 
 @pytest.mark.parametrize(("rms_mm", "severity"), [(0.05, "info"), (0.11, "warning")])

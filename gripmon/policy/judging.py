@@ -36,6 +36,9 @@ _MOTION_KINDS = {AlertKind.STEP: "a step", AlertKind.CREEP: "a creep", AlertKind
 
 NO_EXPLANATION = Explanation()
 
+RELIEF = 0.8
+"""Part of a limit below which what was said to be past it no longer is."""
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
@@ -251,7 +254,7 @@ class Policy:
         if vibration is not None:
             size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
             text = f"the camera vibrates: TCP {size_mm:.3f} mm rms at about {hertz:.0f} Hz"
-            severity = Severity.WARNING if vibration.rms_m >= self._settings.warn_m else Severity.INFO
+            severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(VIBRATION))
             alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
             alerts += book.present(VIBRATION, alert, now_s, stamp_ns)
         else:
@@ -269,11 +272,8 @@ class Policy:
     def _motion_alert(self, evidence: Evidence) -> Alert:
         settings, motion, explanation = self._settings, evidence.motion, evidence.explanation
         shift_m, turn_rad = float(np.linalg.norm(motion.shift[:3])), float(np.linalg.norm(motion.shift[3:]))
-        severity = Severity.INFO
-        if shift_m >= settings.limit_m or turn_rad >= settings.limit_rad:
-            severity = Severity.ERROR
-        elif shift_m >= settings.warn_m or turn_rad >= settings.warn_rad:
-            severity = Severity.WARNING
+        past_warning = max(shift_m / settings.warn_m, turn_rad / settings.warn_rad)
+        past_limit = max(shift_m / settings.limit_m, turn_rad / settings.limit_rad)
         rate, left_s = None, None
         if motion.creep is not None:
             rate = motion.creep.rate_m_per_min
@@ -283,7 +283,7 @@ class Policy:
         return Alert(
             kind=motion.kind,
             cause=explanation.probable.cause,
-            severity=severity,
+            severity=_severity(past_warning, past_limit, self.alerts.about(MOTION)),
             text="; ".join(part for part in parts if part),
             part=explanation.probable.part,
             causes=explanation.causes,
@@ -292,6 +292,17 @@ class Policy:
             rate_m_per_min=rate,
             time_left_s=left_s,
         )
+
+
+def _severity(past_warning: float, past_limit: float, before: Alert | None) -> Severity:
+    """Of what is so many times as large as is worth a warning, and as the limit; what is open (``before``) stays as
+    severe until it is clearly less: at a limit's edge noise would be told again and again.
+    """
+    said = None if before is None else before.severity
+    if past_limit >= (RELIEF if said is Severity.ERROR else 1.0):
+        return Severity.ERROR
+    warned = said in (Severity.WARNING, Severity.ERROR)
+    return Severity.WARNING if past_warning >= (RELIEF if warned else 1.0) else Severity.INFO
 
 
 def _motion_text(motion: Motion) -> str:
