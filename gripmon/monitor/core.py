@@ -338,6 +338,10 @@ class Monitor:
         self._baseline_weighed = False
         self._watch.reset(covariance)
         self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
+        if self.reference.restores is None:
+            # How edges look from where the camera is now; an undo doesn't move it.
+            fingers = len(self._gripper.finger_ids)
+            self._blur, self._fingers, self._residuals = BlurWatch(), FingerWatch(fingers), ResidualWatch()
 
     def _after_restart(self, evidence: Evidence) -> Alert:
         """Whether the picture fits the reference from which the monitor went on."""
