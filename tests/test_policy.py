@@ -393,6 +393,14 @@ def test_without_recalibration_past_the_limit_is_a_drift_for_ever():
     assert kinds(judgements) == [(K.STEP, RAISED)]
 
 
+def test_another_camera_is_neither_trusted_nor_made_the_reference():
+    run = settled()
+    judgements = run.feed_all([seen(4.5, explanation=explained(Cause.CAMERA_REPLACED))] * 10)
+    assert {(j.state, j.verdict, j.recalibrate) for j in judgements} == {(DRIFTING, SUSPECT, False)}
+    assert kinds(judgements) == [(K.STEP, RAISED)]
+    assert alerts_of(judgements)[0].cause is Cause.CAMERA_REPLACED
+
+
 def test_a_slow_creep_past_the_limit_recalibrates_only_when_it_stops():
     run = settled()
     creeping = run.feed_all([seen(x) for x in np.arange(0.0, 6.0, 0.06)])

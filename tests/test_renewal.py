@@ -128,7 +128,7 @@ def test_what_was_wanted_before_does_not_overrule_the_newest_word(name: CommandN
     assert cell.revision == 3 and not cell.renewal.wanted
 
 
-@pytest.mark.parametrize("cause", [Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS])
+@pytest.mark.parametrize("cause", [Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS, Cause.CAMERA_REPLACED])
 def test_a_wish_does_not_make_a_reference_of_what_is_not_the_camera(cause: Cause):
     cell = Cell()
     cell.renewal.want()

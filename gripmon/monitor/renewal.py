@@ -11,7 +11,7 @@ from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
-from gripmon.policy import NOT_THE_CAMERA, Policy
+from gripmon.policy import NO_REFERENCE, Policy
 from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
 from gripmon.records import (
     Alert,
@@ -96,7 +96,7 @@ class Renewal:
         say of it.  ``cam_T_grip`` (4, 4) is where the gripper is now.
         """
         cause = explanation.probable.cause
-        if self.wanted and cause in NOT_THE_CAMERA:
+        if self.wanted and cause in NO_REFERENCE:
             self.wanted = False
             text = f"not calibrated anew, as an operator wanted: {explanation.text or cause}"
             return self._policy.refused(text, explanation, now_s, stamp_ns)

@@ -24,6 +24,11 @@ NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 where it was, and is not calibrated anew.
 """
 
+NO_REFERENCE = (*NOT_THE_CAMERA, Cause.CAMERA_REPLACED)
+"""Causes with which nothing that is measured may be relied on, nor become a reference: with another camera the lens's
+calibration doesn't hold either.
+"""
+
 HIDES_NOTHING = (Cause.CAMERA_MOUNT, Cause.JAW_OPENING)
 """Causes that are found by where the gripper is seen: none of them is why it is not."""
 
@@ -89,11 +94,11 @@ class Policy:
         self._count_still(evidence)
         confirmed = self._since_jump >= settings.confirm_frames
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
-        not_the_camera = probable.cause in NOT_THE_CAMERA
+        unreliable = probable.cause in NO_REFERENCE
         recalibrate = False
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):
             state: State = State.ACQUIRING if self.state is State.LOST else self.state
-        elif past_limit and self._may_recalibrate and not not_the_camera:
+        elif past_limit and self._may_recalibrate and not unreliable:
             state = State.RECALIBRATING
             recalibrate = self._still >= settings.settle_frames
         elif motion.present:
@@ -102,7 +107,7 @@ class Policy:
             state = State.TRACKING
         self.state = state
         sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
-        sure = sure and not (evidence.gripper_astray or not_the_camera or evidence.stream_at_fault)
+        sure = sure and not (evidence.gripper_astray or unreliable or evidence.stream_at_fault)
         verdict = Verdict.VALID if confirmed and sure else Verdict.SUSPECT
         return Judgement(state, verdict, self._alerts_of(evidence, now_s, stamp_ns), recalibrate)
 
