@@ -69,8 +69,8 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 class StreamFault:
     """What is wrong with the stream now: of each ``kind`` there is one at a time.
 
-    A fault of the stamps is told for :data:`CALM_FRAMES` frames more; a ``gap`` is over by then.  Its cause is unknown: a
-    camera that was away, or a clock that was set.
+    A fault of the stamps is told for :data:`CALM_FRAMES` frames more; a ``gap`` is over by then.  Its cause is unknown:
+    a camera that was away, or a clock that was set.
     """
 
     kind: Literal["frozen", "replaced", "clock", "gap", "rate"]
