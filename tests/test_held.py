@@ -16,7 +16,7 @@ from watched import pose_of, reference_of
 from gripmon.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.policy import PolicySettings
-from gripmon.records import AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict
+from gripmon.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict
 from gripmon.simulator.scenario import Sensor
 
 SCENE = plain_scenario(sensor=Sensor())
@@ -110,7 +110,9 @@ def test_too_few_edges_are_held_with_a_growing_covariance_then_unknown(mask: Mas
         assert (record.source, record.verdict, record.state) == (Origin.HELD, Verdict.UNKNOWN, State.LOST)
         assert record.cam_T_grip is record.covariance is record.smoothed is record.drift is record.rms_px is None
     assert {c.reason for r in hidden for c in r.corners} == {CornerFault.NO_FIT}
-    assert [a.kind for r in hidden for a in r.alerts] == [AlertKind.OCCLUDED, AlertKind.LOST]
+    alerts = [a for r in hidden for a in r.alerts]
+    assert list(dict.fromkeys(a.kind for a in alerts)) == [AlertKind.OCCLUDED, AlertKind.LOST]
+    assert [a.event for a in alerts].count(AlertEvent.RAISED) == 1, "what follows says why, and that it is lost"
 
 
 def test_what_was_lost_is_found_again_when_it_shows():

@@ -23,9 +23,10 @@ PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
 its own: until then nearly all of what is claimed is a bias that may change.
 """
 
-LONGER = 4
+LONGER, LONG = (4, 1), 64
 """Lengths, each twice the one before, from a window's own on: noise that is seen in these is always there.  What shows
-only in yet longer ones comes in rare steps, of which the next may come at any moment.
+only in yet longer ones comes in rare steps, of which the next may come at any moment.  Windows of so many frames and
+more are themselves as rare as that.
 """
 
 MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
@@ -35,6 +36,7 @@ LARGEST = 4.0
 """Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
 
 _COUNT = np.array(LENGTHS, dtype=float)[:, None]
+_RARE = [min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)]
 
 
 class Scatter:
@@ -87,7 +89,7 @@ class Scatter:
         # What was only assumed has not been seen.
         learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
         seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
-        rare = np.concatenate([seen[LONGER:], np.zeros_like(seen[:LONGER])])
+        rare = np.concatenate([seen, np.zeros_like(seen[:1])])[_RARE]
         # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
         missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
         return total + missing[0], inflation[..., None, None] * self._of_difference + 2.0 * missing[1:]

@@ -12,15 +12,18 @@ from contextlib import contextmanager
 from typing import Any
 
 import gripmon.corners.settling
-import gripmon.monitor
+import gripmon.monitor.core
 from gripmon.corners import FingertipMeter
-from gripmon.monitor import Monitor
+from gripmon.drift import MotionWatch
+from gripmon.monitor import Monitor, Tracker
+from gripmon.monitor.asking import Inquiry
 from gripmon.policy import Policy
 from gripmon.publish import ZenohPublisher
 from gripmon.smoothing import PoseAverage
+from gripmon.stream import StreamWatch
 
 STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
-    "inspect the image": ((gripmon.monitor, "inspect"),),
+    "inspect the image": ((gripmon.monitor.core, "inspect"),),
     "predict": ((FingertipMeter, "_predicted"),),
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
@@ -29,8 +32,11 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
         (FingertipMeter, "measure"),
     ),
     "corners": ((gripmon.corners.settling, "intersect_edges"),),
+    "look at the stream": ((StreamWatch, "add"),),
+    "drift test": ((MotionWatch, "add"),),
+    "causes": ((Inquiry, "ponder"),),
     "update and judge": (
-        (Monitor, "update"),
+        (Tracker, "update"),
         (Monitor, "_evidence"),
         (Monitor, "process"),
         (PoseAverage, "add"),
