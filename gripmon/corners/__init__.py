@@ -4,7 +4,7 @@ from gripmon.corners.measure import FingertipMeter, Patience
 from gripmon.corners.settling import Effort, Measurement, MeasurementSettings
 from gripmon.corners.sums import edge_sums
 from gripmon.corners.taught import TaughtEdges, TaughtModel
-from gripmon.corners.views import agreeing_fingers, finger_shares, trace_of
+from gripmon.corners.views import agreeing_fingers, trace_of
 
 __all__ = [
     "Effort",
@@ -16,6 +16,5 @@ __all__ = [
     "TaughtModel",
     "agreeing_fingers",
     "edge_sums",
-    "finger_shares",
     "trace_of",
 ]

@@ -1,15 +1,13 @@
-"""What a measurement shows besides its result: pixels for people who look, and which finger left the reference."""
+"""What a measurement shows besides its result: pixels for people who look, and how much of each finger agrees."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gripmon.camera import Camera
-from gripmon.corners.consensus import GATE_PX
 from gripmon.corners.settling import Measurement
-from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
-from gripmon.records import Array, MeasurementTrace
+from gripmon.records import MeasurementTrace
 
 
 def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> MeasurementTrace:
@@ -43,25 +41,3 @@ def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
     agreeing = np.bincount(finger, measurement.consensus.supported, fingers).tolist()
     sampled = np.bincount(finger, prediction.ok, fingers).tolist()
     return [a / n if n else 1.0 for a, n in zip(agreeing, sampled, strict=True)]
-
-
-def finger_shares(measurement: Measurement, gripper: Gripper, cam_T_grip: Array) -> Array:
-    """(f,) share of each finger's profiles that agree with another pose, e.g. the reference; NaN for a finger that
-    isn't sampled.
-
-    The jaw opening is the reported one: the seen one takes part of a bent finger upon itself.  Edge points closer to
-    that pose than three times the fit's own scatter agree.  A pose out of the profiles' reach gets zeros.
-    """
-    prediction, candidates = measurement.prediction, measurement.candidates
-    xi = perturbation_between(prediction.cam_T_grip, cam_T_grip)
-    offset_px = prediction.jacobian[:, :6] @ xi
-    if prediction.jacobian.shape[1] == 7:
-        offset_px = offset_px + prediction.jacobian[:, 6] * (measurement.jaw_reported_m - prediction.jaw_opening_m)
-    gate_px = min(3.0 * measurement.consensus.spread_px, GATE_PX)
-    close = np.abs(candidates.offset_px - offset_px[candidates.sample]) < gate_px
-    agrees = np.zeros(len(prediction.uv_px), dtype=bool)
-    agrees[candidates.sample[close]] = True
-    finger = gripper.edge_finger[prediction.layout.edge[prediction.ok]]
-    count = np.bincount(finger, minlength=len(gripper.finger_ids))
-    with np.errstate(invalid="ignore"):
-        return np.bincount(finger, agrees[prediction.ok], len(gripper.finger_ids)) / np.where(count, count, np.nan)

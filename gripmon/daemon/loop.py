@@ -309,20 +309,7 @@ class Daemon:
             state=state,
             reference_id=self._reference.reference_id,
             revision=self._reference.revision,
-            kind=alert.kind,
-            cause=alert.cause,
-            severity=alert.severity,
-            text=alert.text,
-            event=alert.event,
-            alert_id=alert.alert_id,
-            part=alert.part,
-            causes=alert.causes,
-            tcp_shift_m=alert.tcp_shift_m,
-            rotation_rad=alert.rotation_rad,
-            rate_m_per_min=alert.rate_m_per_min,
-            time_left_s=alert.time_left_s,
-            since_ns=alert.since_ns,
-            acknowledged=alert.acknowledged,
+            **msgspec.structs.asdict(alert),
         )
         self._deliver("alert", self._publisher.alert, message)
         if not recorded:

@@ -49,7 +49,7 @@ def foresee(covariance: Array, settings: DriftSettings) -> Foresight:
     # A shift adds its own square to the six that noise gives on average.
     per_axis = np.sqrt((threshold - 6.0) / np.linalg.inv(covariance).diagonal())
     sizes = np.sqrt(np.minimum.accumulate(least))[:, None] * per_axis
-    sizes = sizes + np.array([settings.tolerated_m] * 3 + [settings.tolerated_rad] * 3)
+    sizes = sizes + settings.tolerated
     return Foresight(sizes[-1], tuple(length + _MEDIAN_FRAMES for length in LENGTHS), sizes)
 
 

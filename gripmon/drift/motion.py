@@ -10,7 +10,7 @@ import numpy as np
 from gripmon.drift.history import History, goes_on
 from gripmon.drift.sequential import SequentialTest
 from gripmon.drift.settings import DriftSettings
-from gripmon.drift.tolerance import square_beyond
+from gripmon.drift.tolerance import square_beyond, whitening
 from gripmon.drift.vibration import VibrationWatch
 from gripmon.records import AlertKind, Array, Creep, Motion, Vibration
 
@@ -46,7 +46,7 @@ class MotionWatch:
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
-        self._tolerated = np.array([settings.tolerated_m] * 3 + [settings.tolerated_rad] * 3)
+        self._tolerated = settings.tolerated
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
@@ -153,8 +153,7 @@ class MotionWatch:
         return mean[0], covariance[0]
 
     def _away(self, level: Array, covariance: Array) -> bool:
-        whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        return bool(square_beyond(whitening, level, self._tolerated) > RETURNED)
+        return bool(square_beyond(whitening(covariance), level, self._tolerated) > RETURNED)
 
     def _look_back(self, level: Array, covariance: Array) -> None:
         """Step or creep, by the last minutes."""

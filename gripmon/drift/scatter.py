@@ -46,7 +46,6 @@ class Scatter:
         lengths = len(LENGTHS)
         self._of_difference = np.zeros((lengths, streams, 6, 6))
         self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
-        self._begun = np.zeros(streams, dtype=bool)
 
     @property
     def windows(self) -> Array:
@@ -54,11 +53,8 @@ class Scatter:
         return self._windows
 
     def begin(self, covariance: Array) -> None:
-        """What to expect by the reported covariances (s, 6, 6), for streams that have shown nothing yet."""
-        new = ~self._begun
-        if new.any():
-            self._of_difference[:, new] = PRIOR_SHARE * covariance[new]
-            self._begun[:] = True
+        """What to expect by the reported covariances (s, 6, 6), before the first frame has shown anything."""
+        self._of_difference[:] = PRIOR_SHARE * covariance
 
     def learn(self, difference: Array, normalised: Array, usable: np.ndarray, frames: int) -> None:
         """Differences (k, s, 6) of neighbouring windows after ``frames`` more of them, their squares ``normalised``
@@ -78,21 +74,22 @@ class Scatter:
         return self._of_difference
 
     def covariances(self, reported: Array, inflation: Array) -> tuple[Array, Array]:
-        """(k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones.
+        """(..., k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones.
 
-        ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (k, s) by how much more the variance of
-        what the stream has shown counts.
+        ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (..., k, s) by how much more the
+        variance of what the stream has shown counts.
         """
         parts = 0.25 * self._of_difference
         parts[-1] *= 2.0  # beyond the longest, windows count as independent
-        total = np.cumsum((inflation[..., None, None] * parts)[::-1], axis=0)[::-1]
+        inflated = inflation[..., None, None]
+        total = np.flip(np.cumsum(np.flip(inflated * parts, axis=-4), axis=-4), axis=-4)
         # What was only assumed has not been seen.
         learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
         seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
         rare = np.concatenate([seen, np.zeros_like(seen[:1])])[_RARE]
         # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
         missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
-        return total + missing[0], inflation[..., None, None] * self._of_difference + 2.0 * missing[1:]
+        return total + missing[0], inflated * self._of_difference + 2.0 * missing[1:]
 
     def of_single_frames(self) -> Array:
         """(s, 6, 6) of frames about their mean, as the stream has shown it."""

@@ -16,7 +16,7 @@ from scipy import stats
 
 from gripmon.drift.scatter import Scatter
 from gripmon.drift.settings import DriftSettings
-from gripmon.drift.tolerance import square_beyond
+from gripmon.drift.tolerance import square, square_beyond, times, whitening
 from gripmon.drift.windows import LENGTHS, Windows
 from gripmon.records import Array
 
@@ -75,12 +75,12 @@ class SequentialTest:
         self._streams = streams
         self.windows = Windows(streams)
         self.scatter = Scatter(streams)
-        self._tolerated = np.array([settings.tolerated_m] * 3 + [settings.tolerated_rad] * 3)
+        self._tolerated = settings.tolerated
         self._frames_per_s = settings.frames_per_s
         self._last_two = np.zeros((2, streams, 6))
         self._sure = np.zeros((streams, 6))
         self._seen = np.zeros(streams, dtype=np.intp)
-        self._reported = np.zeros((streams, 6, 6))
+        self._reported: Array = np.zeros((streams, 6, 6))
         self._reference: Array = np.zeros((streams, 6, 6))
         self._frames = 0
         self._surge = np.ones((len(LENGTHS), streams))
@@ -117,20 +117,20 @@ class SequentialTest:
         mean, before = self.windows.means()
         difference = mean - before
         mean_full, both_full = self.windows.full()
-        square = np.stack([_square(self._whitening[0], mean), _square(self._whitening[1], difference)])
+        squares = np.stack([square(self._whitening[0], mean), square(self._whitening[1], difference)])
         full = np.stack([mean_full, both_full])
         # What is tolerated can only matter between these two.
         surely = np.sqrt(self._threshold) + self._most_tolerated
-        worth = mean_full & (square[0] > WORTH * self._threshold) & (square[0] <= surely * surely)
+        worth = mean_full & (squares[0] > WORTH * self._threshold) & (squares[0] <= surely * surely)
         if worth.any():
-            square[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
-        beyond = np.where(full, square / self._threshold, 0.0)  # (2, k, s)
+            squares[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
+        beyond = np.where(full, squares / self._threshold, 0.0)  # (2, k, s)
         if self._frames % LEARNING_FRAMES == 0:
             # An offset that stays says nothing against what differences show.
             usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
             if learn is not None:
                 usable &= learn
-            normalised = _square(self._learnt_whitening, difference)
+            normalised = square(self._learnt_whitening, difference)
             self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
             self._learn_surge(normalised, usable)
             self._learn_tail(normalised, usable)
@@ -165,10 +165,11 @@ class SequentialTest:
 
     def _report(self, covariance: Array) -> Array:
         """Follow the reported covariances; the usual variances over this frame's, 1 at most, on average (s,)."""
-        first = self._seen == 0
-        gain = np.where(first & ~self.scatter._begun, 1.0, REPORTED_MEMORY)
-        self._reported += gain[:, None, None] * (covariance - self._reported)
-        self.scatter.begin(self._reported)
+        if self._frames == 0:
+            self._reported = np.array(covariance)
+            self.scatter.begin(covariance)
+        else:
+            self._reported += REPORTED_MEMORY * (covariance - self._reported)
         variances = np.einsum("sii->si", covariance) / np.einsum("sii->si", self._reported)
         return 1.0 / np.maximum(variances.mean(axis=1), 1.0)
 
@@ -181,22 +182,22 @@ class SequentialTest:
         last = np.where((self._seen == 0)[:, None], shift, self._last_two)
         self._last_two = np.stack([last[1], shift])
         self._seen += 1
-        one, two = (_times(self._to_reported, each) for each in last)
-        three = _times(self._to_reported, shift)
+        one, two = (times(self._to_reported, each) for each in last)
+        three = times(self._to_reported, shift)
         middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three))
-        return _times(self._from_reported, middle)
+        return times(self._from_reported, middle)
 
-    def _learn_surge(self, square: Array, usable: np.ndarray) -> None:
+    def _learn_surge(self, normalised: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
         rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * _COUNT), 0.0)
-        self._surge += rate * (np.minimum(square / 6.0, SURGE_MOST) - self._surge)
+        self._surge += rate * (np.minimum(normalised / 6.0, SURGE_MOST) - self._surge)
 
-    def _learn_tail(self, square: Array, usable: np.ndarray) -> None:
+    def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
         """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
         ones.
         """
         share = np.minimum(LEARNING_FRAMES / (2.0 * _COUNT), 1.0) / TAIL_WINDOWS
-        beyond = (square > self._tail * NORMAL_SQUARE) / TAIL - 1.0
+        beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 
     def _refresh(self) -> None:
@@ -210,12 +211,14 @@ class SequentialTest:
             )
         heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
         inflation = self._inflation**heavy * np.maximum(self._surge, 1.0)
-        of_mean, of_difference = self.scatter.covariances(self._reported, inflation)
-        self._whitening = _whitening(np.stack([of_mean + self._reference, of_difference]))
-        self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
         # What is told of a mean is its standard deviation, not what would be too rare.
-        self._mean_covariance = self.scatter.covariances(self._reported, np.ones_like(inflation))[0] + self._reference
-        self._learnt_whitening = _whitening(self.scatter.of_differences)
+        both = np.stack([inflation, np.ones_like(inflation)])
+        of_mean, of_difference = self.scatter.covariances(self._reported, both)
+        of_mean += self._reference
+        self._mean_covariance = of_mean[1]
+        self._whitening = whitening(np.stack([of_mean[0], of_difference[0]]))
+        self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
+        self._learnt_whitening = whitening(self.scatter.of_differences)
 
 
 def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> tuple[float, Array]:
@@ -230,18 +233,3 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
     freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
     threshold = float(stats.chi2.isf(chance, 6))
     return MARGIN * threshold, np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0 / threshold)
-
-
-def _times(matrix: Array, values: Array) -> Array:
-    """(..., 6, 6) times (..., 6)."""
-    return np.asarray((matrix @ values[..., None])[..., 0])
-
-
-def _square(whitening: Array, values: Array) -> Array:
-    white = _times(whitening, values)
-    return np.asarray((white * white).sum(axis=-1))
-
-
-def _whitening(covariance: Array) -> Array:
-    """(..., 6, 6) W with W C Wᵀ = 1."""
-    return np.linalg.inv(np.linalg.cholesky(covariance))

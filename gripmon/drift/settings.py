@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
+
+from gripmon.records import Array
 
 
 class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -29,3 +32,8 @@ class DriftSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         float,
         Meta(gt=0.0, le=0.1, description="vibration of the TCP, root mean square, from which there is an alert (m)"),
     ] = 2e-5
+
+    @property
+    def tolerated(self) -> Array:
+        """(6,) what of a shift of the TCP and of a turn is never worth an alarm, m and rad."""
+        return np.array([self.tolerated_m] * 3 + [self.tolerated_rad] * 3)

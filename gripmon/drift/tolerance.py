@@ -1,4 +1,4 @@
-"""How far a mean shift lies beyond those that are tolerated, in terms of what it is known to."""
+"""How large a shift is in terms of what it is known to, and how far it lies beyond those that are tolerated."""
 
 from __future__ import annotations
 
@@ -8,6 +8,22 @@ from gripmon.records import Array
 
 SWEEPS = 8
 """Rounds over the axes; each can only come closer, and after none of them the answer is too small."""
+
+
+def whitening(covariance: Array) -> Array:
+    """(..., 6, 6) W with ``W C W' = 1``."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def times(matrix: Array, values: Array) -> Array:
+    """(..., 6, 6) times (..., 6)."""
+    return np.asarray((matrix @ values[..., None])[..., 0])
+
+
+def square(whitening: Array, values: Array) -> Array:
+    """(...) normalised squares of values (..., 6)."""
+    white = times(whitening, values)
+    return np.asarray((white * white).sum(axis=-1))
 
 
 def square_beyond(whitening: Array, shift: Array, tolerated: Array) -> Array:
@@ -25,6 +41,5 @@ def square_beyond(whitening: Array, shift: Array, tolerated: Array) -> Array:
             for axis in range(6):
                 pull = (precision[..., axis, :] * (shift - taken)).sum(axis=-1) / precision[..., axis, axis]
                 taken[..., axis] = np.clip(taken[..., axis] + pull, -tolerated[axis], tolerated[axis])
-        left = (whitening @ (shift - taken)[..., None])[..., 0]
-        best = np.minimum(best, (left * left).sum(axis=-1))
+        best = np.minimum(best, square(whitening, shift - taken))
     return best

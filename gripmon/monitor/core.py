@@ -253,7 +253,8 @@ class Monitor:
         jumped = looked_far and self._tracker.moved_px(measurement, before_T) > reach_px
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
         sigma = np.sqrt(self._covariance.diagonal())
-        astray = self._gripper_astray(measurement)
+        shares = agreeing_fingers(measurement, self._gripper)
+        astray = _gripper_astray(measurement, shares)
         self._astray = self._astray + 1 if astray else 0
         # Few doubtful frames tell nothing; many are how it is now.
         if 0 < self._astray < DOUBTED_FRAMES:
@@ -263,7 +264,7 @@ class Monitor:
         if motion.stepped:
             self._inquiry.moved_again()
         odd = self._blur.add(self._tracker.blur_px(measurement))
-        odd |= self._fingers.add(agreeing_fingers(measurement, self._gripper))
+        odd |= self._fingers.add(shares)
         odd |= self._residuals.add(self._tracker.edge_residuals_px(measurement))
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
@@ -284,15 +285,6 @@ class Monitor:
         return self._inquiry.ask(
             wrong, lambda: self._tracker.evidence(frame, measurement, self._ref_cam_T_grip), self._ref_cam_T_grip
         )
-
-    def _gripper_astray(self, measurement: Measurement) -> bool:
-        """Whether the gripper contradicts its model: one finger is where the transform says and another, though
-        sampled, is not (hidden, or bent), or the seen jaw opening is not the reported one.
-        """
-        if abs(measurement.jaw_surprise) > JAW_SURPRISE:
-            return True
-        shares = agreeing_fingers(measurement, self._gripper)
-        return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
 
     def _drift(self) -> Drift:
         return drift_between(self._ref_cam_T_grip, self._cam_T_grip)
@@ -415,6 +407,15 @@ class Monitor:
     def _noted(self) -> list[Alert]:
         noted, self._due = self._due, []
         return noted
+
+
+def _gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
+    """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
+    not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
+    """
+    if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+        return True
+    return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
 
 
 def _frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from gripmon.records.alerts import AlertEvent, AlertKind, Cause, CauseWeight, Severity
+from gripmon.records.alerts import Alert
 from gripmon.records.frames import State, Verdict
 
 
@@ -30,7 +30,7 @@ class StateRecord(msgspec.Struct, frozen=True):
     version: str
 
 
-class AlertRecord(msgspec.Struct, frozen=True):
+class AlertRecord(Alert, frozen=True, kw_only=True):
     """The ``alert`` message: one alert with the frame and the state that it belongs to."""
 
     robot: str
@@ -40,17 +40,3 @@ class AlertRecord(msgspec.Struct, frozen=True):
     state: State
     reference_id: str
     revision: int
-    kind: AlertKind
-    cause: Cause
-    severity: Severity
-    text: str
-    event: AlertEvent = AlertEvent.NOTED
-    alert_id: str = ""
-    part: str | None = None
-    causes: tuple[CauseWeight, ...] = ()
-    tcp_shift_m: tuple[float, float, float] | None = None
-    rotation_rad: float | None = None
-    rate_m_per_min: float | None = None
-    time_left_s: float | None = None
-    since_ns: int | None = None
-    acknowledged: bool = False
