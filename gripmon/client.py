@@ -18,7 +18,6 @@ from typing import NamedTuple, Self, TypeVar
 import msgspec
 import zenoh
 
-from gripmon.publish import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
 from gripmon.records import (
     CommandError,
     CommandFault,
@@ -28,6 +27,7 @@ from gripmon.records import (
     ReferenceRecord,
     StateRecord,
 )
+from gripmon.wire import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
 
 _T = TypeVar("_T")
 
@@ -71,7 +71,7 @@ class Client:
         """``camera`` may be left out while the robot has one; messages of a second one then raise LookupError.
 
         ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
-        Raises ValueError for a name that can't be part of a key, and :class:`gripmon.publish.PublishError` for a bad
+        Raises ValueError for a name that can't be part of a key, and :class:`gripmon.wire.PublishError` for a bad
         configuration.
         """
         self.keys = Keys(robot, camera if camera is not None else "*")

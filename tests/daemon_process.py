@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 from loopback import WAIT_S, state_record
+from published import Published
 from stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
 from gripmon.geometry import make_transform, to_record
-from gripmon.publish import PublishSettings, ZenohPublisher
+from gripmon.wire import PublishSettings
 
 # A third of a turn about (1, 1, 1) after a turn about x: no component of its quaternion is like another.
 ROTATION = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ np.array(
@@ -26,7 +27,7 @@ if __name__ == "__main__":
     log_to_stderr()
     transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
     with sigterm_exits():
-        publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+        publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
         if kind == "forgetful":
             raise SystemExit(5)  # without closing the publisher
         if kind == "starting":

@@ -8,10 +8,11 @@ from collections.abc import Callable, Iterator
 import msgspec
 import pytest
 from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
+from published import Published
 
 from gripmon.client import Client, MonitorName
-from gripmon.publish import PublishError, PublishSettings, ZenohPublisher
 from gripmon.records import FrameRecord
+from gripmon.wire import PublishError, PublishSettings
 
 
 @pytest.fixture
@@ -20,20 +21,20 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def publisher(endpoint: str) -> Iterator[ZenohPublisher]:
-    made = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+def publisher(endpoint: str) -> Iterator[Published]:
+    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     yield made
     made.close()
 
 
 @pytest.fixture
-def client(publisher: ZenohPublisher, endpoint: str) -> Iterator[Client]:
+def client(publisher: Published, endpoint: str) -> Iterator[Client]:
     with Client("arm", connect=[endpoint]) as made:
         wait_until(made.alive, "the client to find the monitor")
         yield made
 
 
-def put_until(publisher: ZenohPublisher, record: FrameRecord, arrived: Callable[[], object]) -> None:
+def put_until(publisher: Published, record: FrameRecord, arrived: Callable[[], object]) -> None:
     """Publish again and again until the subscription works."""
 
     def attempt() -> object:
@@ -43,7 +44,7 @@ def put_until(publisher: ZenohPublisher, record: FrameRecord, arrived: Callable[
     wait_until(attempt, "a transform")
 
 
-def test_latest_is_the_newest_record_and_stays(publisher: ZenohPublisher, client: Client):
+def test_latest_is_the_newest_record_and_stays(publisher: Published, client: Client):
     assert client.latest() is None
     put_until(publisher, frame_record(0), client.latest)
     for seq in range(1, 100):
@@ -52,7 +53,7 @@ def test_latest_is_the_newest_record_and_stays(publisher: ZenohPublisher, client
     assert client.latest() == frame_record(99)
 
 
-def test_a_slow_reader_gets_the_newest_of_its_depth_in_order(publisher: ZenohPublisher, endpoint: str):
+def test_a_slow_reader_gets_the_newest_of_its_depth_in_order(publisher: Published, endpoint: str):
     with Client("arm", "wrist", connect=[endpoint], depth=3) as client, Client("arm", connect=[endpoint]) as witness:
         put_until(publisher, frame_record(0), lambda: client.latest() and witness.latest())
         for seq in range(1, 51):
@@ -65,7 +66,7 @@ def test_a_slow_reader_gets_the_newest_of_its_depth_in_order(publisher: ZenohPub
         assert seqs == sorted(seqs) and len(seqs) <= 4  # one more may come between the last put and the first read
 
 
-def test_iteration_ends_when_the_client_is_closed(publisher: ZenohPublisher, endpoint: str):
+def test_iteration_ends_when_the_client_is_closed(publisher: Published, endpoint: str):
     client = Client("arm", connect=[endpoint])
     seqs: list[int] = []
 
@@ -82,7 +83,7 @@ def test_iteration_ends_when_the_client_is_closed(publisher: ZenohPublisher, end
     assert set(seqs) <= {5}
 
 
-def test_callbacks_get_every_record_and_end_with_the_client(publisher: ZenohPublisher, endpoint: str):
+def test_callbacks_get_every_record_and_end_with_the_client(publisher: Published, endpoint: str):
     before = set(threading.enumerate())
     seqs: list[int] = []
     with Client("arm", connect=[endpoint], depth=64) as client:
@@ -94,7 +95,7 @@ def test_callbacks_get_every_record_and_end_with_the_client(publisher: ZenohPubl
     assert set(threading.enumerate()) == before
 
 
-def test_state_and_reference(publisher: ZenohPublisher, client: Client):
+def test_state_and_reference(publisher: Published, client: Client):
     assert client.state() is None and client.reference() is None
     publisher.state(state_record(3))
     publisher.reference(reference_record(2))
@@ -106,7 +107,7 @@ def test_a_client_may_come_before_its_monitor_and_outlive_it(endpoint: str):
     with Client("arm", connect=[endpoint]) as client:
         for seq in (1, 2):
             assert client.alive(0.2) == ()
-            publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+            publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
             try:
                 put_until(
                     publisher, frame_record(seq), lambda seq=seq: (r := client.latest()) is not None and r.seq == seq
@@ -117,9 +118,9 @@ def test_a_client_may_come_before_its_monitor_and_outlive_it(endpoint: str):
             wait_until(lambda: not client.alive(0.2), "the token to vanish")
 
 
-def test_a_second_camera_must_be_told_apart(publisher: ZenohPublisher, endpoint: str):
+def test_a_second_camera_must_be_told_apart(publisher: Published, endpoint: str):
     second_endpoint = free_endpoint()
-    second = ZenohPublisher(PublishSettings(listen=(second_endpoint,)), "arm", "elbow")
+    second = Published(PublishSettings(listen=(second_endpoint,)), "arm", "elbow")
     try:
         with Client("arm", connect=[endpoint, second_endpoint]) as client:
             wait_until(lambda: len(client.alive()) == 2, "both monitors")
@@ -138,7 +139,7 @@ def test_a_second_camera_must_be_told_apart(publisher: ZenohPublisher, endpoint:
         second.close()
 
 
-def test_a_message_that_is_no_record_is_an_error(publisher: ZenohPublisher, client: Client, endpoint: str):
+def test_a_message_that_is_no_record_is_an_error(publisher: Published, client: Client, endpoint: str):
     put_until(publisher, frame_record(1), client.latest)
     with plain_session(connect=endpoint) as session:
         session.put("gripmon/arm/wrist/transform", '{"seq": "one"}')

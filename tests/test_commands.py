@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import threading
 import time
@@ -10,11 +11,12 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 from loopback import free_endpoint, plain_session, wait_until
+from published import Published
 
 from gripmon.client import Client, NotCarriedOut
-from gripmon.publish import Keys, PublishSettings, ZenohPublisher
 from gripmon.publish.commands import ZenohCommands
 from gripmon.records import Command, CommandFault, CommandName, CommandReply
+from gripmon.wire import Keys, Link, PublishSettings
 
 CMD = "gripmon/arm/wrist/cmd"
 
@@ -53,21 +55,21 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def publisher(endpoint: str) -> Iterator[ZenohPublisher]:
-    made = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+def publisher(endpoint: str) -> Iterator[Published]:
+    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     yield made
     made.close()
 
 
 @pytest.fixture
-def loop(publisher: ZenohPublisher) -> Iterator[Loop]:
+def loop(publisher: Published) -> Iterator[Loop]:
     made = Loop(publisher.commands, reply_to)
     yield made
     made.end()
 
 
 @pytest.fixture
-def session(publisher: ZenohPublisher, endpoint: str) -> Iterator[zenoh.Session]:
+def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
     with plain_session(connect=endpoint) as made:
         yield made
 
@@ -122,9 +124,9 @@ def test_what_is_no_command_is_answered_by_an_error(
 
 
 def test_without_an_answer_in_time_the_asker_is_told_and_the_command_is_dropped(endpoint: str):
-    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.1)
-    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
-        commands.attach(host)
+    link = Link(PublishSettings(listen=(endpoint,)))
+    commands = ZenohCommands(link, Keys("arm", "wrist"), timeout_s=0.1)
+    with contextlib.closing(link), plain_session(connect=endpoint) as session:
         [(is_reply, error)] = answers(session, f"{CMD}/undo")
         assert not is_reply and error["error"] == "timeout"
         assert error["text"] == "the monitor has not answered within 0.1 s; it is not carried out"
@@ -132,9 +134,9 @@ def test_without_an_answer_in_time_the_asker_is_told_and_the_command_is_dropped(
 
 
 def test_a_command_that_takes_too_long_may_still_be_carried_out(endpoint: str):
-    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.3)
-    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
-        commands.attach(host)
+    link = Link(PublishSettings(listen=(endpoint,)))
+    commands = ZenohCommands(link, Keys("arm", "wrist"), timeout_s=0.3)
+    with contextlib.closing(link), plain_session(connect=endpoint) as session:
         loop = Loop(commands, lambda _: None)
         [(is_reply, error)] = answers(session, f"{CMD}/undo")
         loop.end()
@@ -145,9 +147,9 @@ def test_a_command_that_takes_too_long_may_still_be_carried_out(endpoint: str):
 
 
 def test_an_answer_that_comes_too_late_goes_nowhere(endpoint: str):
-    commands = ZenohCommands(Keys("arm", "wrist"), timeout_s=0.05)
-    with plain_session(listen=endpoint, mode="peer") as host, plain_session(connect=endpoint) as session:
-        commands.attach(host)
+    link = Link(PublishSettings(listen=(endpoint,)))
+    commands = ZenohCommands(link, Keys("arm", "wrist"), timeout_s=0.05)
+    with contextlib.closing(link), plain_session(connect=endpoint) as session:
 
         def slow(command: Command) -> CommandReply:
             time.sleep(0.3)
@@ -159,7 +161,7 @@ def test_an_answer_that_comes_too_late_goes_nowhere(endpoint: str):
     assert [is_reply for is_reply, _ in got] == [False]
 
 
-def test_too_many_at_once_are_told_to_wait(publisher: ZenohPublisher, endpoint: str):
+def test_too_many_at_once_are_told_to_wait(publisher: Published, endpoint: str):
     """Nobody takes them: those that don't fit are answered at once, those that wait when the monitor stops."""
     with plain_session(connect=endpoint) as session:
         replies = [session.get(f"{CMD}/undo", timeout=20.0) for _ in range(20)]
@@ -179,7 +181,7 @@ def try_one(replies: object) -> zenoh.Reply | None:
 
 
 def test_commands_can_be_turned_off(endpoint: str):
-    deaf = ZenohPublisher(PublishSettings(listen=(endpoint,), commands=False), "arm", "wrist")
+    deaf = Published(PublishSettings(listen=(endpoint,), commands=False), "arm", "wrist")
     try:
         with plain_session(connect=endpoint) as session:
             assert answers(session, f"{CMD}/undo") == []
@@ -192,7 +194,7 @@ def test_commands_can_be_turned_off(endpoint: str):
 # --- the client ---
 
 
-def test_the_client_finds_the_camera_and_brings_the_answer(publisher: ZenohPublisher, loop: Loop, endpoint: str):
+def test_the_client_finds_the_camera_and_brings_the_answer(publisher: Published, loop: Loop, endpoint: str):
     with Client("arm", connect=[endpoint]) as client:
         assert client.send(CommandName.UNDO, "r-1") == reply_to(Command(CommandName.UNDO, "r-1"))
         assert not client.send(CommandName.ACCEPT, "no").done
@@ -207,9 +209,9 @@ def test_the_client_says_who_is_missing(endpoint: str):
         client.send(CommandName.UNDO, timeout_s=0.2)
 
 
-def test_the_client_does_not_choose_between_two_cameras(publisher: ZenohPublisher, loop: Loop, endpoint: str):
+def test_the_client_does_not_choose_between_two_cameras(publisher: Published, loop: Loop, endpoint: str):
     second = free_endpoint()
-    other = ZenohPublisher(PublishSettings(listen=(second,)), "arm", "elbow")
+    other = Published(PublishSettings(listen=(second,)), "arm", "elbow")
     try:
         with Client("arm", connect=[endpoint, second]) as client:
             wait_until(lambda: len(client.alive()) == 2, "both monitors")
@@ -222,7 +224,7 @@ def test_the_client_does_not_choose_between_two_cameras(publisher: ZenohPublishe
     assert loop.heard == [Command(CommandName.UNDO)]
 
 
-def test_the_client_tells_a_stopping_monitor_from_a_refusal(publisher: ZenohPublisher, endpoint: str):
+def test_the_client_tells_a_stopping_monitor_from_a_refusal(publisher: Published, endpoint: str):
     publisher.commands.close()
     with Client("arm", connect=[endpoint]) as client, pytest.raises(NotCarriedOut, match="the monitor stops") as caught:
         client.send(CommandName.UNDO)

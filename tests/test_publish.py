@@ -22,9 +22,11 @@ from loopback import (
     state_record,
     wait_until,
 )
+from published import Published
 
-from gripmon.publish import Keys, NullPublisher, PublishError, PublishSettings, ZenohPublisher
+from gripmon.publish import NullPublisher
 from gripmon.records import Verdict
+from gripmon.wire import Keys, PublishError, PublishSettings
 
 PREFIX = "gripmon/arm/wrist"
 
@@ -35,14 +37,14 @@ def endpoint() -> str:
 
 
 @pytest.fixture
-def publisher(endpoint: str) -> Iterator[ZenohPublisher]:
-    made = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist", subscribe_jaw=True)
+def publisher(endpoint: str) -> Iterator[Published]:
+    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     yield made
     made.close()
 
 
 @pytest.fixture
-def session(publisher: ZenohPublisher, endpoint: str) -> Iterator[zenoh.Session]:
+def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
     with plain_session(connect=endpoint) as opened:
         yield opened
 
@@ -61,7 +63,7 @@ def received(subscriber: zenoh.Subscriber, put: object) -> zenoh.Sample:
     return samples[0]
 
 
-def test_transform_on_the_wire(publisher: ZenohPublisher, session: zenoh.Session):
+def test_transform_on_the_wire(publisher: Published, session: zenoh.Session):
     record = frame_record()
     sample = received(session.declare_subscriber(f"{PREFIX}/transform"), lambda: publisher.transform(record))
     message = json.loads(sample.payload.to_bytes())
@@ -85,14 +87,14 @@ def test_transform_on_the_wire(publisher: ZenohPublisher, session: zenoh.Session
     assert str(sample.encoding) == "application/json"
 
 
-def test_alert_on_the_wire(publisher: ZenohPublisher, session: zenoh.Session):
+def test_alert_on_the_wire(publisher: Published, session: zenoh.Session):
     sample = received(session.declare_subscriber(f"{PREFIX}/alert"), lambda: publisher.alert(alert_record("it moved")))
     message = json.loads(sample.payload.to_bytes())
     assert (message["kind"], message["cause"], message["text"]) == ("drift", "camera_mount_moved", "it moved")
 
 
 @pytest.mark.parametrize("leaf", ["state", "reference"])
-def test_late_joiners_get_the_last_one(publisher: ZenohPublisher, endpoint: str, leaf: str):
+def test_late_joiners_get_the_last_one(publisher: Published, endpoint: str, leaf: str):
     records = [state_record(i) for i in (1, 2)] if leaf == "state" else [reference_record(i) for i in (1, 2)]
     for record in records:
         getattr(publisher, leaf)(record)
@@ -118,7 +120,7 @@ def test_a_question_before_the_first_state_is_answered_in_words(session: zenoh.S
 
 def test_close_frees_token_port_and_threads(endpoint: str):
     before = set(threading.enumerate())
-    publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "wrist", subscribe_jaw=True)
+    publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     with plain_session(connect=endpoint) as session:
         tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
         assert tokens.recv().kind == zenoh.SampleKind.PUT
@@ -130,9 +132,9 @@ def test_close_frees_token_port_and_threads(endpoint: str):
     wait_until(lambda: set(threading.enumerate()) <= before, f"threads to end: {threading.enumerate()}")
 
 
-def test_a_port_that_is_taken_is_said_with_its_key(publisher: ZenohPublisher, endpoint: str):
+def test_a_port_that_is_taken_is_said_with_its_key(publisher: Published, endpoint: str):
     with pytest.raises(PublishError) as caught:
-        ZenohPublisher(PublishSettings(listen=(endpoint,)), "arm", "other")
+        Published(PublishSettings(listen=(endpoint,)), "arm", "other")
     assert (
         str(caught.value)
         == f"publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
@@ -141,7 +143,7 @@ def test_a_port_that_is_taken_is_said_with_its_key(publisher: ZenohPublisher, en
 
 def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str):
     settings = PublishSettings(mode="client", connect=(endpoint,), retry_first_s=0.02, retry_longest_s=0.1)
-    publisher = ZenohPublisher(settings, "arm", "wrist")
+    publisher = Published(settings, "arm", "wrist")
     try:
         assert not publisher.connected
         for record in (frame_record(1), frame_record(2)):
@@ -169,7 +171,7 @@ def test_a_client_waits_for_its_router_without_holding_anybody_up(endpoint: str)
 
 def test_a_client_that_never_finds_its_router_closes(endpoint: str):
     before = set(threading.enumerate())
-    publisher = ZenohPublisher(PublishSettings(mode="client", connect=(endpoint,)), "arm", "wrist")
+    publisher = Published(PublishSettings(mode="client", connect=(endpoint,)), "arm", "wrist")
     publisher.close()
     wait_until(lambda: set(threading.enumerate()) <= before, "the opening thread to end")
 
@@ -182,13 +184,13 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
         ".yaml": "mode: peer\nlisten:\n  endpoints: [HERE]\nscouting:\n  multicast:\n    enabled: false\n",
     }[suffix].replace("HERE", endpoint)
     path.write_text(text)
-    publisher = ZenohPublisher(PublishSettings(zenoh_config=path.name), "arm", "wrist", relative_to=tmp_path)
+    publisher = Published(PublishSettings(zenoh_config=path.name), "arm", "wrist", relative_to=tmp_path)
     try:
         publisher.state(state_record(5))
         with plain_session(connect=endpoint) as session:
             assert ask(session, f"{PREFIX}/state")[0]["seq"] == 5
         with pytest.raises(PublishError, match=rf"^publish.zenoh_config: {endpoint} is already in use"):
-            ZenohPublisher(PublishSettings(zenoh_config=str(path)), "arm", "other")
+            Published(PublishSettings(zenoh_config=str(path)), "arm", "other")
     finally:
         publisher.close()
 
@@ -206,7 +208,7 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
 )
 def test_bad_settings_name_their_key(changes: dict[str, object], text: str):
     with pytest.raises(PublishError) as caught:
-        ZenohPublisher(PublishSettings(**changes), "arm", "wrist")  # type: ignore[arg-type]
+        Published(PublishSettings(**changes), "arm", "wrist")  # type: ignore[arg-type]
     assert str(caught.value).startswith(text)
     assert "\n" not in str(caught.value) and ".rs:" not in str(caught.value)
 
@@ -215,7 +217,7 @@ def test_bad_settings_name_their_key(changes: dict[str, object], text: str):
 def test_names_that_would_break_a_key_are_refused(name: str):
     for robot, camera in ((name, "wrist"), ("arm", name)):
         with pytest.raises(ValueError, match=r"name .* can't be part of a Zenoh key"):
-            ZenohPublisher(PublishSettings(listen=()), robot, camera)
+            Published(PublishSettings(listen=()), robot, camera)
 
 
 @pytest.mark.parametrize("name", ["arm", "arm-1", "Größe", "a@b", "ur10.left"])
@@ -223,7 +225,7 @@ def test_names_that_zenoh_takes_are_taken(name: str):
     assert zenoh.KeyExpr(Keys(name, name)["state"])
 
 
-def test_the_newest_jaw_opening_wins(publisher: ZenohPublisher, session: zenoh.Session):
+def test_the_newest_jaw_opening_wins(publisher: Published, session: zenoh.Session):
     assert publisher.jaw.opening_m() is None
     assert publisher.jaw.fault() == "no jaw opening received"
     for stamp_ns, opening_m in ((1, 0.010), (3, 0.020), (2, 0.030)):
@@ -243,7 +245,7 @@ def test_the_newest_jaw_opening_wins(publisher: ZenohPublisher, session: zenoh.S
         b'{"stamp_ns": 1, "opening_m": "2"}',
     ],
 )
-def test_a_malformed_jaw_message_is_counted_and_said(publisher: ZenohPublisher, session: zenoh.Session, message: bytes):
+def test_a_malformed_jaw_message_is_counted_and_said(publisher: Published, session: zenoh.Session, message: bytes):
     session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": 1, "opening_m": 0.02}))
     session.put(f"{PREFIX}/jaw", message)
     wait_until(lambda: publisher.jaw.opening_m() is not None and publisher.jaw.malformed == 1, "the malformed message")
@@ -253,7 +255,7 @@ def test_a_malformed_jaw_message_is_counted_and_said(publisher: ZenohPublisher, 
 
 def test_an_old_jaw_opening_is_not_used(endpoint: str):
     settings = PublishSettings(listen=(endpoint,), jaw_max_age_s=0.2)
-    publisher = ZenohPublisher(settings, "arm", "wrist", subscribe_jaw=True)
+    publisher = Published(settings, "arm", "wrist")
     try:
         with plain_session(connect=endpoint) as session:
             session.put(f"{PREFIX}/jaw", json.dumps({"stamp_ns": 1, "opening_m": 0.02}))
@@ -267,7 +269,7 @@ def test_an_old_jaw_opening_is_not_used(endpoint: str):
 def test_a_jaw_opening_grows_old_though_nobody_asked(endpoint: str):
     """The camera was away for a while: what the robot said before must not look fresh."""
     settings = PublishSettings(listen=(endpoint,), jaw_max_age_s=0.2)
-    publisher = ZenohPublisher(settings, "arm", "wrist", subscribe_jaw=True)
+    publisher = Published(settings, "arm", "wrist")
     try:
         with plain_session(connect=endpoint) as session:
             putter = session.declare_publisher(f"{PREFIX}/jaw")

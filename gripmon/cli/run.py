@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gripmon.recording import Recorder
     from gripmon.records import Alert, ReferenceRecord
     from gripmon.statefile import StateFile
+    from gripmon.wire import Link
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -116,7 +117,8 @@ def run_daemon(
         monitor = Monitor(
             config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
         )
-        publisher, jaw, commands = _open_publisher(config)
+        link = _open_link(config)
+        publisher, jaw, commands = _open_publisher(config, link)
         opened.callback(publisher.close)
         on_network()
         recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
@@ -182,26 +184,30 @@ def _notices(kept: StateFile | None) -> list[Alert]:
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
 
 
-def _open_publisher(config: Config) -> tuple[Publisher, JawFeed | None, ZenohCommands | None]:
-    """The publisher, where the jaw opening comes from (None: with the frames), and where commands come from."""
-    from gripmon.publish import NullPublisher, PublishError, ZenohPublisher
+def _open_link(config: Config) -> Link | None:
+    """The session; None if nothing is published."""
+    from gripmon.wire import Link, PublishError
 
-    settings = config.settings
-    fixed = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
-    if not settings.publish.enabled:
-        return NullPublisher(), fixed, None
-    from_network = settings.jaw.source == "zenoh"
+    if not config.settings.publish.enabled:
+        return None
     try:
-        publisher = ZenohPublisher(
-            settings.publish,
-            settings.robot,
-            settings.camera_name,
-            subscribe_jaw=from_network,
-            relative_to=config.directory,
-        )
+        return Link(config.settings.publish, config.directory)
     except PublishError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
-    return publisher, publisher.jaw if from_network else fixed, publisher.commands
+
+
+def _open_publisher(config: Config, link: Link | None) -> tuple[Publisher, JawFeed | None, ZenohCommands | None]:
+    """The publisher, where the jaw opening comes from (None: with the frames), and where commands come from."""
+    from gripmon.publish import NullPublisher, ZenohCommands, ZenohJaw, ZenohPublisher
+
+    settings = config.settings
+    jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
+    if link is None:
+        return NullPublisher(), jaw, None
+    publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
+    if settings.jaw.source == "zenoh":
+        jaw = ZenohJaw(link, publisher.keys["jaw"])
+    return publisher, jaw, ZenohCommands(link, publisher.keys) if settings.publish.commands else None
 
 
 def _open_recorder(

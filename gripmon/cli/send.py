@@ -85,8 +85,8 @@ def send(arguments: argparse.Namespace) -> int:
 
 def _ask(arguments: argparse.Namespace) -> CommandReply:
     from gripmon.client import Client, NotCarriedOut
-    from gripmon.publish import DEFAULT_ENDPOINT
     from gripmon.records import CommandName
+    from gripmon.wire import DEFAULT_ENDPOINT
 
     try:
         client = Client(

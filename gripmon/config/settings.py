@@ -10,10 +10,10 @@ from msgspec import Meta
 from gripmon.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.monitor import MonitorSettings
-from gripmon.publish import PublishSettings
 from gripmon.recording import RecordingSettings
 from gripmon.sources import SourceSettings
 from gripmon.statefile import StateSettings
+from gripmon.wire import PublishSettings
 
 Name = Annotated[
     str,

@@ -1,4 +1,4 @@
-"""What the monitor says on the network, and the jaw opening that it hears there: one Zenoh session.
+"""What the monitor says on the network, and the jaw opening that it hears there.
 
 Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.records`):
 
@@ -19,21 +19,13 @@ from __future__ import annotations
 from gripmon.publish.commands import PendingCommand, ZenohCommands
 from gripmon.publish.jaw import JawReading, ZenohJaw
 from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
-from gripmon.publish.session import open_session, zenoh_config
-from gripmon.publish.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings
 
 __all__ = [
-    "DEFAULT_ENDPOINT",
     "JawReading",
-    "Keys",
     "NullPublisher",
     "PendingCommand",
-    "PublishError",
-    "PublishSettings",
     "Publisher",
     "ZenohCommands",
     "ZenohJaw",
     "ZenohPublisher",
-    "open_session",
-    "zenoh_config",
 ]

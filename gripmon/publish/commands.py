@@ -9,8 +9,8 @@ from collections import deque
 import msgspec
 import zenoh
 
-from gripmon.publish.settings import Keys
 from gripmon.records import Command, CommandError, CommandFault, CommandName, CommandReply, to_json
+from gripmon.wire import Keys, Link
 
 _log = logging.getLogger(__name__)
 
@@ -68,17 +68,13 @@ class ZenohCommands:
     It replies a :class:`gripmon.records.CommandReply` as JSON, or as an error a :class:`gripmon.records.CommandError`.
     """
 
-    def __init__(self, keys: Keys, *, timeout_s: float = TIMEOUT_S) -> None:
+    def __init__(self, link: Link, keys: Keys, *, timeout_s: float = TIMEOUT_S) -> None:
         self._keys = keys
         self._timeout_s = timeout_s
         self._waiting: deque[PendingCommand] = deque()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
-
-    def attach(self, session: zenoh.Session) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        answer = zenoh.handlers.Callback(self._receive, indirect=False)
-        self._queryable = session.declare_queryable(self._keys["cmd/*"], answer, complete=True)
+        link.attach(self._attach, self.close)
 
     def poll(self) -> PendingCommand | None:
         """The next command to carry out and answer, at once; None if there is none."""
@@ -93,6 +89,11 @@ class ZenohCommands:
         self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out"))
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        answer = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._queryable = session.declare_queryable(self._keys["cmd/*"], answer, complete=True)
 
     def _receive(self, query: zenoh.Query) -> None:
         # Zenoh swallows an exception here and the asker would see an empty result: always answer in words.

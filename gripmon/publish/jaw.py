@@ -9,6 +9,8 @@ import time
 import msgspec
 import zenoh
 
+from gripmon.wire import Link
+
 _log = logging.getLogger(__name__)
 
 
@@ -26,18 +28,17 @@ class ZenohJaw:
     any thread may ask.
     """
 
-    def __init__(self, max_age_s: float) -> None:
+    def __init__(self, link: Link, key: str) -> None:
+        """Reads ``key``; a reading older than the link's ``jaw_max_age_s`` is not used."""
         self.malformed = 0
-        self._max_age_s = max_age_s
+        self._key = key
+        self._max_age_s = link.settings.jaw_max_age_s
         self._subscriber: zenoh.Subscriber[None] | None = None
         self._decode = msgspec.json.Decoder(JawReading).decode
         self._lock = threading.Lock()  # guards what follows, and `malformed`, against Zenoh's thread
         self._newest: JawReading | None = None
         self._arrival_s = 0.0
-
-    def attach(self, session: zenoh.Session, key: str) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.Callback(self._receive, indirect=False))
+        link.attach(self._attach)
 
     def opening_m(self) -> float | None:
         """The newest opening, m; None if none came, or none for ``jaw_max_age_s``."""
@@ -58,6 +59,10 @@ class ZenohJaw:
 
     def _is_old(self) -> bool:
         return time.monotonic() - self._arrival_s > self._max_age_s
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._receive, indirect=False))
 
     def _receive(self, sample: zenoh.Sample) -> None:
         arrival_s = time.monotonic()

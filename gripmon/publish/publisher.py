@@ -1,22 +1,15 @@
-"""One open session and everything declared on it."""
+"""What a monitor says on the network."""
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections import deque
-from pathlib import Path
 from typing import Protocol
 
 import zenoh
 
-from gripmon.publish.commands import ZenohCommands
-from gripmon.publish.jaw import ZenohJaw
-from gripmon.publish.session import in_short, open_session, zenoh_config
-from gripmon.publish.settings import Keys, PublishSettings, check_name
 from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord, to_json
-
-_log = logging.getLogger(__name__)
+from gripmon.wire import Keys, Link, check_name
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
@@ -44,55 +37,23 @@ class NullPublisher:
 
 
 class ZenohPublisher:
-    """Publishes one monitor's records.
+    """Publishes one monitor's records over a link, which it closes in the end.
 
-    The session is open when the constructor returns, except for a client: its router may come later, so it is opened in
-    a thread that tries again with growing pauses.  Until then transforms are dropped and counted in ``unsent``; the
-    last state, the last reference and the last few alerts are kept for the router's arrival.
+    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
+    and the last few alerts are kept for its opening.
     """
 
-    def __init__(
-        self,
-        settings: PublishSettings,
-        robot: str,
-        camera: str,
-        *,
-        subscribe_jaw: bool = False,
-        relative_to: Path = Path(),
-    ) -> None:
-        """``relative_to`` is the folder of the configuration file, from which a path in the settings counts.
-
-        Raises ValueError for a name that can't be part of a key, and :class:`PublishError` for a configuration that
-        can't work or an address that is already taken.
-        """
-        check_name("robot", robot)
-        check_name("camera", camera)
-        self.keys = Keys(robot, camera)
-        self.jaw = ZenohJaw(settings.jaw_max_age_s)
-        self.commands = ZenohCommands(self.keys)
+    def __init__(self, link: Link, robot: str, camera: str) -> None:
+        """Raises ValueError for a name that can't be part of a key."""
+        self.keys = Keys(check_name("robot", robot), check_name("camera", camera))
         self.unsent = 0
-        self._settings = settings
-        self._subscribe_jaw = subscribe_jaw
+        self._link = link
         self._wire: _Wire | None = None
         self._lock = threading.Lock()  # guards the kept records below against the opening thread
         self._state: StateRecord | None = None
         self._reference: ReferenceRecord | None = None
         self._alerts: deque[AlertRecord] = deque(maxlen=_ALERTS_KEPT)
-        self._closing = threading.Event()
-        self._opener: threading.Thread | None = None
-        config = zenoh_config(settings, relative_to)
-        if config.get_json("mode") == '"client"':
-            self._opener = threading.Thread(
-                target=self._open_until_it_works, args=(config,), name="zenoh-open", daemon=True
-            )
-            self._opener.start()
-        else:
-            self._adopt(open_session(config, settings))
-
-    @property
-    def connected(self) -> bool:
-        """Is there a session?  False only for a client that has not found its router yet."""
-        return self._wire is not None
+        link.attach(self._adopt, self._leave)
 
     def transform(self, record: FrameRecord) -> None:
         """Send one frame's record."""
@@ -125,23 +86,12 @@ class ZenohPublisher:
                 self._alerts.append(record)
 
     def close(self) -> None:
-        """Withdraw the liveliness token, close the session and free its port.  Calling it twice does nothing more."""
-        self._closing.set()
-        self.commands.close()
-        if self._opener is not None:
-            self._opener.join(timeout=1.0)  # an attempt under way closes its own session when it returns
-        with self._lock:
-            wire, self._wire = self._wire, None
-        if wire is not None:
-            wire.close()
+        """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
+        self._link.close()
 
     def _adopt(self, session: zenoh.Session) -> None:
         """Declare everything on a new session and send what was kept for it."""
         wire = _Wire(session, self.keys)
-        if self._subscribe_jaw:
-            self.jaw.attach(session, self.keys["jaw"])
-        if self._settings.commands:
-            self.commands.attach(session)
         with self._lock:
             self._wire = wire
             if self._reference is not None:
@@ -151,25 +101,11 @@ class ZenohPublisher:
             while self._alerts:
                 wire.alert.put(to_json(self._alerts.popleft()))
 
-    def _open_until_it_works(self, config: zenoh.Config) -> None:
-        pause_s = self._settings.retry_first_s
-        said = ""
-        while not self._closing.is_set():
-            try:
-                session = zenoh.open(config)
-            except zenoh.ZError as error:
-                if (text := in_short(error)) != said:
-                    _log.warning("no Zenoh session yet, trying again: %s", text)
-                    said = text
-                self._closing.wait(pause_s)
-                pause_s = min(2.0 * pause_s, self._settings.retry_longest_s)
-                continue
-            if self._closing.is_set():
-                session.close()
-                return
-            self._adopt(session)
-            _log.info("Zenoh session open")
-            return
+    def _leave(self) -> None:
+        with self._lock:
+            wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.close()
 
 
 def _keeping_publisher(
@@ -217,7 +153,6 @@ class _Wire:
     """Everything declared on one open session."""
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
-        self._session = session
         self.transform = session.declare_publisher(
             keys["transform"],
             encoding=_JSON,
@@ -232,4 +167,3 @@ class _Wire:
 
     def close(self) -> None:
         self._alive.undeclare()
-        self._session.close()

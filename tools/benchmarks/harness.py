@@ -20,9 +20,10 @@ from benchmarks.scene import FPS, Ring
 from gripmon import daemon
 from gripmon.config import Config
 from gripmon.monitor import Monitor
-from gripmon.publish import Publisher, PublishSettings, ZenohPublisher
+from gripmon.publish import Publisher, ZenohPublisher
 from gripmon.recording import NullRecorder, Recorder
 from gripmon.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.wire import Link, PublishSettings
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)
@@ -126,7 +127,8 @@ def published(config: Config) -> Iterator[tuple[ZenohPublisher, Subscriber]]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    publisher = ZenohPublisher(PublishSettings(listen=(endpoint,)), config.settings.robot, config.settings.camera_name)
+    link = Link(PublishSettings(listen=(endpoint,)))
+    publisher = ZenohPublisher(link, config.settings.robot, config.settings.camera_name)
     try:
         subscriber = Subscriber(endpoint, publisher.keys["transform"])
         try:

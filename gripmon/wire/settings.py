@@ -65,10 +65,11 @@ class Keys:
         return f"gripmon/{self.robot}/{self.camera}/{leaf}"
 
 
-def check_name(role: str, name: str) -> None:
-    """Raise ValueError unless the name can be one chunk of a Zenoh key."""
+def check_name(role: str, name: str) -> str:
+    """The name; raises ValueError unless it can be one chunk of a Zenoh key."""
     if not _NAME.fullmatch(name):
         raise ValueError(
             f"{role} name {name!r} can't be part of a Zenoh key; give at least one character, none of them a space or "
             "one of / * $ # ?, and no @ in front"
         )
+    return name

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import zenoh
 
-from gripmon.publish.settings import PublishError, PublishSettings
+from gripmon.wire.settings import PublishError, PublishSettings
 
 
 def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh.Config:

@@ -1,0 +1,20 @@
+"""The one Zenoh session of a process, its settings, and the names of the keys: what everyone who talks to the network
+shares.
+"""
+
+from __future__ import annotations
+
+from gripmon.wire.link import Link
+from gripmon.wire.session import open_session, zenoh_config
+from gripmon.wire.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings, check_name
+
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "Keys",
+    "Link",
+    "PublishError",
+    "PublishSettings",
+    "check_name",
+    "open_session",
+    "zenoh_config",
+]

@@ -1,0 +1,110 @@
+"""A session that may open later, and those who wait for it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import zenoh
+
+from gripmon.wire.session import in_short, open_session, zenoh_config
+from gripmon.wire.settings import PublishSettings
+
+_log = logging.getLogger(__name__)
+
+
+class Link:
+    """The process's session.
+
+    It is open when the constructor returns, except for a client: its router may come later, so it is opened in a thread
+    that tries again with growing pauses.
+    """
+
+    def __init__(self, settings: PublishSettings, relative_to: Path = Path()) -> None:
+        """``relative_to`` is the folder of the configuration file, from which a path in the settings counts.
+
+        Raises :class:`PublishError` for a configuration that can't work or an address that is already taken.
+        """
+        self.settings = settings
+        self._lock = threading.RLock()  # guards what follows against the opening thread
+        self._session: zenoh.Session | None = None
+        self._declare: list[Callable[[zenoh.Session], None]] = []
+        self._leave: list[Callable[[], None]] = []
+        self._fault = ""
+        self._closing = threading.Event()
+        self._opener: threading.Thread | None = None
+        config = zenoh_config(settings, relative_to)
+        if config.get_json("mode") == '"client"':
+            self._fault = "no Zenoh session yet"
+            self._opener = threading.Thread(
+                target=self._open_until_it_works, args=(config,), name="zenoh-open", daemon=True
+            )
+            self._opener.start()
+        else:
+            self._session = open_session(config, settings)
+
+    @property
+    def connected(self) -> bool:
+        """Is there a session?  False only for a client that has not found its router yet."""
+        return self._session is not None
+
+    def fault(self) -> str:
+        """Why there is no session, in a few words for a person; empty if there is one."""
+        return self._fault
+
+    def attach(self, declare: Callable[[zenoh.Session], None], leave: Callable[[], None] | None = None) -> None:
+        """Call ``declare`` with the session: now, or in another thread when it opens; ``leave`` before it is closed.
+
+        What is attached first is declared first and leaves last.
+        """
+        with self._lock:
+            self._leave += [] if leave is None else [leave]
+            if self._session is None:
+                self._declare.append(declare)
+            else:
+                declare(self._session)
+
+    def close(self) -> None:
+        """Tell everyone attached, close the session and free its port.  Calling it twice does nothing more."""
+        self._closing.set()
+        if self._opener is not None:
+            self._opener.join(timeout=1.0)  # an attempt under way closes its own session when it returns
+        with self._lock:
+            session, self._session = self._session, None
+            leave, self._leave = self._leave, []
+            self._declare.clear()
+        for last_word in reversed(leave):
+            last_word()
+        if session is not None:
+            session.close()
+
+    def _adopt(self, session: zenoh.Session) -> bool:
+        """Let everyone declare what they have; False if it came too late."""
+        with self._lock:
+            if self._closing.is_set():
+                return False
+            declare, self._declare = self._declare, []
+            for each in declare:
+                each(session)
+            self._session, self._fault = session, ""
+        return True
+
+    def _open_until_it_works(self, config: zenoh.Config) -> None:
+        pause_s = self.settings.retry_first_s
+        while not self._closing.is_set():
+            try:
+                session = zenoh.open(config)
+            except zenoh.ZError as error:
+                if (text := f"no Zenoh session yet, trying again: {in_short(error)}") != self._fault:
+                    _log.warning("%s", text)
+                    self._fault = text
+                self._closing.wait(pause_s)
+                pause_s = min(2.0 * pause_s, self.settings.retry_longest_s)
+                continue
+            if self._adopt(session):
+                _log.info("Zenoh session open")
+            else:
+                session.close()
+            return
