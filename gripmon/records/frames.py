@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.records.alerts import Alert
 from gripmon.records.references import ReferenceRecord
 from gripmon.records.values import Array, Drift, Image, Smoothed, Transform
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 
 class Verdict(enum.StrEnum):

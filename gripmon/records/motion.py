@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from gripmon.records.alerts import AlertKind, Cause, CauseWeight
 from gripmon.records.values import Array
 
@@ -22,6 +20,8 @@ class Creep:
     @property
     def rate_m_per_min(self) -> float:
         """Of the TCP."""
+        import numpy as np  # not at the top: who only reads messages needn't load it
+
         return 60.0 * float(np.linalg.norm(self.velocity[:3]))
 
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
-import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.floating[Any]]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-
-Image = NDArray[np.integer[Any] | np.floating[Any]]
+    Array = NDArray[np.floating[Any]]
+    Image = NDArray[np.integer[Any] | np.floating[Any]]
+else:  # these are for annotations alone: who only reads messages needn't load NumPy
+    Array = Image = Any
 
 
 class Transform(msgspec.Struct, frozen=True):

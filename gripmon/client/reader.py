@@ -1,23 +1,16 @@
-"""For programs that use the corrected transform, such as servo controllers: a typed reader of one monitor.
-
-    with Client("arm1") as monitor:
-        record = monitor.latest()
-        if record is not None and record.verdict == "valid":
-            cam_T_grip = record.cam_T_grip
-
-Nothing here waits for the monitor to start: a client that comes first is connected when the monitor is there.
-"""
+"""A reader of everything that one monitor says, which can also tell it something."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple, Self, TypeVar
+from typing import Self, TypeVar
 
 import msgspec
 import zenoh
 
+from gripmon.client.names import MonitorName, monitor_name
 from gripmon.records import (
     CommandError,
     CommandFault,
@@ -30,16 +23,6 @@ from gripmon.records import (
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
 
 _T = TypeVar("_T")
-
-
-class MonitorName(NamedTuple):
-    """Whose messages: the second and third part of every key."""
-
-    robot: str
-    camera: str
-
-    def __str__(self) -> str:
-        return f"{self.robot}/{self.camera}"
 
 
 class NotCarriedOut(Exception):
@@ -135,7 +118,7 @@ class Client:
     def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
         """The monitors of this name that run now, in order; all on the network for ``Client("*")``."""
         replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
-        return tuple(sorted({_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
+        return tuple(sorted({monitor_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
     def send(self, name: CommandName, argument: str = "", timeout_s: float = 5.0) -> CommandReply:
         """Tell the monitor something (:class:`gripmon.records.Command`) and wait for its answer.
@@ -196,15 +179,10 @@ class Client:
         return alive[0]
 
     def _check_name(self, key: zenoh.KeyExpr) -> None:
-        name = _name(key)
+        name = monitor_name(key)
         if self._heard is None:
             self._heard = name
         elif name != self._heard:
             raise LookupError(
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
-
-
-def _name(key: zenoh.KeyExpr) -> MonitorName:
-    _, robot, camera, _ = str(key).split("/")
-    return MonitorName(robot, camera)

@@ -1,0 +1,33 @@
+"""For programs that use the corrected transform, such as servo controllers.
+
+    from gripmon.client import TransformClient
+
+    with TransformClient("arm1", "wrist") as monitor:
+        reading = monitor.latest()  # at once, whatever the network does
+        if reading.usable:
+            move_by(reading.transform)
+        else:
+            stop(reading.reason)
+
+:class:`TransformClient` gives the newest transform and whether it may be used.  :class:`Client` reads every message as
+it is, and sends commands.  Nothing here waits for the monitor to start, and nothing needs help when a monitor or a
+router ends and comes again.  Neither NumPy nor OpenCV is loaded.
+"""
+
+from __future__ import annotations
+
+from gripmon.client.names import MonitorName
+from gripmon.client.reader import Client, NotCarriedOut
+from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
+from gripmon.client.transforms import TransformClient
+
+__all__ = [
+    "Client",
+    "MonitorName",
+    "NotCarriedOut",
+    "NotUsable",
+    "Policy",
+    "Reading",
+    "TransformClient",
+    "Unusable",
+]

@@ -1,0 +1,112 @@
+"""What came from the network: Zenoh's threads write, any number of others read without waiting."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import weakref
+from typing import NamedTuple, Protocol
+
+from gripmon.client.message import TransformMessage, Unreadable, transform_message
+from gripmon.client.names import MonitorName
+
+_log = logging.getLogger(__name__)
+
+
+class Entry(NamedTuple):
+    """A message, who sent it, and when it arrived by the monotonic clock."""
+
+    message: TransformMessage
+    monitor: MonitorName
+    arrival_s: float
+
+
+class Heard(NamedTuple):
+    """What readings are made from; replaced as a whole, so that who reads it needs no lock.
+
+    ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
+    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read.
+    """
+
+    entry: Entry | None = None
+    present: frozenset[MonitorName] = frozenset()
+    cut: bool = False
+    unreadable: str = ""
+    closed: bool = False
+
+
+class Waiter(Protocol):
+    """Somebody who waits for news; neither method may wait itself."""
+
+    def put(self, entry: Entry) -> None: ...
+    def wake(self) -> None: ...
+
+
+class Inbox:
+    """The newest message, who is there, and who wants to be told."""
+
+    def __init__(self) -> None:
+        self.heard = Heard()
+        self.unreadable = 0
+        self._lock = threading.Lock()  # for those who write
+        self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # an iterator that is let go is told no more
+
+    def take(self, monitor: MonitorName, payload: bytes, arrival_s: float) -> None:
+        """A message arrived."""
+        try:
+            entry = Entry(transform_message(payload), monitor, arrival_s)
+        except Unreadable as error:
+            self._refuse(monitor, str(error))
+            return
+        with self._lock:
+            self._set(entry=entry, present=self.heard.present | {monitor}, cut=False, unreadable="")
+            for waiter in self._waiters:
+                waiter.put(entry)
+
+    def appeared(self, monitor: MonitorName) -> None:
+        """Its liveliness token is there."""
+        with self._lock:
+            self._set(present=self.heard.present | {monitor})
+            self._wake()
+
+    def vanished(self, monitor: MonitorName) -> None:
+        """Its liveliness token is gone: it ended, was killed, or the way to it is cut."""
+        with self._lock:
+            entry = self.heard.entry
+            cut = self.heard.cut or (entry is not None and entry.monitor == monitor)
+            self._set(present=self.heard.present - {monitor}, cut=cut)
+            self._wake()
+
+    def close(self) -> None:
+        """No more will come."""
+        with self._lock:
+            self._set(closed=True)
+            self._wake()
+
+    def join(self, waiter: Waiter) -> None:
+        """Tell it from now on, as long as somebody else refers to it."""
+        with self._lock:
+            self._waiters.add(waiter)
+
+    def _refuse(self, monitor: MonitorName, text: str) -> None:
+        with self._lock:
+            self.unreadable += 1
+            if self.heard.unreadable != text:  # said once, and again when it is something else or was over
+                _log.warning("%s: a transform message can't be read: %s", monitor, text)
+                self._set(unreadable=text)
+
+    def _set(self, **changes: object) -> None:
+        before = self.heard
+        self.heard = before._replace(**changes)  # type: ignore[arg-type]
+        if len(self.heard.present) > max(1, len(before.present)):
+            _log.error("%s", several(self.heard.present))
+
+    def _wake(self) -> None:
+        for waiter in self._waiters:
+            waiter.wake()
+
+
+def several(present: frozenset[MonitorName]) -> str:
+    """What to tell somebody who has not named the camera."""
+    names = ", ".join(map(str, sorted(present)))
+    return f"more than one monitor is there: {names}; name the camera"

@@ -1,0 +1,93 @@
+"""From what was heard to a reading: the rules for verdicts, and the controller's own policy."""
+
+from __future__ import annotations
+
+import math
+
+from gripmon.client.inbox import Entry, Heard, several
+from gripmon.client.message import TransformMessage
+from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
+from gripmon.records import Verdict
+
+_Refusal = tuple[Unusable, str]
+
+
+def judge(heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_ns: int, fault: str) -> Reading:
+    """The reading of ``entry`` at ``now_s`` by the monotonic clock, ``wall_ns`` by the wall clock.
+
+    ``heard`` says who is there, ``fault`` why there is no session (empty if there is one).
+    """
+    if entry is None:
+        why, reason = _cut_off(heard, None) or _silence(heard, fault)
+        return Reading(monitor=None, verdict=Verdict.UNKNOWN, usable=False, why=why, reason=reason, age_s=math.inf)
+    message = entry.message
+    age_s = _age_s(entry, policy, now_s, wall_ns)
+    lost = _cut_off(heard, entry) or _unknown(message) or _too_old(heard, age_s, policy)
+    refusal = lost or _against_policy(message, policy)
+    return Reading(
+        monitor=entry.monitor,
+        verdict=Verdict.UNKNOWN if lost else message.verdict,
+        usable=refusal is None,
+        why=refusal[0] if refusal else None,
+        reason=refusal[1] if refusal else "",
+        age_s=age_s,
+        transform=None if lost else message.cam_T_grip,
+        covariance=None if lost else message.covariance,
+        smoothed=None if lost else message.smoothed,
+        state=message.state,
+        source=message.source,
+        stamp_ns=message.stamp_ns,
+        seq=message.seq,
+        reference_id=message.reference_id,
+        revision=message.revision,
+    )
+
+
+def _age_s(entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
+    age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.message.latency_ns
+    return max(age_s, 1e-9 * (wall_ns - entry.message.stamp_ns)) if policy.clocks_agree else age_s
+
+
+def _cut_off(heard: Heard, entry: Entry | None) -> _Refusal | None:
+    """Is it unclear whether the monitor, and which one, still stands by what it said?"""
+    if heard.closed:
+        return Unusable.CLOSED, "the client is closed"
+    if len(heard.present) > 1:
+        return Unusable.SEVERAL, several(heard.present)
+    if entry is None or not heard.cut:
+        return None
+    if entry.monitor in heard.present:
+        return Unusable.RESTARTED, "the monitor was gone and is back, but has sent no transform yet"
+    return Unusable.GONE, "the monitor is gone"
+
+
+def _silence(heard: Heard, fault: str) -> _Refusal:
+    if heard.unreadable:
+        return Unusable.UNREADABLE, f"no transform came that can be read: {heard.unreadable}"
+    if fault:
+        return Unusable.NOT_CONNECTED, fault
+    return Unusable.NOTHING_YET, f"no transform came yet{'' if heard.present else ', and no monitor is seen'}"
+
+
+def _unknown(message: TransformMessage) -> _Refusal | None:
+    if message.verdict is not Verdict.UNKNOWN:
+        return None
+    return Unusable.UNKNOWN, f"the monitor has no transform: {message.reason or message.state}"
+
+
+def _too_old(heard: Heard, age_s: float, policy: Policy) -> _Refusal | None:
+    if age_s <= policy.max_age_s:
+        return None
+    since = f"; what came since can't be read: {heard.unreadable}" if heard.unreadable else ""
+    return Unusable.STALE, f"the newest transform is {age_s:.3g} s old, allowed are {policy.max_age_s:g} s{since}"
+
+
+def _against_policy(message: TransformMessage, policy: Policy) -> _Refusal | None:
+    if message.verdict is Verdict.SUSPECT and not policy.accept_suspect:
+        return Unusable.SUSPECT, f"the transform is suspect: {message.reason or message.state}"
+    if policy.max_sigma_m is not None and (sigma_m := largest_sigma_m(message.covariance)) > policy.max_sigma_m:
+        return (
+            Unusable.UNCERTAIN,
+            f"the transform is certain to {1e3 * sigma_m:.3g} mm, allowed are {1e3 * policy.max_sigma_m:g} mm",
+        )
+    return None

@@ -1,0 +1,144 @@
+"""The newest transform of one monitor, for programs that move by it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Self
+
+import zenoh
+
+from gripmon.client.inbox import Entry, Inbox
+from gripmon.client.iterators import AsyncReadings, Readings
+from gripmon.client.judging import judge
+from gripmon.client.names import monitor_name
+from gripmon.client.reading import NotUsable, Policy, Reading
+from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link, PublishSettings
+
+
+class TransformClient:
+    """Hears one monitor.  Any thread may call any method.
+
+    It may start before the monitor and the router, and needs no help when they end and come again.  With a ``with``
+    statement or :meth:`close` it leaves the network.
+    """
+
+    def __init__(
+        self,
+        robot: str,
+        camera: str | None = None,
+        *,
+        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        zenoh_config_file: str | None = None,
+        policy: Policy | None = None,
+        depth: int = 1,
+    ) -> None:
+        """``camera`` may be left out while the robot has one; with a second one no reading is usable, and says so.
+
+        ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
+        ``depth`` is how many readings wait for each iterator or callback that is slower than the camera: 1 gives it
+        always the newest.  Raises ValueError for a name that can't be part of a key or a ``depth`` below 1, and
+        :class:`gripmon.wire.PublishError` for a bad configuration; that nobody answers is no error.
+        """
+        if depth < 1:
+            raise ValueError(f"depth is {depth}; give 1 or more")
+        self.policy = policy if policy is not None else Policy()
+        self.keys = Keys(robot, camera if camera is not None else "*")
+        self._depth = depth
+        self._inbox = Inbox()
+        self._threads: list[threading.Thread] = []
+        self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
+        if zenoh_config_file is not None:
+            settings = PublishSettings(zenoh_config=zenoh_config_file)
+        else:
+            settings = PublishSettings(listen=(), connect=tuple(connect))
+        self._link = Link(settings)
+        self._link.attach(self._declare)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def latest(self) -> Reading:
+        """The newest transform and whether it may be used now, at once: without a lock, a system call or an error."""
+        heard = self._inbox.heard
+        return judge(heard, heard.entry, self.policy, time.monotonic(), time.time_ns(), self._link.fault())
+
+    def require(self) -> Reading:
+        """As :meth:`latest`, but raises :class:`NotUsable` unless the policy allows the transform."""
+        reading = self.latest()
+        if not reading.usable:
+            raise NotUsable(reading)
+        return reading
+
+    def __iter__(self) -> Readings:
+        """Each reading as it comes, and one that refuses the last as soon as it holds no longer; ends with the client.
+
+        Every iterator has a queue of its own.
+        """
+        readings = Readings(self, self._depth)
+        self._inbox.join(readings)
+        return readings
+
+    def __aiter__(self) -> AsyncReadings:
+        """The same for asyncio; to be called while its loop runs."""
+        readings = AsyncReadings(self, self._depth)
+        self._inbox.join(readings)
+        return readings
+
+    def on_transform(self, callback: Callable[[Reading], None]) -> None:
+        """Call back with every reading that an iterator would give, in a thread of its own, until the client is closed.
+
+        An exception in the callback ends its thread and goes to ``threading.excepthook``.
+        """
+        readings = iter(self)
+
+        def pump() -> None:
+            for reading in readings:
+                callback(reading)
+
+        thread = threading.Thread(target=pump, name="gripmon-client", daemon=True)
+        self._threads.append(thread)
+        thread.start()
+
+    @property
+    def unreadable(self) -> int:
+        """How many messages could not be read; what was wrong with them is in the log, once."""
+        return self._inbox.unreadable
+
+    @property
+    def closed(self) -> bool:
+        return self._inbox.heard.closed
+
+    def close(self) -> None:
+        """Leave the network: iterations and callbacks end, nothing is usable.  Calling it twice does nothing more."""
+        self._inbox.close()
+        self._link.close()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
+
+    def judge(self, entry: Entry) -> Reading:
+        """The reading of a message, as of now."""
+        return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._link.fault())
+
+    def _declare(self, session: zenoh.Session) -> None:
+        # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
+        transforms = zenoh.handlers.Callback(self._receive, indirect=False)
+        tokens = zenoh.handlers.Callback(self._see, indirect=False)
+        self._declared = (
+            session.declare_subscriber(self.keys["transform"], transforms),
+            session.liveliness().declare_subscriber(self.keys["alive"], tokens, history=True),
+        )
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.PUT:
+            arrival_s = time.monotonic()
+            self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s)
+
+    def _see(self, token: zenoh.Sample) -> None:
+        seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
+        seen(monitor_name(token.key_expr))
