@@ -77,6 +77,14 @@ class Kept(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     state: MonitorState
 
 
+class _State(MonitorState, frozen=True, forbid_unknown_fields=True):
+    """As it is read from a file, where a field that isn't known here would be lost with the next write."""
+
+
+class _Read(Kept, frozen=True, forbid_unknown_fields=True):
+    state: _State
+
+
 class _Envelope(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sha256: str
     content: msgspec.Raw
@@ -103,7 +111,8 @@ def default_path(robot: str, camera: str) -> Path:
 def calibration_of(lens: LensSettings, gripper: GripperModel, reference: ReferenceRecord) -> Calibration:
     """Digests of the values, not of the files: a comment more or less changes nothing."""
     start = msgspec.structs.replace(reference, revision=0, stamp_ns=0)
-    return Calibration(*(hashlib.sha256(msgspec.json.encode(part)).hexdigest()[:16] for part in (lens, gripper, start)))
+    values = (lens, gripper, msgspec.structs.asdict(start))  # the reference without the name of its message
+    return Calibration(*(hashlib.sha256(msgspec.json.encode(part)).hexdigest()[:16] for part in values))
 
 
 def pack(owner: Owner, state: MonitorState) -> bytes:
@@ -125,9 +134,10 @@ def unpack(data: bytes) -> Kept:
         version = msgspec.json.decode(content, type=_Format).format
         if version != FORMAT:
             raise ValueError(f"it has format {version}, and this version of gripmon reads format {FORMAT}")
-        kept = msgspec.json.decode(content, type=Kept)
+        read = msgspec.json.decode(content, type=_Read)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ValueError(f"its content is no state: {error}") from None
+    kept = Kept(read.format, read.owner, MonitorState(**msgspec.structs.asdict(read.state)))
     if fault := state_fault(kept.state):
         raise ValueError(f"its content contradicts itself: {fault}")
     return kept

@@ -5,13 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 
-import msgspec
 import pytest
 from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
 from published import Published
 
 from gripmon.client import Client, MonitorName
-from gripmon.records import FrameRecord
+from gripmon.records import FrameRecord, MessageRefused
 from gripmon.wire import PublishError, PublishSettings
 
 
@@ -147,7 +146,7 @@ def test_a_message_that_is_no_record_is_an_error(publisher: Published, client: C
         def broken() -> bool:
             try:
                 client.latest()
-            except msgspec.DecodeError:
+            except MessageRefused:
                 return True
             return False
 

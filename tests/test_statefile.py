@@ -151,7 +151,7 @@ def packed(**changes: object) -> bytes:
         ({"state__references__1__cam_T_grip__rotation_xyzw": [0.5, 0.5, 0.5, 0.6]}, "no pose"),
         ({"state__references__1__cam_T_grip__translation_m": [0.1, 0.2]}, "Expected `array` of length 3"),
         ({"state__references__1__revision": 7}, "revision 2 follows revision 7"),
-        ({"state__references__1__cause": "magic"}, "Invalid enum value 'magic'"),
+        ({"state__alerts__0__alert__severity": "magic"}, "Invalid enum value 'magic'"),
         ({"state__references": []}, "no reference at all"),
         ({"state__proposal__revision": 3}, "revision 3 follows revision 3"),
         ({"state__alerts_raised": 0}, "1 open alerts of 0 that were raised"),

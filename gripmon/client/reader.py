@@ -19,10 +19,11 @@ from gripmon.records import (
     FrameRecord,
     ReferenceRecord,
     StateRecord,
+    from_json,
 )
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
 
-_T = TypeVar("_T")
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 
 class NotCarriedOut(Exception):
@@ -63,7 +64,6 @@ class Client:
         else:
             settings = PublishSettings(listen=(), connect=tuple(connect))
         self._session = open_session(zenoh_config(settings), settings)
-        self._decode = msgspec.json.Decoder(FrameRecord).decode
         self._depth = depth
         self._heard: MonitorName | None = None
         self._newest: FrameRecord | None = None
@@ -79,8 +79,8 @@ class Client:
     def latest(self) -> FrameRecord | None:
         """The newest record, at once; the same one again while no newer one came; None before the first.
 
-        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises msgspec.DecodeError for a message that is no
-        record.
+        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises :class:`gripmon.records.MessageRefused` for
+        a message that is no record, or one of a major version that isn't known here.
         """
         newest: zenoh.Sample | None = None
         while (sample := self._samples.try_recv()) is not None:
@@ -132,9 +132,9 @@ class Client:
             Keys(*monitor)[f"cmd/{name.value}"], payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL
         ):
             if reply.ok is not None:
-                return msgspec.json.decode(reply.ok.payload.to_bytes(), type=CommandReply)
+                return from_json(reply.ok.payload.to_bytes(), CommandReply)
             assert reply.err is not None
-            error = msgspec.json.decode(reply.err.payload.to_bytes(), type=CommandError)
+            error = from_json(reply.err.payload.to_bytes(), CommandError)
             raise NotCarriedOut(f"{monitor}: {error.text}", error.error)
         raise NotCarriedOut(f"{monitor} doesn't answer; it may be told not to take commands (publish.commands)")
 
@@ -154,14 +154,14 @@ class Client:
 
     def _record(self, sample: zenoh.Sample) -> FrameRecord:
         self._check_name(sample.key_expr)
-        return self._decode(sample.payload.to_bytes())
+        return from_json(sample.payload.to_bytes(), FrameRecord)
 
     def _get(self, leaf: str, record_type: type[_T], timeout_s: float) -> _T | None:
         answer: _T | None = None
         for reply in self._session.get(self.keys[leaf], timeout=timeout_s):
             if reply.ok is not None:
                 self._check_name(reply.ok.key_expr)
-                answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=record_type)
+                answer = from_json(reply.ok.payload.to_bytes(), record_type)
         return answer
 
     def _only_one(self, timeout_s: float) -> MonitorName:

@@ -17,11 +17,10 @@ and an advanced subscriber with history (``zenoh.ext``).
 from __future__ import annotations
 
 from gripmon.publish.commands import PendingCommand, ZenohCommands
-from gripmon.publish.jaw import JawReading, ZenohJaw
+from gripmon.publish.jaw import ZenohJaw
 from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
 
 __all__ = [
-    "JawReading",
     "NullPublisher",
     "PendingCommand",
     "Publisher",

@@ -6,10 +6,19 @@ import logging
 import threading
 from collections import deque
 
-import msgspec
 import zenoh
 
-from gripmon.records import Command, CommandError, CommandFault, CommandName, CommandReply, to_json
+from gripmon.records import (
+    Command,
+    CommandError,
+    CommandFault,
+    CommandName,
+    CommandReply,
+    CommandRequest,
+    MessageRefused,
+    from_json,
+    to_json,
+)
 from gripmon.wire import Keys, Link
 
 _log = logging.getLogger(__name__)
@@ -17,12 +26,6 @@ _log = logging.getLogger(__name__)
 _WAITING_MOST = 16
 TIMEOUT_S = 2.0
 """So long the loop has for a command; then the asker is told that it has not answered."""
-
-
-class _Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The payload of a command; none at all is an empty argument."""
-
-    argument: str = ""
 
 
 class PendingCommand:
@@ -131,10 +134,9 @@ def _command(keys: Keys, key: str, payload: zenoh.ZBytes | None) -> Command | Co
         return CommandError(CommandFault.UNKNOWN, text)
     data = b"" if payload is None else payload.to_bytes()
     try:
-        request = msgspec.json.decode(data, type=_Request) if data else _Request()
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        text = f'the payload is not {{"argument": "…"}}, in JSON: {error}'
-        return CommandError(CommandFault.MALFORMED, text)
+        request = from_json(data, CommandRequest) if data else CommandRequest()
+    except MessageRefused as error:
+        return CommandError(CommandFault.MALFORMED, f'{error}; a payload is {{"argument": "…"}}, or none')
     return Command(known, request.argument)
 
 

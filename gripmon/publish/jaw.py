@@ -6,19 +6,12 @@ import logging
 import threading
 import time
 
-import msgspec
 import zenoh
 
+from gripmon.records import JawReading, MessageRefused, from_json
 from gripmon.wire import Link
 
 _log = logging.getLogger(__name__)
-
-
-class JawReading(msgspec.Struct, frozen=True):
-    """One message on the ``jaw`` key."""
-
-    stamp_ns: int
-    opening_m: float
 
 
 class ZenohJaw:
@@ -34,7 +27,6 @@ class ZenohJaw:
         self._key = key
         self._max_age_s = link.settings.jaw_max_age_s
         self._subscriber: zenoh.Subscriber[None] | None = None
-        self._decode = msgspec.json.Decoder(JawReading).decode
         self._lock = threading.Lock()  # guards what follows, and `malformed`, against Zenoh's thread
         self._newest: JawReading | None = None
         self._arrival_s = 0.0
@@ -67,8 +59,8 @@ class ZenohJaw:
     def _receive(self, sample: zenoh.Sample) -> None:
         arrival_s = time.monotonic()
         try:
-            reading = self._decode(sample.payload.to_bytes())
-        except msgspec.DecodeError as error:
+            reading = from_json(sample.payload.to_bytes(), JawReading)
+        except MessageRefused as error:
             with self._lock:
                 self.malformed += 1
                 first = self.malformed == 1

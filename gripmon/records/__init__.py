@@ -13,7 +13,7 @@ exp(omega) R``.
 from __future__ import annotations
 
 from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
-from gripmon.records.commands import Command, CommandError, CommandFault, CommandName, CommandReply
+from gripmon.records.commands import Command, CommandError, CommandFault, CommandName, CommandReply, CommandRequest
 from gripmon.records.evidence import EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
     CornerFault,
@@ -27,12 +27,14 @@ from gripmon.records.frames import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.records.messages import AlertRecord, StateRecord
+from gripmon.records.messages import AlertRecord, JawReading, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
+from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.records.values import Array, Drift, Image, Smoothed, Transform, to_json
 
 __all__ = [
+    "MESSAGES",
     "Alert",
     "AlertEvent",
     "AlertKind",
@@ -45,6 +47,7 @@ __all__ = [
     "CommandFault",
     "CommandName",
     "CommandReply",
+    "CommandRequest",
     "CornerFault",
     "CornerRecord",
     "Creep",
@@ -55,7 +58,9 @@ __all__ = [
     "Frame",
     "FrameRecord",
     "Image",
+    "JawReading",
     "MeasurementTrace",
+    "MessageRefused",
     "MonitorState",
     "Motion",
     "OpenAlert",
@@ -70,6 +75,9 @@ __all__ = [
     "Transform",
     "Verdict",
     "Vibration",
+    "from_json",
+    "largest_bytes",
+    "schema_name",
     "to_json",
     "unmeasured_record",
 ]

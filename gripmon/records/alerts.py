@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import enum
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
+
+from gripmon.records.values import OpenEnum
 
 
 class Severity(enum.StrEnum):
+    """How bad it is."""
+
     INFO = "info"
     WARNING = "warning"
     ERROR = "error"
 
 
-class Cause(enum.StrEnum):
+class Cause(OpenEnum):
     """What an alert believes to have happened."""
 
     CAMERA_MOUNT = "camera_mount_moved"
@@ -29,7 +35,7 @@ class Cause(enum.StrEnum):
     UNKNOWN = "unknown"
 
 
-class AlertKind(enum.StrEnum):
+class AlertKind(OpenEnum):
     """What an alert is about."""
 
     STEP = "step"
@@ -60,41 +66,41 @@ class AlertEvent(enum.StrEnum):
 
 
 class CauseWeight(msgspec.Struct, frozen=True):
-    """How probable a cause is; ``part`` is the finger's name in the gripper file where the cause is a finger's."""
+    """How probable a cause is."""
 
     cause: Cause
-    probability: float
-    part: str | None = None
+    probability: Annotated[float, Meta(description="0 to 1; those of one alert add up to 1")]
+    part: Annotated[str | None, Meta(description="the finger's name in the gripper file; null for other causes")] = None
 
 
 class Alert(msgspec.Struct, frozen=True):
-    """One event in the life of an alert.
-
-    ``alert_id`` is the same from ``raised`` to ``cleared``; empty for what is only noted.  ``causes`` are all that were
-    weighed, the most probable first: the first is ``cause`` unless none of them is probable enough.  A creep has a
-    ``rate_m_per_min`` of the TCP and, towards a limit, ``time_left_s`` until it is reached.
-    """
+    """One event in the life of an alert."""
 
     kind: AlertKind
-    cause: Cause
+    cause: Annotated[Cause, Meta(description="the most probable cause; unknown while none is probable enough")]
     severity: Severity
-    text: str
+    text: Annotated[str, Meta(description="one line for a person")]
     event: AlertEvent = AlertEvent.NOTED
-    alert_id: str = ""
-    part: str | None = None
-    causes: tuple[CauseWeight, ...] = ()
-    tcp_shift_m: tuple[float, float, float] | None = None
-    rotation_rad: float | None = None
-    rate_m_per_min: float | None = None
-    time_left_s: float | None = None
-    since_ns: int | None = None
-    acknowledged: bool = False
+    alert_id: Annotated[str, Meta(description="the same from raised to cleared; empty for what is only noted")] = ""
+    part: Annotated[str | None, Meta(description="the finger that cause is about; null for other causes")] = None
+    causes: Annotated[tuple[CauseWeight, ...], Meta(description="all that were weighed, the most probable first")] = ()
+    tcp_shift_m: Annotated[
+        tuple[float, float, float] | None,
+        Meta(description="of the TCP against the reference along the camera's x, y, z, m; null: not about a motion"),
+    ] = None
+    rotation_rad: Annotated[float | None, Meta(description="turn against the reference, rad; null likewise")] = None
+    rate_m_per_min: Annotated[
+        float | None, Meta(description="speed of the TCP in a creep, m/min; null for all else")
+    ] = None
+    time_left_s: Annotated[
+        float | None, Meta(description="until a creep reaches the limit, s; null for all else, or away from it")
+    ] = None
+    since_ns: Annotated[int | None, Meta(description="when it was raised, Unix ns; null for what is only noted")] = None
+    acknowledged: Annotated[bool, Meta(description="an operator has taken note of it")] = False
 
 
 class OpenAlert(msgspec.Struct, frozen=True):
-    """An alert that was raised and not cleared yet, as it is kept over a restart: ``topic`` is what it is about, of
-    which there is one at a time, ``alert`` what was said of it last.
-    """
+    """An alert that was raised and not cleared yet."""
 
-    topic: str
-    alert: Alert
+    topic: Annotated[str, Meta(description="what it is about; of one topic there is one at a time")]
+    alert: Annotated[Alert, Meta(description="what was said of it last")]

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import enum
+from typing import Annotated
 
 import msgspec
+from msgspec import Meta
 
 from gripmon.records.references import MonitorState
+from gripmon.records.values import OpenEnum
 
 
 class CommandName(enum.StrEnum):
@@ -30,21 +33,34 @@ class Command(msgspec.Struct, frozen=True):
     argument: str = ""
 
 
-class CommandReply(msgspec.Struct, frozen=True):
-    """``done`` or refused, and why, in ``text``; then nothing has changed.  The reference in force afterwards.
+class CommandRequest(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schema", tag="gripmon.command/1"
+):
+    """The payload of a command, whose name is the last part of the key; none at all is an empty argument.
 
-    ``monitor`` answers ``state``: all references and proposals that other commands may name, and the open alerts.
+    A field that the monitor doesn't know is refused: what it can't honour it must not carry out.
     """
 
+    argument: Annotated[
+        str, Meta(max_length=256, description="the reference, proposal or alert that is meant; empty: see the command")
+    ] = ""
+
+
+class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reply/1"):
+    """The monitor's answer to a command."""
+
     name: CommandName
-    done: bool
-    text: str
-    reference_id: str
-    revision: int
-    monitor: MonitorState | None = None
+    done: Annotated[bool, Meta(description="false: refused, and nothing has changed")]
+    text: Annotated[str, Meta(description="what was done, or why not, in one line for a person")]
+    reference_id: Annotated[str, Meta(description="the reference in force afterwards")]
+    revision: Annotated[int, Meta(description="of the reference in force afterwards")]
+    monitor: Annotated[
+        MonitorState | None,
+        Meta(description="answers state: references, a proposal, open alerts, by which commands name them; else null"),
+    ] = None
 
 
-class CommandFault(enum.StrEnum):
+class CommandFault(OpenEnum):
     """Why a command did not reach the monitor, or nothing is known of what became of it."""
 
     UNKNOWN = "unknown_command"
@@ -56,10 +72,8 @@ class CommandFault(enum.StrEnum):
     INTERNAL = "internal_error"
 
 
-class CommandError(msgspec.Struct, frozen=True):
-    """The answer in place of a :class:`CommandReply` to a command that was not carried out, or perhaps was: see
-    ``text``.
-    """
+class CommandError(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.error/1"):
+    """The answer in place of a reply: the command was not carried out, or perhaps was; the text says which."""
 
     error: CommandFault
-    text: str
+    text: Annotated[str, Meta(description="what went wrong, in one line for a person")]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
+from msgspec import Meta
 
 from gripmon.records.alerts import Alert
 from gripmon.records.references import ReferenceRecord
-from gripmon.records.values import Array, Drift, Image, Smoothed, Transform
+from gripmon.records.values import Array, Covariance, Drift, Image, OpenEnum, Smoothed, Transform
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,7 +26,7 @@ class Verdict(enum.StrEnum):
     UNKNOWN = "unknown"
 
 
-class State(enum.StrEnum):
+class State(OpenEnum):
     """What the monitor is doing."""
 
     ACQUIRING = "acquiring"
@@ -37,7 +38,7 @@ class State(enum.StrEnum):
     STALE = "stale"
 
 
-class Origin(enum.StrEnum):
+class Origin(OpenEnum):
     """How the transform of a frame came about (``source`` on the wire)."""
 
     UPDATE = "update"
@@ -59,7 +60,7 @@ class Refusal(enum.StrEnum):
     FROZEN = "frozen"
 
 
-class CornerFault(enum.StrEnum):
+class CornerFault(OpenEnum):
     """Why a corner was not measured, or not used."""
 
     OUTSIDE = "outside"
@@ -91,38 +92,47 @@ class Frame:
 
 
 class CornerRecord(msgspec.Struct, frozen=True):
-    """A corner in one frame: where it was measured (None if it was not), its standard deviation in px (the larger
-    axis).
-    """
+    """A corner of a fingertip in one frame."""
 
-    id: str
-    uv_px: tuple[float, float] | None
-    sigma_px: float | None
-    used: bool
-    reason: CornerFault | None = None
+    id: Annotated[str, Meta(description="its name in the gripper file")]
+    uv_px: Annotated[
+        tuple[float, float] | None,
+        Meta(description="column and row where it was measured, px; the first pixel's centre is 0; null if it was not"),
+    ]
+    sigma_px: Annotated[float | None, Meta(description="standard deviation along its larger axis, px; null likewise")]
+    used: Annotated[bool, Meta(description="the transform rests on it, too")]
+    reason: Annotated[CornerFault | None, Meta(description="why it was not measured or used; null if it was")] = None
 
 
-class FrameRecord(msgspec.Struct, frozen=True):
+class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.transform/1"):
     """What the monitor decided about one frame; the ``transform`` message and one line of ``replay``."""
 
-    seq: int
-    stamp_ns: int
+    seq: Annotated[int, Meta(description="number of the frame; one that is missing was dropped")]
+    stamp_ns: Annotated[int, Meta(description="time of the capture, Unix ns")]
     verdict: Verdict
     state: State
     source: Origin
-    cam_T_grip: Transform | None
-    covariance: tuple[float, ...] | None
-    smoothed: Smoothed | None
-    drift: Drift | None
-    reference_id: str
-    revision: int
-    rms_px: float | None
-    jaw_opening_m: float | None
-    corners: tuple[CornerRecord, ...]
-    alerts: tuple[Alert, ...]
-    latency_ns: int = 0
-    reason: str | None = None
-    name: str = ""
+    cam_T_grip: Annotated[Transform | None, Meta(description="null where there is nothing to stand by")]
+    covariance: Annotated[Covariance | None, Meta(description="of cam_T_grip, null with it; a held one grows")]
+    smoothed: Annotated[Smoothed | None, Meta(description="averaged over time; null where nothing is averaged")]
+    drift: Annotated[Drift | None, Meta(description="of cam_T_grip against the reference; null with it")]
+    reference_id: Annotated[str, Meta(description="the reference that drift is measured against")]
+    revision: Annotated[int, Meta(description="of the reference; it never names two different ones")]
+    rms_px: Annotated[
+        float | None,
+        Meta(
+            description="root mean square distance of measured corners from where the transform puts them, px; null: "
+            "none was measured"
+        ),
+    ]
+    jaw_opening_m: Annotated[
+        float | None, Meta(description="as the image shows it, the reported one considered, m; null if not measured")
+    ]
+    corners: Annotated[tuple[CornerRecord, ...], Meta(description="all of the gripper file, in its order")]
+    alerts: Annotated[tuple[Alert, ...], Meta(description="what this frame raised, updated or cleared")]
+    latency_ns: Annotated[int, Meta(description="from handed over to judged, ns; 0 in a replay")] = 0
+    reason: Annotated[str | None, Meta(description="why nothing was measured; null when all is well")] = None
+    name: Annotated[str, Meta(description="file or stream that the frame came from")] = ""
 
 
 @dataclass(frozen=True, slots=True)

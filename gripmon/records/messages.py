@@ -2,41 +2,51 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
 
 from gripmon.records.alerts import Alert
 from gripmon.records.frames import State, Verdict
 
 
-class StateRecord(msgspec.Struct, frozen=True):
-    """The ``state`` message: 1 Hz and on every change."""
+class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.state/1"):
+    """The ``state`` message: once a second and on every change."""
 
-    robot: str
-    camera: str
+    robot: Annotated[str, Meta(description="second part of the monitor's keys")]
+    camera: Annotated[str, Meta(description="third part of the monitor's keys")]
     state: State
-    verdict: Verdict
-    stamp_ns: int
-    seq: int
-    reference_id: str
-    revision: int
-    frames: int
-    frames_refused: int
-    frames_dropped: int
-    frames_per_s: float
-    uptime_s: float
-    camera_connected: bool
-    recording_dropped: int
-    message: str
-    version: str
+    verdict: Annotated[Verdict, Meta(description="of the last transform; unknown while no frames come")]
+    stamp_ns: Annotated[int, Meta(description="when it was said, Unix ns")]
+    seq: Annotated[int, Meta(description="the last frame's; -1 before the first")]
+    reference_id: Annotated[str, Meta(description="the reference in force")]
+    revision: Annotated[int, Meta(description="of the reference in force")]
+    frames: Annotated[int, Meta(description="handled since the start")]
+    frames_refused: Annotated[int, Meta(description="of these, how many couldn't be measured at all")]
+    frames_dropped: Annotated[int, Meta(description="that came while another one was worked on")]
+    frames_per_s: Annotated[float, Meta(description="rate of the last frames, 1/s; 0 while none come")]
+    uptime_s: Annotated[float, Meta(description="since the start, s")]
+    camera_connected: Annotated[bool, Meta(description="the source is open")]
+    recording_dropped: Annotated[int, Meta(description="frames that the recording had no time for")]
+    message: Annotated[str, Meta(description="what is wrong, in words; empty when all is well")]
+    version: Annotated[str, Meta(description="of gripmon")]
 
 
-class AlertRecord(Alert, frozen=True, kw_only=True):
+class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
     """The ``alert`` message: one alert with the frame and the state that it belongs to."""
 
-    robot: str
-    camera: str
-    seq: int
-    stamp_ns: int
+    robot: Annotated[str, Meta(description="second part of the monitor's keys")]
+    camera: Annotated[str, Meta(description="third part of the monitor's keys")]
+    seq: Annotated[int, Meta(description="of the frame that it belongs to, or the last one before it; -1: none yet")]
+    stamp_ns: Annotated[int, Meta(description="of that frame, or when it was said, Unix ns")]
     state: State
-    reference_id: str
-    revision: int
+    reference_id: Annotated[str, Meta(description="the reference in force")]
+    revision: Annotated[int, Meta(description="of the reference in force")]
+
+
+class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
+    """The ``jaw`` message, which the robot writes."""
+
+    stamp_ns: Annotated[int, Meta(description="when it was measured, Unix ns; 0 if that isn't known")]
+    opening_m: Annotated[float, Meta(description="distance of the jaws as the gripper file counts it, m")]

@@ -2,59 +2,68 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import msgspec
+from msgspec import Meta
 
 from gripmon.records.alerts import Cause, OpenAlert
-from gripmon.records.values import Transform
+from gripmon.records.values import Covariance, Transform
 
 
 class ReferenceInputs(msgspec.Struct, frozen=True):
-    """What a reference was made of: the frames ``first_seq`` to ``last_seq``, their number, the corners' names, the
-    weighted rms of their residuals (1 if their covariances hold), and by how much it moved the reference before it.
-    """
+    """What a reference was made of."""
 
-    first_seq: int
-    last_seq: int
-    frames: int
-    corners: tuple[str, ...]
-    weighted_rms: float
-    step_m: float
-    step_rad: float
+    first_seq: Annotated[int, Meta(description="the first frame that was averaged")]
+    last_seq: Annotated[int, Meta(description="the last one")]
+    frames: Annotated[int, Meta(description="how many of them were used")]
+    corners: Annotated[tuple[str, ...], Meta(description="names of the corners that it rests on")]
+    weighted_rms: Annotated[float, Meta(description="of the residuals over their deviations: 1 if covariances hold")]
+    step_m: Annotated[float, Meta(description="by how much it moved the reference before it, m")]
+    step_rad: Annotated[float, Meta(description="by how much it turned it, rad")]
 
 
-class ReferenceRecord(msgspec.Struct, frozen=True):
-    """The calibration that drift is measured against; the ``reference`` message.
-
-    ``revision`` grows by one with every change and is never used twice.  ``parent`` is the reference that was in force
-    before; ``restores`` the earlier one whose transform an undo brought back; ``cause`` what made it necessary;
-    ``accepted_by`` who let it in: ``configuration``, ``monitor`` or ``operator``.
-    """
+class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reference/1"):
+    """The calibration that drift is measured against; the ``reference`` message."""
 
     reference_id: str
-    revision: int
-    stamp_ns: int
-    origin: str
+    revision: Annotated[int, Meta(description="grows by one with every change and is never used twice")]
+    stamp_ns: Annotated[
+        int,
+        Meta(description="of the newest frame behind it or of the command, Unix ns; 0: configured"),
+    ]
+    origin: Annotated[str, Meta(description="configuration, recalibration, undo or reset")]
     cam_T_grip: Transform
-    covariance: tuple[float, ...]
-    parent: str | None = None
-    restores: str | None = None
-    cause: Cause = Cause.UNKNOWN
-    accepted_by: str = "configuration"
-    inputs: ReferenceInputs | None = None
+    covariance: Covariance
+    parent: Annotated[str | None, Meta(description="the reference in force before; null for the first")] = None
+    restores: Annotated[
+        str | None, Meta(description="the earlier one whose transform an undo or reset brought back; else null")
+    ] = None
+    cause: Annotated[Cause, Meta(description="what made it necessary")] = Cause.UNKNOWN
+    accepted_by: Annotated[str, Meta(description="who let it in: configuration, monitor or operator")] = "configuration"
+    inputs: Annotated[
+        ReferenceInputs | None, Meta(description="what it was measured from; null if it was not measured here")
+    ] = None
 
 
-class MonitorState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What survives a restart.
+class MonitorState(msgspec.Struct, frozen=True):
+    """What survives a restart."""
 
-    ``references`` from the configured one to the one in force, ``proposal`` a new one that waits for an operator,
-    ``alerts`` those that are open, ``alerts_raised`` how many there were: it numbers the next one.  ``cam_T_grip`` is
-    the last transform that was measured, None if none was; ``reference_error`` (6) what of a
-    shift against the configured reference was there from the start, None if that isn't known.
-    """
-
-    references: tuple[ReferenceRecord, ...]
-    proposal: ReferenceRecord | None = None
-    alerts: tuple[OpenAlert, ...] = ()
-    alerts_raised: int = 0
-    cam_T_grip: Transform | None = None
-    reference_error: tuple[float, ...] | None = None
+    references: Annotated[
+        tuple[ReferenceRecord, ...], Meta(description="from the configured one to the one in force, the newest 1000")
+    ]
+    proposal: Annotated[
+        ReferenceRecord | None, Meta(description="a new reference that waits for an operator; null if there is none")
+    ] = None
+    alerts: Annotated[tuple[OpenAlert, ...], Meta(description="those that are open")] = ()
+    alerts_raised: Annotated[int, Meta(description="how many there were: it numbers the next one")] = 0
+    cam_T_grip: Annotated[
+        Transform | None, Meta(description="the last transform that was measured; null if none was")
+    ] = None
+    reference_error: Annotated[
+        tuple[float, ...] | None,
+        Meta(
+            description="6 numbers, m and rad: what of a shift against the configured reference was there from the "
+            "start; null if that isn't known"
+        ),
+    ] = None

@@ -1,10 +1,12 @@
-"""Arrays, poses, and JSON."""
+"""Arrays, poses, names that may become more, and JSON."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import enum
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import msgspec
+from msgspec import Meta
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,10 +17,38 @@ if TYPE_CHECKING:
 else:  # these are for annotations alone: who only reads messages needn't load NumPy
     Array = Image = Any
 
+Translation = Annotated[tuple[float, float, float], Meta(description="x, y, z of the TCP in camera axes, m")]
+Rotation = Annotated[
+    tuple[float, float, float, float], Meta(description="unit quaternion x, y, z, w, gripper to camera")
+]
+Covariance = Annotated[
+    tuple[float, ...],
+    Meta(
+        min_length=36,
+        max_length=36,
+        description="6 x 6, row by row: the TCP's position error in camera axes (m), then the rotation error vector in "
+        "camera axes (rad); entries in m², m rad, rad²",
+    ),
+]
+
+
+class OpenEnum(enum.StrEnum):
+    """Names that later versions may have more of: one that isn't known here is kept as it came."""
+
+    @classmethod
+    def _missing_(cls, value: object) -> Self | None:
+        if not isinstance(value, str):
+            return None
+        unknown = str.__new__(cls, value)
+        unknown._name_ = unknown._value_ = value
+        return unknown
+
 
 class Transform(msgspec.Struct, frozen=True):
-    translation_m: tuple[float, float, float]
-    rotation_xyzw: tuple[float, float, float, float]
+    """``cam_T_grip``: from gripper to camera coordinates, the gripper's origin at the TCP."""
+
+    translation_m: Translation
+    rotation_xyzw: Rotation
 
 
 class Drift(msgspec.Struct, frozen=True):
@@ -26,15 +56,19 @@ class Drift(msgspec.Struct, frozen=True):
     frame.
     """
 
-    translation_m: float
-    rotation_rad: float
-    tcp_shift_m: tuple[float, float, float]
+    translation_m: Annotated[float, Meta(description="d: length of the camera's displacement, m")]
+    rotation_rad: Annotated[float, Meta(description="delta: the camera's turn, rad")]
+    tcp_shift_m: Annotated[
+        tuple[float, float, float], Meta(description="displacement of the TCP along the camera's x, y, z, m")
+    ]
 
 
 class Smoothed(msgspec.Struct, frozen=True):
-    translation_m: tuple[float, float, float]
-    rotation_xyzw: tuple[float, float, float, float]
-    covariance: tuple[float, ...]
+    """The transform averaged over time."""
+
+    translation_m: Translation
+    rotation_xyzw: Rotation
+    covariance: Covariance
 
 
 _encoder = msgspec.json.Encoder()

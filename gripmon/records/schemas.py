@@ -1,0 +1,81 @@
+"""The messages by name, reading one that may come from anybody, and their JSON Schema.
+
+A message says its schema and that one's major version, ``"schema": "gripmon.transform/1"``.  Within a major version
+fields and names (:class:`gripmon.records.values.OpenEnum`) may be added; a reader passes over what it doesn't know.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TypeVar
+
+import msgspec
+
+from gripmon.records.commands import CommandError, CommandReply, CommandRequest
+from gripmon.records.frames import FrameRecord
+from gripmon.records.messages import AlertRecord, JawReading, StateRecord
+from gripmon.records.references import ReferenceRecord
+
+_T = TypeVar("_T", bound=msgspec.Struct)
+
+MESSAGES: dict[str, type[msgspec.Struct]] = {
+    "transform": FrameRecord,
+    "state": StateRecord,
+    "alert": AlertRecord,
+    "reference": ReferenceRecord,
+    "jaw": JawReading,
+    "command": CommandRequest,
+    "reply": CommandReply,
+    "error": CommandError,
+}
+"""Everything that goes over the wire."""
+
+LARGEST_BYTES: dict[type[msgspec.Struct], int] = {JawReading: 4096, CommandRequest: 4096, CommandReply: 64 << 20}
+_LARGEST_BYTES = 1 << 20  # of any other
+
+
+class MessageRefused(ValueError):
+    """A payload is not the message that it should be; the text says why, in one line."""
+
+
+class _Tag(msgspec.Struct, frozen=True):
+    schema: str = ""
+
+
+def from_json(payload: bytes, message: type[_T]) -> _T:
+    """The message in a payload from the network, of the type that is expected there.
+
+    Raises :class:`MessageRefused` for anything else, in particular for a major version that isn't known here.  Without
+    ``schema`` it counts as the version that is.
+    """
+    if len(payload) > largest_bytes(message):
+        raise MessageRefused(f"{len(payload)} bytes; at most {largest_bytes(message)}")
+    try:
+        return _decoder(message).decode(payload)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MessageRefused(_what_is_wrong(payload, message, error)) from None
+
+
+def largest_bytes(message: type[msgspec.Struct]) -> int:
+    """No message of this type is larger, in bytes of JSON."""
+    return LARGEST_BYTES.get(message, _LARGEST_BYTES)
+
+
+def schema_name(message: type[msgspec.Struct]) -> str:
+    """Its name on the wire with its major version, e.g. ``gripmon.transform/1``."""
+    return str(message.__struct_config__.tag)
+
+
+@functools.cache
+def _decoder(message: type[_T]) -> msgspec.json.Decoder[_T]:
+    return msgspec.json.Decoder(message)
+
+
+def _what_is_wrong(payload: bytes, message: type[msgspec.Struct], error: Exception) -> str:
+    try:
+        schema = msgspec.json.decode(payload, type=_Tag).schema
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        schema = ""
+    if schema and schema != (known := schema_name(message)):
+        return f"its schema is {schema[:80]!r}, and this version of gripmon reads {known!r}; update the older one"
+    return f"no message {schema_name(message)}: {str(error) or type(error).__name__}"
