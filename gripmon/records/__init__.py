@@ -27,7 +27,7 @@ from gripmon.records.frames import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.records.messages import AlertRecord, JawReading, StateRecord
+from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
@@ -56,6 +56,7 @@ __all__ = [
     "EdgeSums",
     "Explanation",
     "Frame",
+    "FrameNote",
     "FrameRecord",
     "Image",
     "JawReading",

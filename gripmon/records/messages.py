@@ -50,3 +50,30 @@ class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.j
 
     stamp_ns: Annotated[int, Meta(description="when it was measured, Unix ns; 0 if that isn't known")]
     opening_m: Annotated[float, Meta(description="distance of the jaws as the gripper file counts it, m")]
+
+
+Side = Annotated[int, Meta(ge=1, le=65535)]
+
+
+class FrameNote(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.frame/1"):
+    """What a driver attaches to a frame.  Raw pixels need ``width``, ``height`` and ``encoding``, files don't."""
+
+    stamp_ns: (
+        Annotated[
+            int, Meta(ge=0, le=2**63 - 1, description="when the image was captured, Unix ns; absent: Zenoh's time")
+        ]
+        | None
+    ) = None
+    jaw_opening_m: (
+        Annotated[float, Meta(ge=0.0, le=1.0, description="opening of the jaws at that time, m; absent: not known")]
+        | None
+    ) = None
+    width: Annotated[Side, Meta(description="pixels in a row")] | None = None
+    height: Annotated[Side, Meta(description="rows")] | None = None
+    encoding: (
+        Annotated[str, Meta(max_length=40, description="pixel format, named as in ROS: mono8, mono16, bgr8, rgb8, …")]
+        | None
+    ) = None
+    step: (
+        Annotated[int, Meta(ge=1, le=2**24, description="bytes from row to row; absent: no gap between rows")] | None
+    ) = None

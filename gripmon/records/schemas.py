@@ -13,7 +13,7 @@ import msgspec
 
 from gripmon.records.commands import CommandError, CommandReply, CommandRequest
 from gripmon.records.frames import FrameRecord
-from gripmon.records.messages import AlertRecord, JawReading, StateRecord
+from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
 from gripmon.records.references import ReferenceRecord
 
 _T = TypeVar("_T", bound=msgspec.Struct)
@@ -24,13 +24,19 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "alert": AlertRecord,
     "reference": ReferenceRecord,
     "jaw": JawReading,
+    "frame": FrameNote,
     "command": CommandRequest,
     "reply": CommandReply,
     "error": CommandError,
 }
 """Everything that goes over the wire."""
 
-LARGEST_BYTES: dict[type[msgspec.Struct], int] = {JawReading: 4096, CommandRequest: 4096, CommandReply: 64 << 20}
+LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
+    JawReading: 4096,
+    FrameNote: 4096,
+    CommandRequest: 4096,
+    CommandReply: 64 << 20,
+}
 _LARGEST_BYTES = 1 << 20  # of any other
 
 
