@@ -7,16 +7,17 @@ import threading
 import weakref
 from typing import NamedTuple, Protocol
 
-from gripmon.client.message import TransformMessage, Unreadable, transform_message
+from gripmon.client.message import transform_message
 from gripmon.client.names import MonitorName
+from gripmon.records import FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
 
 
 class Entry(NamedTuple):
-    """A message, who sent it, and when it arrived by the monotonic clock."""
+    """A record, who sent it, and when it arrived by the monotonic clock."""
 
-    message: TransformMessage
+    record: FrameRecord
     monitor: MonitorName
     arrival_s: float
 
@@ -55,7 +56,7 @@ class Inbox:
         """A message arrived."""
         try:
             entry = Entry(transform_message(payload), monitor, arrival_s)
-        except Unreadable as error:
+        except MessageRefused as error:
             self._refuse(monitor, str(error))
             return
         with self._lock:

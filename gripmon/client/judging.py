@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 from gripmon.client.inbox import Entry, Heard, several
-from gripmon.client.message import TransformMessage
 from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
-from gripmon.records import Verdict
+from gripmon.records import FrameRecord, Verdict
 
 _Refusal = tuple[Unusable, str]
 
@@ -20,32 +19,32 @@ def judge(heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_
     if entry is None:
         why, reason = _cut_off(heard, None) or _silence(heard, fault)
         return Reading(monitor=None, verdict=Verdict.UNKNOWN, usable=False, why=why, reason=reason, age_s=math.inf)
-    message = entry.message
+    record = entry.record
     age_s = _age_s(entry, policy, now_s, wall_ns)
-    lost = _cut_off(heard, entry) or _unknown(message) or _too_old(heard, age_s, policy)
-    refusal = lost or _against_policy(message, policy)
+    lost = _cut_off(heard, entry) or _unknown(record) or _too_old(heard, age_s, policy)
+    refusal = lost or _against_policy(record, policy)
     return Reading(
         monitor=entry.monitor,
-        verdict=Verdict.UNKNOWN if lost else message.verdict,
+        verdict=Verdict.UNKNOWN if lost else record.verdict,
         usable=refusal is None,
         why=refusal[0] if refusal else None,
         reason=refusal[1] if refusal else "",
         age_s=age_s,
-        transform=None if lost else message.cam_T_grip,
-        covariance=None if lost else message.covariance,
-        smoothed=None if lost else message.smoothed,
-        state=message.state,
-        source=message.source,
-        stamp_ns=message.stamp_ns,
-        seq=message.seq,
-        reference_id=message.reference_id,
-        revision=message.revision,
+        transform=None if lost else record.cam_T_grip,
+        covariance=None if lost else record.covariance,
+        smoothed=None if lost else record.smoothed,
+        state=record.state,
+        source=record.source,
+        stamp_ns=record.stamp_ns,
+        seq=record.seq,
+        reference_id=record.reference_id,
+        revision=record.revision,
     )
 
 
 def _age_s(entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
-    age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.message.latency_ns
-    return max(age_s, 1e-9 * (wall_ns - entry.message.stamp_ns)) if policy.clocks_agree else age_s
+    age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.record.latency_ns
+    return max(age_s, 1e-9 * (wall_ns - entry.record.stamp_ns)) if policy.clocks_agree else age_s
 
 
 def _cut_off(heard: Heard, entry: Entry | None) -> _Refusal | None:
@@ -69,10 +68,10 @@ def _silence(heard: Heard, fault: str) -> _Refusal:
     return Unusable.NOTHING_YET, f"no transform came yet{'' if heard.present else ', and no monitor is seen'}"
 
 
-def _unknown(message: TransformMessage) -> _Refusal | None:
-    if message.verdict is not Verdict.UNKNOWN:
+def _unknown(record: FrameRecord) -> _Refusal | None:
+    if record.verdict is not Verdict.UNKNOWN:
         return None
-    return Unusable.UNKNOWN, f"the monitor has no transform: {message.reason or message.state}"
+    return Unusable.UNKNOWN, f"the monitor has no transform: {record.reason or record.state}"
 
 
 def _too_old(heard: Heard, age_s: float, policy: Policy) -> _Refusal | None:
@@ -82,10 +81,10 @@ def _too_old(heard: Heard, age_s: float, policy: Policy) -> _Refusal | None:
     return Unusable.STALE, f"the newest transform is {age_s:.3g} s old, allowed are {policy.max_age_s:g} s{since}"
 
 
-def _against_policy(message: TransformMessage, policy: Policy) -> _Refusal | None:
-    if message.verdict is Verdict.SUSPECT and not policy.accept_suspect:
-        return Unusable.SUSPECT, f"the transform is suspect: {message.reason or message.state}"
-    if policy.max_sigma_m is not None and (sigma_m := largest_sigma_m(message.covariance)) > policy.max_sigma_m:
+def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
+    if record.verdict is Verdict.SUSPECT and not policy.accept_suspect:
+        return Unusable.SUSPECT, f"the transform is suspect: {record.reason or record.state}"
+    if policy.max_sigma_m is not None and (sigma_m := largest_sigma_m(record.covariance)) > policy.max_sigma_m:
         return (
             Unusable.UNCERTAIN,
             f"the transform is certain to {1e3 * sigma_m:.3g} mm, allowed are {1e3 * policy.max_sigma_m:g} mm",

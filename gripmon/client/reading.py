@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from gripmon.client.names import MonitorName
-from gripmon.records import Smoothed, Transform, Verdict
+from gripmon.records import Origin, Smoothed, State, Transform, Verdict
 
 if TYPE_CHECKING:
     from gripmon.records import Array
@@ -85,8 +85,8 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     transform: Transform | None = None
     covariance: tuple[float, ...] | None = None
     smoothed: Smoothed | None = None
-    state: str = ""
-    source: str = ""
+    state: State | None = None
+    source: Origin | None = None
     stamp_ns: int = 0
     seq: int = -1
     reference_id: str = ""

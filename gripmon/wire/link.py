@@ -36,6 +36,7 @@ class Link:
         self._closing = threading.Event()
         self._opener: threading.Thread | None = None
         config = zenoh_config(settings, relative_to)
+        self._opening_s = 1e-3 * float(config.get_json("transport/unicast/open_timeout"))
         if config.get_json("mode") == '"client"':
             self._fault = "no Zenoh session yet"
             self._opener = threading.Thread(
@@ -70,7 +71,8 @@ class Link:
         """Tell everyone attached, close the session and free its port.  Calling it twice does nothing more."""
         self._closing.set()
         if self._opener is not None:
-            self._opener.join(timeout=1.0)  # an attempt under way closes its own session when it returns
+            # A process that ended with this thread inside Zenoh would be aborted by the interpreter.
+            self._opener.join(timeout=self._opening_s + 1.0)
         with self._lock:
             session, self._session = self._session, None
             leave, self._leave = self._leave, []

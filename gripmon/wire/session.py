@@ -41,6 +41,8 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         # An express message takes a whole place in the queue, of which there are two: 33 ms without a slice of the
         # processor would lose a frame.
         "transport/link/tx/queue/size/real_time": 8,
+        # An endpoint that takes the connection and says nothing: closing waits for the attempt under way.
+        "transport/unicast/open_timeout": 3000,
     }
     for key, value in entries.items():
         try:
