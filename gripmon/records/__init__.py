@@ -27,6 +27,7 @@ from gripmon.records.frames import (
     Verdict,
     unmeasured_record,
 )
+from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
@@ -77,8 +78,10 @@ __all__ = [
     "Verdict",
     "Vibration",
     "from_json",
+    "json_schema",
     "largest_bytes",
     "schema_name",
+    "summary",
     "to_json",
     "unmeasured_record",
 ]

@@ -36,9 +36,10 @@ class Command(msgspec.Struct, frozen=True):
 class CommandRequest(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schema", tag="gripmon.command/1"
 ):
-    """The payload of a command, whose name is the last part of the key; none at all is an empty argument.
+    """The payload of a command; none at all is an empty argument.
 
-    A field that the monitor doesn't know is refused: what it can't honour it must not carry out.
+    The command's name is the last part of the key.  A field that the monitor doesn't know is refused: what it can't
+    honour it must not carry out.
     """
 
     argument: Annotated[
@@ -73,7 +74,7 @@ class CommandFault(OpenEnum):
 
 
 class CommandError(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.error/1"):
-    """The answer in place of a reply: the command was not carried out, or perhaps was; the text says which."""
+    """In place of a reply: the command was not carried out, or perhaps was; the text says which."""
 
     error: CommandFault
     text: Annotated[str, Meta(description="what went wrong, in one line for a person")]

@@ -105,7 +105,7 @@ class CornerRecord(msgspec.Struct, frozen=True):
 
 
 class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.transform/1"):
-    """What the monitor decided about one frame; the ``transform`` message and one line of ``replay``."""
+    """What the monitor decided about one frame: also one line of ``replay``."""
 
     seq: Annotated[int, Meta(description="number of the frame; one that is missing was dropped")]
     stamp_ns: Annotated[int, Meta(description="time of the capture, Unix ns")]

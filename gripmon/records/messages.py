@@ -12,7 +12,7 @@ from gripmon.records.frames import State, Verdict
 
 
 class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.state/1"):
-    """The ``state`` message: once a second and on every change."""
+    """What the monitor is doing: once a second and on every change."""
 
     robot: Annotated[str, Meta(description="second part of the monitor's keys")]
     camera: Annotated[str, Meta(description="third part of the monitor's keys")]
@@ -34,7 +34,7 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
-    """The ``alert`` message: one alert with the frame and the state that it belongs to."""
+    """One alert with the frame and the state that it belongs to."""
 
     robot: Annotated[str, Meta(description="second part of the monitor's keys")]
     camera: Annotated[str, Meta(description="third part of the monitor's keys")]
@@ -46,7 +46,7 @@ class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gri
 
 
 class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
-    """The ``jaw`` message, which the robot writes."""
+    """The opening of the jaws, which the robot writes."""
 
     stamp_ns: Annotated[int, Meta(description="when it was measured, Unix ns; 0 if that isn't known")]
     opening_m: Annotated[float, Meta(description="distance of the jaws as the gripper file counts it, m")]

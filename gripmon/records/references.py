@@ -24,9 +24,9 @@ class ReferenceInputs(msgspec.Struct, frozen=True):
 
 
 class ReferenceRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reference/1"):
-    """The calibration that drift is measured against; the ``reference`` message."""
+    """The calibration that drift is measured against."""
 
-    reference_id: str
+    reference_id: Annotated[str, Meta(description="its name, which no other reference has")]
     revision: Annotated[int, Meta(description="grows by one with every change and is never used twice")]
     stamp_ns: Annotated[
         int,

@@ -1,4 +1,4 @@
-"""The messages by name, reading one that may come from anybody, and their JSON Schema.
+"""The messages by name, and reading one that may come from anybody.
 
 A message says its schema and that one's major version, ``"schema": "gripmon.transform/1"``.  Within a major version
 fields and names (:class:`gripmon.records.values.OpenEnum`) may be added; a reader passes over what it doesn't know.

@@ -1,0 +1,219 @@
+"""``gripmon schema`` against what is really published, judged by another implementation of JSON Schema."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Iterator
+
+import jsonschema
+import msgspec
+import pytest
+import zenoh
+from loopback import (
+    alert_record,
+    frame_record,
+    free_endpoint,
+    plain_session,
+    reference_record,
+    state_record,
+    wait_until,
+)
+from published import Published
+from test_schemas import ONE_OF_EACH
+
+from gripmon.cli import main
+from gripmon.cli.schema import _NAMES
+from gripmon.records import (
+    MESSAGES,
+    Command,
+    CommandName,
+    CommandReply,
+    CornerFault,
+    CornerRecord,
+    Frame,
+    MonitorState,
+    json_schema,
+    to_json,
+    unmeasured_record,
+)
+from gripmon.wire import PublishSettings
+
+
+def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(["schema", *arguments]) == 0
+    return capsys.readouterr().out
+
+
+def validator(schema: dict) -> jsonschema.Draft202012Validator:
+    jsonschema.Draft202012Validator.check_schema(schema)
+    return jsonschema.Draft202012Validator(schema)
+
+
+NULLS = unmeasured_record(Frame(8, 5, None), reference_record(), "black", corners=(
+    CornerRecord("L_in_near", None, None, used=False, reason=CornerFault.FRAME_REFUSED),
+))  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def heard() -> Iterator[dict[str, list[object]]]:
+    """What a plain subscriber and a plain asker get of each message."""
+    endpoint = free_endpoint()
+    publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    try:
+        with plain_session(connect=endpoint) as session:
+            yield {
+                "transform": [
+                    said(session, "transform", lambda: publisher.transform(frame_record())),
+                    said(session, "transform", lambda: publisher.transform(NULLS)),
+                ],
+                "state": [said(session, "state", lambda: publisher.state(state_record()))],
+                "alert": [said(session, "alert", lambda: publisher.alert(alert_record()))],
+                "reference": [said(session, "reference", lambda: publisher.reference(reference_record()))],
+                "reply": [asked(session, publisher, "state", None)],
+                "error": [asked(session, publisher, "explode", None), asked(session, publisher, "undo", b"no JSON")],
+            }
+    finally:
+        publisher.close()
+
+
+def said(session: zenoh.Session, leaf: str, put: object) -> object:
+    subscriber = session.declare_subscriber(f"gripmon/arm/wrist/{leaf}")
+    samples: list[zenoh.Sample] = []
+
+    def arrived() -> bool:
+        put()  # type: ignore[operator]
+        while (sample := subscriber.try_recv()) is not None:
+            samples.append(sample)
+        return bool(samples)
+
+    wait_until(arrived, leaf)
+    return json.loads(samples[-1].payload.to_bytes())
+
+
+def asked(session: zenoh.Session, publisher: Published, name: str, payload: bytes | None) -> object:
+    replies = session.get(f"gripmon/arm/wrist/cmd/{name}", payload=payload, timeout=20.0)
+    if name == "state":
+        pending: list[object] = []
+        wait_until(lambda: (got := publisher.commands.poll()) is not None and not pending.append(got), "the command")
+        assert pending[0].command == Command(CommandName.STATE)  # type: ignore[attr-defined]
+        state = MonitorState((reference_record(),), reference_record(1), (), 3, None, None)
+        pending[0].answer(CommandReply(CommandName.STATE, True, "well", "plate-2", 3, state))  # type: ignore[attr-defined]
+    (reply,) = replies
+    return json.loads((reply.ok or reply.err).payload.to_bytes())
+
+
+@pytest.mark.parametrize("name", ["transform", "state", "alert", "reference", "reply", "error"])
+def test_what_is_published_validates(heard: dict[str, list[object]], name: str, capsys: pytest.CaptureFixture[str]):
+    one, every = (validator(json.loads(printed(capsys, *which))) for which in ([name], []))
+    for message in heard[name]:
+        one.validate(message)
+        every.validate(message)
+
+
+def test_the_null_transform_is_one(heard: dict[str, list[object]]):
+    assert heard["transform"][1]["cam_T_grip"] is None  # type: ignore[index]
+    assert heard["transform"][0]["cam_T_grip"] is not None  # type: ignore[index]
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_one_of_each_validates_against_its_own_schema_and_no_other(name: str):
+    message = json.loads(to_json(ONE_OF_EACH[name]))
+    passed = [other for other in MESSAGES if validator(json_schema((other,))).is_valid(message)]
+    assert passed == [name]
+
+
+FROM_OTHERS = dict.fromkeys(("jaw", "command", "frame"), ("schema",))
+
+
+@pytest.mark.parametrize("name", FROM_OTHERS)
+def test_others_may_leave_the_schema_out(name: str):
+    message = json.loads(to_json(ONE_OF_EACH[name]))
+    del message["schema"]
+    assert validator(json_schema((name,))).is_valid(message)
+
+
+def test_a_monitor_always_says_the_schema():
+    message = json.loads(to_json(ONE_OF_EACH["transform"]))
+    del message["schema"]
+    assert not validator(json_schema(("transform",))).is_valid(message)
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (("schema",), "gripmon.transform/2"),
+        (("verdict",), "splendid"),
+        (("seq",), "7"),
+        (("seq",), 7.5),
+        (("cam_T_grip", "translation_m"), [0.1, 0.2]),
+        (("cam_T_grip", "rotation_xyzw"), None),
+        (("covariance",), [0.0] * 35),
+        (("corners", 0, "used"), 1),
+        (("corners", 0, "uv_px"), [1.0, 2.0, 3.0]),
+        (("alerts", 0, "severity"), "awful"),
+        (("reference_id",), None),
+    ],
+)
+def test_an_altered_transform_does_not_validate(place: tuple[str | int, ...], value: object):
+    check = validator(json_schema(("transform",)))
+    message = json.loads(to_json(ONE_OF_EACH["transform"]))
+    assert check.is_valid(message)
+    altered = inner = copy.deepcopy(message)
+    for step in place[:-1]:
+        inner = inner[step]
+    inner[place[-1]] = value
+    assert not check.is_valid(altered)
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_a_missing_field_does_not_validate(name: str):
+    check = validator(json_schema((name,)))
+    message = json.loads(to_json(ONE_OF_EACH[name]))
+    needed = {field for field in message if not check.is_valid({k: v for k, v in message.items() if k != field})}
+    without_default = {field.encode_name for field in msgspec.structs.fields(MESSAGES[name]) if field.required}
+    assert needed == without_default | ({"schema"} - set(FROM_OTHERS.get(name, ())))
+
+
+def test_later_fields_and_names_validate():
+    check = validator(json_schema(("transform",)))
+    message = json.loads(to_json(ONE_OF_EACH["transform"]))
+    message["more"], message["state"], message["corners"][0]["reason"] = {"a": 1}, "resting", "painted"
+    check.validate(message)
+
+
+def test_every_field_says_what_it_is():
+    """By a description of its own or of its type."""
+
+    def described(node: dict, definitions: dict) -> bool:
+        if "description" in node:
+            return True
+        parts = [*node.get("anyOf", ()), *([definitions[node["$ref"].rpartition("/")[2]]] if "$ref" in node else [])]
+        return any(described(part, definitions) for part in parts)
+
+    definitions = json_schema()["$defs"]
+    silent = [
+        f"{title}.{field}"
+        for title, definition in definitions.items()
+        for field, node in definition.get("properties", {}).items()
+        if not described(node, definitions)
+    ]
+    assert silent == []
+    assert [title for title, definition in definitions.items() if "description" not in definition] == []
+
+
+def test_the_list_names_every_message(capsys: pytest.CaptureFixture[str]):
+    lines = printed(capsys, "--list").splitlines()
+    assert [line.split()[:2] for line in lines] == [[name, f"gripmon.{name}/1"] for name in MESSAGES]
+    assert all(len(line.split()) > 5 and "`" not in line for line in lines)
+    assert tuple(MESSAGES) == _NAMES
+
+
+@pytest.mark.parametrize("arguments", [["nonsense"], ["--list", "transform"]])
+def test_wrong_usage_is_said(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    try:
+        code = main(["schema", *arguments])
+    except SystemExit as ended:
+        code = ended.code
+    assert code == 2
+    assert arguments[-1] in capsys.readouterr().err
