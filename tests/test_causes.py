@@ -18,11 +18,12 @@ from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings, PaperLens, make_camera
 from gripmon.causes import BlurWatch, CauseJudge, CauseSettings, FingerWatch, ResidualWatch
+from gripmon.causes.pooling import pool
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.geometry import perturb
 from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Cause
+from gripmon.records import Cause, EdgeEvidence
 
 FRAMES = 8
 
@@ -188,6 +189,75 @@ def test_nothing_seen_at_all_is_a_blocked_view_or_a_noisy_image():
     cause, _, text = told(shown, shown.judge(), hidden=everything, brightest=0.05)
     assert cause is Cause.IMAGE_BAD
     assert "dark" in text
+
+
+def test_noise_that_hides_the_fingers_is_the_cause_of_where_they_seem_to_be():
+    shown = Shown(sharp_gripper())
+    bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}
+    assert told(shown, shown.judge(), bent=bent, noise=0.08)[0] is Cause.FINGER_BENT
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(bent=bent, noise=0.08), 0.3, 0.45))
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is Cause.IMAGE_BAD
+    assert "noise of 8 %" in explanation.text
+    # One of them too: a finger that is hidden in noise isn't hidden by a thing.
+    assert told(shown, shown.judge(), hidden=("left",), noise=0.08)[0] is Cause.IMAGE_BAD
+
+
+def ill_seen(evidence: EdgeEvidence, *shares: float) -> EdgeEvidence:
+    """With other shares of the fingers' profiles that agree."""
+    return dataclasses.replace(evidence, finger_share=np.array(shares))
+
+
+@pytest.mark.parametrize(
+    ("well_seen", "cause"), [(FRAMES, Cause.FINGER_BENT), (3, Cause.FINGER_BENT), (2, Cause.UNKNOWN)]
+)
+def test_a_finger_that_most_of_its_profiles_contradict_is_not_called_bent(well_seen: int, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}
+    for k in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(bent=bent), 0.6 if k < well_seen else 0.4, 0.8))
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is cause
+    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
+    assert ("too little of the fingers is seen" in explanation.text) == (cause is Cause.UNKNOWN)
+
+
+@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.JAW_OPENING), (0.4, Cause.UNKNOWN)])
+def test_one_finger_alone_does_not_tell_of_the_opening(share: float, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(reported_m=OPENING_M + 5e-4), 0.8, share))
+    assert judge.explanation(shown.reference).probable.cause is cause
+
+
+@pytest.mark.parametrize("place", [0, FRAMES // 2, FRAMES - 1])
+def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
+    """A fit in which too little agreed may have ended anywhere; its edge points lie where they lie."""
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    astray = knocked(shown.reference, (0.02, -0.01, 0.01), (6.0, -4.0, 8.0))
+    for k in range(FRAMES):
+        evidence = shown.evidence(opening_m=OPENING_M - 2e-4 * k, reported_m=OPENING_M - 2e-4 * k)
+        judge.add(dataclasses.replace(evidence, cam_T_grip=astray) if k == place else evidence)
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is Cause.UNKNOWN
+    assert explanation.text == "every finger and the camera stand where they did"
+
+
+@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (6.0, -4.0, 8.0)])
+def test_pieces_lie_where_a_frame_shows_them_whatever_its_pose(turn_deg: tuple[float, ...]):
+    shown = Shown(sharp_gripper())
+    evidence = shown.evidence()
+    pooled = pool(
+        [dataclasses.replace(evidence, cam_T_grip=knocked(shown.reference, (0.02, 0.0, 0.0), turn_deg))],
+        shown.camera,
+        shown.gripper,
+    )
+    np.testing.assert_allclose(pooled.evidence.xy, evidence.xy, atol=1e-9)
 
 
 def test_another_camera_is_thought_of_only_after_an_interruption():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -10,10 +11,12 @@ import pytest
 from meters import JAW_SIGMA_M, NARROW, box_gripper, meter
 from shown_edges import OPENING_M, REFERENCE_SIGMA
 from simulated import PAPER_LENS, nominal_cam_T_grip
+from watched import new_monitor
 
 from gripmon.camera import make_camera
 from gripmon.causes import CauseJudge, CauseSettings
 from gripmon.corners import FingertipMeter
+from gripmon.monitor import MonitorSettings
 from gripmon.records import Cause, EdgeEvidence, Explanation, Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, BentFinger, Cover, Defocus, Tilt
@@ -136,3 +139,22 @@ def test_one_covered_finger_is_not_called_bent():
     explanation = watching.judge.explanation(nominal_cam_T_grip())
     assert explanation.probable.cause is Cause.UNKNOWN
     assert "finger left is not seen" in explanation.text
+
+
+def test_images_that_come_again_do_not_tell_that_the_jaw_is_elsewhere():
+    """The robot goes on reporting openings that the old images don't show."""
+    scenario = Scenario(name="frozen", fps=FPS, duration_s=1.0)
+    scene = Simulator(CAMERA, box_gripper(), nominal_cam_T_grip(), scenario, 3)
+    frames = [scene.frame(index) for index in range(22)]
+    monitor = new_monitor(MonitorSettings(jaw_sigma_m=0.0))
+    told = [monitor.process(frame) for frame in frames]
+    for later in range(36):
+        again = replace(
+            frames[-1 - later % 2],
+            seq=len(frames) + later,
+            stamp_ns=frames[-1].stamp_ns + round((later + 1) * 1e9 / FPS),
+            jaw_opening_m=OPENING_M + 2.5e-3 * min(later / 4.0, 1.0),
+        )
+        told.append(monitor.process(again))
+    named = {alert.cause for record in told for alert in record.alerts} - {Cause.UNKNOWN}
+    assert named == {Cause.CAMERA_FROZEN}

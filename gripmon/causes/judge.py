@@ -37,6 +37,11 @@ BAD_IMAGE = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.0
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
 MUCH_NOISE, LEAST_NOISE, DARK = 4.0, 0.02, 0.08
 
+MOST = 0.5
+"""Share of a finger's profiles that must agree with where it is said to be.  What fewer show may be anything that has
+an edge or two: a shadow, a finger's other side, what lies behind.
+"""
+
 
 class CauseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """When a cause is named."""
@@ -105,20 +110,31 @@ class CauseJudge:
     def explanation(self, ref_cam_T_grip: Array) -> Explanation:
         """What the frames since the last reset say together about what moved since ``ref_cam_T_grip`` (4, 4)."""
         if not self._frames:
-            return _explained({(Cause.UNKNOWN, None): 1.0}, self._gripper, 1.0, "nothing was seen that tells a cause")
+            return self._told({Cause.UNKNOWN: 1.0}, "nothing was seen that tells a cause")
         baseline = self._learnt(ref_cam_T_grip)
         pooled = pool(self._frames, self._camera, self._gripper)
-        if len(pooled.piece) < FEWEST_PIECES:
-            return self._blind(pooled, baseline)
-        scatter_px = float(np.median(pooled.evidence.sigma_px))
+        blind = len(pooled.piece) < FEWEST_PIECES
+        scatter_px = 0.0 if blind else float(np.median(pooled.evidence.sigma_px))
+        ill_seen = bool((pooled.share < MOST).any())
+        # What the image itself explains needs no other cause.
+        if blind or (baseline is not None and (ill_seen or scatter_px > SCATTERED_PX)):
+            spoilt = _spoilt(pooled, baseline)
+            if spoilt is not None:
+                return self._told(BAD_IMAGE, spoilt)
+        if blind:
+            return self._told(BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place")
         if scatter_px > SCATTERED_PX:
             text = f"the places of the gripper's edges scatter by {scatter_px:.1f} px: they don't tell what is wrong"
-            return _explained({(Cause.UNKNOWN, None): 1.0}, self._gripper, self._settings.probable, text)
+            return self._told({Cause.UNKNOWN: 1.0}, text)
         comparison = self._compared(pooled, ref_cam_T_grip, baseline)
         top = max(comparison.log.values())
         total = sum(math.exp(value - top) for value in comparison.log.values())
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
+        for key in [key for key in shares if _ill_founded(key, pooled)]:
+            if shares[key] >= self._settings.probable:
+                text = f"too little of the fingers is seen to tell what moved; what is seen would fit if {text}"
+            shares[Cause.UNKNOWN, None] += shares.pop(key)
         return _explained(shares, self._gripper, self._settings.probable, text)
 
     def _compared(self, pooled: Pooled, ref_cam_T_grip: Array, baseline: Baseline | None) -> Comparison:
@@ -152,15 +168,31 @@ class CauseJudge:
         self._baseline = Baseline.of(pooled, nothing.motion, nothing.residual_px, edges)
         return self._baseline
 
-    def _blind(self, pooled: Pooled, baseline: Baseline | None) -> Explanation:
-        """No finger is seen."""
-        usual = 0.0 if baseline is None else baseline.noise
-        shares, text = BAD_IMAGE, f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
-        if pooled.brightest < DARK:
-            text = f"the image is dark: hardly a pixel above {100.0 * pooled.brightest:.0f} % of the full scale"
-        elif pooled.noise <= max(MUCH_NOISE * usual, LEAST_NOISE):
-            shares, text = BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place"
+    def _told(self, shares: Mapping[Cause, float], text: str) -> Explanation:
+        """Where no models were compared."""
         return _explained({(c, None): p for c, p in shares.items()}, self._gripper, self._settings.probable, text)
+
+
+def _spoilt(pooled: Pooled, baseline: Baseline | None) -> str | None:
+    """By what the image hides the gripper's edges; None if by nothing."""
+    if pooled.brightest < DARK:
+        return f"the image is dark: hardly a pixel above {100.0 * pooled.brightest:.0f} % of the full scale"
+    if pooled.noise > max(MUCH_NOISE * (0.0 if baseline is None else baseline.noise), LEAST_NOISE):
+        return f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
+    return None
+
+
+def _ill_founded(key: Key, pooled: Pooled) -> bool:
+    """Whether a cause is told from fingers that most of their own profiles contradict.
+
+    A finger that isn't seen at all is weighed as such.  Of an opening two fingers have to tell: what one does may as
+    well be its own.
+    """
+    cause, part = key
+    if cause is Cause.FINGER_BENT and part is not None:
+        return part not in pooled.absent and not pooled.share[part] >= MOST
+    several = min(len(pooled.share), 2)
+    return cause is Cause.JAW_OPENING and int((pooled.share >= MOST).sum()) < several
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,7 @@ PIECES = 5
 """Pieces that an edge is divided into."""
 
 SEEN_IN = 1.0 / 3.0
-"""Part of the frames in which a piece has to be seen."""
+"""Part of the frames in which a piece has to be seen, and which have to show so much of a finger."""
 
 CONSTANT = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
@@ -28,14 +29,16 @@ FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
 
 @dataclass(frozen=True, slots=True)
 class Pooled:
-    """``evidence`` of the newest frame's time with a stretch for each piece ``piece`` (s,) of an edge; ``absent``:
-    fingers in view that are not seen; ``blur_px2``: of the lens, None where it can't be told; ``noise`` and
-    ``brightest`` as in ``EdgeEvidence``; ``frames`` that it was made of.
+    """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
+    edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
+    finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where it
+    can't be told; ``noise`` and ``brightest`` as in ``EdgeEvidence``; ``frames`` that it was made of.
     """
 
     evidence: EdgeEvidence
     piece: NDArray[np.intp]
     absent: tuple[int, ...]
+    share: Array
     blur_px2: float | None
     noise: float
     brightest: float
@@ -48,27 +51,32 @@ def piece_of(edge: NDArray[np.intp], fraction: Array) -> NDArray[np.intp]:
 
 
 def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Pooled:
-    """One or more frames as one, at the place of the newest; motion between them that comes and goes averages out."""
-    newest = frames[-1]
-    base = _state(newest, newest, gripper)
+    """One or more frames as one, at the place of the one in their midst; motion between them that comes and goes
+    averages out.
+
+    Not at the newest's: a frame in which too little agreed may have the gripper anywhere.
+    """
+    midst = frames[_midst(frames, gripper)]
+    base = _state(midst, midst, gripper)
     places, residuals, fractions, sigmas, details = [], [], [], [], []
     for frame in frames:
         frame = _without(frame, absent_fingers(frame, gripper), gripper)
         if not len(frame.edge):
             continue
-        residual, _ = EdgeView(camera, gripper, frame).residual(_state(frame, newest, gripper))
+        residual, fraction = EdgeView(camera, gripper, frame).beside(_state(frame, midst, gripper))
         places.append(piece_of(frame.edge, frame.fraction))
         residuals.append(residual)
-        fractions.append(frame.fraction)
+        fractions.append(fraction)
         sigmas.append(frame.sigma_px)
         details.append(np.column_stack([frame.per_px, frame.spread_px, frame.blur_px2, frame.across]))
     absences = [absent_fingers(frame, gripper) for frame in frames]
     often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
+    share = _share(frames)
     noise = float(np.median([frame.noise for frame in frames]))
     brightest = float(np.median([frame.brightest for frame in frames]))
     if not places:
-        nothing = _only(newest, np.zeros(len(newest.edge), dtype=bool))
-        return Pooled(nothing, np.zeros(0, np.intp), often, None, noise, brightest, len(frames))
+        nothing = _only(midst, np.zeros(len(midst.edge), dtype=bool))
+        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, noise, brightest, len(frames))
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -90,7 +98,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     xy, across_xy = edge_places(gripper, base, edge, at)
     per_px = other[:, 0]
     evidence = replace(
-        newest,
+        midst,
         edge=edge,
         fraction=at,
         xy=xy + (shift_px * per_px)[:, None] * across_xy,
@@ -100,7 +108,15 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         blur_px2=other[:, 2],
         across=other[:, 3:],
     )
-    return Pooled(evidence, numbers, often, isotropic_blur_px2(evidence), noise, brightest, len(frames))
+    blur_px2 = isotropic_blur_px2(evidence)
+    return Pooled(evidence, numbers, often, share, blur_px2, noise, brightest, len(frames))
+
+
+def _share(frames: Sequence[EdgeEvidence]) -> Array:
+    """(f,) what the shares reach in as many of the frames as a piece has to be seen in; NaN without such frames."""
+    shares = np.sort(np.nan_to_num([frame.finger_share for frame in frames], nan=-1.0), axis=0)
+    reached = shares[-math.ceil(SEEN_IN * len(frames))]
+    return np.where(reached >= 0.0, reached, np.nan)
 
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:
@@ -133,13 +149,21 @@ def isotropic_blur_px2(evidence: EdgeEvidence) -> float | None:
     return max(float(terms[0] - np.hypot(terms[1], terms[2])), 0.0)
 
 
-def _state(frame: EdgeEvidence, newest: EdgeEvidence, gripper: Gripper) -> State:
-    """Where the newest frame has everything, with the opening as it was reported, or seen, in another."""
+def _midst(frames: Sequence[EdgeEvidence], gripper: Gripper) -> int:
+    """Number of the frame that has the gripper nearest to where all of them have it; of equals the newest."""
+    points = gripper.points_grip_m(None)
+    places = np.array([points @ frame.cam_T_grip[:3, :3].T + frame.cam_T_grip[:3, 3] for frame in frames])
+    away_m = [float(np.linalg.norm(places - own, axis=2).mean(axis=1).sum()) for own in places]
+    return len(frames) - 1 - int(np.argmin(away_m[::-1]))
+
+
+def _state(frame: EdgeEvidence, base: EdgeEvidence, gripper: Gripper) -> State:
+    """Where the frame ``base`` has everything, with the opening as it was reported, or seen, in another."""
     opening_m = frame.jaw_opening_m
-    if frame.jaw_reported_m is not None and newest.jaw_reported_m is not None:
-        opening_m = newest.jaw_opening_m + frame.jaw_reported_m - newest.jaw_reported_m
+    if frame.jaw_reported_m is not None and base.jaw_reported_m is not None:
+        opening_m = base.jaw_opening_m + frame.jaw_reported_m - base.jaw_reported_m
     opening_m = min(max(opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
-    return State(newest.cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
+    return State(base.cam_T_grip, opening_m, 0.0, np.zeros((len(gripper.finger_ids), 6)))
 
 
 def _without(evidence: EdgeEvidence, fingers: tuple[int, ...], gripper: Gripper) -> EdgeEvidence:

@@ -126,6 +126,18 @@ class EdgeView:
         focal = np.einsum("si,si->s", perp, by_focal) / per_px
         return off / per_px, self._jacobian(state, spot, gradient, rate, middle, focal)
 
+    def beside(self, state: State) -> tuple[Array, Array]:
+        """(s,) measured minus predicted place of each stretch across its edge, px, and the fraction (s,) of the edge's
+        image beside which it lies: :func:`edge_places` there, and so much across, is the measured place.
+        """
+        residual, _ = self.residual(state)
+        points, _, _ = points_cam(self._gripper, state, opened(self._gripper, state.jaw_opening_m))
+        a, b = points[self._ends[:, 0]], points[self._ends[:, 1]]
+        perp = _across(a, b)
+        spot = _on_edge(a, b, self._ideal(state.log_focal)[0], np.column_stack([perp[:, 1], -perp[:, 0]]))
+        span = b - a
+        return residual, np.einsum("si,si->s", spot - a, span) / np.einsum("si,si->s", span, span)
+
     def _ideal(self, log_focal: float) -> tuple[Array, Array]:
         """Ideal coordinates (s, 2) of the stretches with another focal length, and (s, 2) what its logarithm moves
         *predictions* by.

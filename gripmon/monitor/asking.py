@@ -56,7 +56,7 @@ class Inquiry:
         self._pending = (wrong, evidence, ref_cam_T_grip)
         if not wrong:
             self._calm += 1
-        return self._told()
+        return self.told()
 
     def ponder(self) -> None:
         """Think about the last frame that was asked about; nothing if that has been done."""
@@ -77,7 +77,8 @@ class Inquiry:
         if self._calm >= CALM_FRAMES and self._judge.wants_baseline:
             self._judge.well(evidence())
 
-    def _told(self) -> Explanation:
+    def told(self) -> Explanation:
+        """What the frames so far have shown; for a frame that says nothing new."""
         return self._explanation if self._asked >= FEWEST_FRAMES and self._calm <= LULL_FRAMES else Explanation()
 
     def _forget(self) -> None:

@@ -282,6 +282,8 @@ class Monitor:
         return since_start
 
     def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
+        if self._stream.repeats:
+            return self._inquiry.told()  # the image is an old one, what the robot reports is not
         return self._inquiry.ask(
             wrong, lambda: self._tracker.evidence(frame, measurement, self._ref_cam_T_grip), self._ref_cam_T_grip
         )
