@@ -8,7 +8,7 @@ from collections.abc import Iterable
 
 import pytest
 from daemon_bench import Bench
-from loopback import reference_record, wait_until
+from loopback import frame_record, reference_record, wait_until
 from stand_ins import ScriptedMonitor
 
 from gripmon.daemon import StateKeeper
@@ -22,6 +22,7 @@ from gripmon.records import (
     CommandName,
     CommandReply,
     MonitorState,
+    OpenAlert,
     Severity,
 )
 from gripmon.sources import Waiting
@@ -183,6 +184,20 @@ def test_a_monitor_that_can_not_tell_its_state_goes_on():
     assert bench.run(keeper=StateKeeper(Disk())) == 0
     assert len(bench.network.transforms) == 3
     assert "ZeroDivisionError" in bench.states[2][1]
+
+
+def test_the_state_message_says_which_alerts_are_open():
+    class Alarmed(ScriptedMonitor):
+        def state(self) -> MonitorState:
+            raised = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off", alert_id="1-a", since_ns=5)
+            return MonitorState((self.reference,), alerts=(OpenAlert("drift", raised),) * (self.reference.revision > 3))
+
+    bench = Bench(range(3), Alarmed(lambda seq: {"revision": 3 if seq < 1 else 4}), state_period_s=1e-6)
+    assert bench.run() == 0
+    said = [[alert.alert_id for alert in state.open_alerts] for state in bench.network.states]
+    assert said == [[], [], ["1-a"], ["1-a"], ["1-a"]]
+    shift_m = frame_record().drift.tcp_shift_m
+    assert [state.tcp_shift_m for state in bench.network.states] == [None, shift_m, shift_m, shift_m, None]
 
 
 def test_notices_of_the_start_are_alerts_behind_the_reference():

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from loopback import frame_record
 from stand_ins import REFUSED
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
-from gripmon.records import (
-    State,
-)
+from gripmon.records import Alert, AlertKind, Cause, OpenAlert, Severity, State, Verdict
 
 RAISED, CLEARED = "source raised", "source cleared"
 GOOD, BAD, NONE = "good", "bad", "none"
@@ -86,3 +85,31 @@ def test_the_rate_is_that_of_the_last_frames():
     watch.frame(frame_record(200), now_s=30.0)
     watch.frame(frame_record(201), now_s=30.1)
     assert watch.frames_per_s(30.1) == pytest.approx(10.0)
+
+
+def test_drift_and_certainty_are_those_of_the_last_transform_while_it_counts():
+    watch = Watch(SETTINGS, now_s=0.0)
+    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+    covariance = np.diag([1e-10, 4e-10, 2.5e-9, 1.0, 1.0, 1.0]).ravel().tolist()
+    watch.frame(frame_record(covariance=tuple(covariance)), now_s=1.0)
+    assert watch.tcp_shift_m == frame_record().drift.tcp_shift_m and watch.sigma_m == pytest.approx(5e-5)
+    watch.no_frame("unplugged", 9.0, 9)
+    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+    watch.frame(frame_record(drift=None, covariance=None, cam_T_grip=None, verdict=Verdict.SUSPECT), now_s=10.0)
+    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+
+
+def test_standing_alerts_are_the_monitors_and_those_of_the_silence():
+    watch = Watch(SETTINGS, now_s=0.0)
+    drift = Alert(
+        AlertKind.DRIFT, Cause.CAMERA_MOUNT, Severity.WARNING, "moved", alert_id="7-a", since_ns=40, acknowledged=True
+    )
+    assert watch.standing(()) == ()
+    [silent] = watch.no_frame("unplugged", 3.0, 30)
+    standing = watch.standing((OpenAlert("drift", drift),))
+    assert [(a.alert_id, a.kind, a.text, a.since_ns, a.acknowledged) for a in standing] == [
+        (silent.alert_id, AlertKind.SOURCE, silent.text, 30, False),
+        ("7-a", AlertKind.DRIFT, "moved", 40, True),
+    ]
+    watch.frame(frame_record(), 4.0)
+    assert [alert.alert_id for alert in watch.standing((OpenAlert("drift", drift),))] == ["7-a"]

@@ -33,6 +33,7 @@ from gripmon.records import (
     FrameRecord,
     MeasurementTrace,
     MonitorState,
+    OpenAlert,
     ReferenceRecord,
     Severity,
     State,
@@ -129,6 +130,7 @@ class Daemon:
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
         self._kept_revision: int | None = None
+        self._open_alerts: tuple[OpenAlert, ...] = ()  # the monitor's
         self._commands = commands
         self._notices = notices
         self._reference, self._reference_due = monitor.reference, True
@@ -253,7 +255,7 @@ class Daemon:
 
     def _keep_now(self) -> None:
         self._kept_revision = self._monitor.state_revision
-        self._keeper.now(self._monitor.state())
+        self._keeper.now(self._monitor_state())
 
     def _keep_changes(self, *, at_once: bool = False) -> None:
         """Keep the monitor's state if it has changed."""
@@ -263,7 +265,12 @@ class Daemon:
             self._keep_now()
         else:
             self._kept_revision = self._monitor.state_revision
-            self._keeper.soon(self._monitor.state())
+            self._keeper.soon(self._monitor_state())
+
+    def _monitor_state(self) -> MonitorState:
+        state = self._monitor.state()
+        self._open_alerts = state.alerts
+        return state
 
     def _make_reference_known(self) -> None:
         """Say a new reference, which is kept before: no other one may ever get its revision."""
@@ -351,6 +358,9 @@ class Daemon:
             recording_dropped=self._recorder.dropped,
             message=message,
             version=__version__,
+            tcp_shift_m=watch.tcp_shift_m,
+            sigma_m=watch.sigma_m,
+            open_alerts=watch.standing(self._open_alerts),
         )
         self._deliver("state", self._publisher.state, self._said)
         if due:

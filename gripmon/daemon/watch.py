@@ -7,7 +7,19 @@ from collections import deque
 
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.policy import AlertBook
-from gripmon.records import Alert, AlertKind, Cause, CornerFault, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Cause,
+    CornerFault,
+    FrameRecord,
+    OpenAlert,
+    Origin,
+    Severity,
+    StandingAlert,
+    State,
+    Verdict,
+)
 
 _RATE_OVER_FRAMES = 64
 _SILENCE, _FAILURE = "silence", "failure"
@@ -33,6 +45,7 @@ class Watch:
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
+        self._record: FrameRecord | None = None
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; the alerts that are due beside the record's own."""
@@ -42,6 +55,7 @@ class Watch:
         self._frame_times_s.append(now_s)
         self._last_frame_s = now_s
         self.state, self.verdict = record.state, record.verdict
+        self._record = record
         if is_refused(record):
             self.frames_refused += 1
             self._keep_message(f"frames refused: {record.reason}")
@@ -76,6 +90,26 @@ class Watch:
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
+
+    @property
+    def tcp_shift_m(self) -> tuple[float, float, float] | None:
+        """Of the last transform, if it still counts: against the reference, along the camera's axes, m."""
+        record = self._record if self.verdict is not Verdict.UNKNOWN else None
+        return None if record is None or record.drift is None else record.drift.tcp_shift_m
+
+    @property
+    def sigma_m(self) -> float | None:
+        """Of the last transform, if it still counts: the TCP's largest standard deviation along a camera axis, m."""
+        record = self._record if self.verdict is not Verdict.UNKNOWN else None
+        return None if record is None or record.covariance is None else math.sqrt(max(record.covariance[:15:7]))
+
+    def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
+        """All that is raised and not cleared, the monitor's and what comes from here, the oldest first."""
+        alerts = [each.alert for each in (*of_the_monitor, *self._alerts.open)]
+        return tuple(
+            StandingAlert(a.alert_id, a.kind, a.severity, a.text, a.since_ns, a.acknowledged)
+            for a in sorted(alerts, key=lambda alert: alert.since_ns or 0)
+        )
 
     @property
     def gives_up(self) -> bool:

@@ -28,7 +28,7 @@ from gripmon.records.frames import (
     unmeasured_record,
 )
 from gripmon.records.json_schema import json_schema, summary
-from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
+from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
@@ -72,6 +72,7 @@ __all__ = [
     "Refusal",
     "Severity",
     "Smoothed",
+    "StandingAlert",
     "State",
     "StateRecord",
     "Transform",

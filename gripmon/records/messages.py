@@ -7,8 +7,19 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.alerts import Alert
+from gripmon.records.alerts import Alert, AlertKind, Severity
 from gripmon.records.frames import State, Verdict
+
+
+class StandingAlert(msgspec.Struct, frozen=True):
+    """What a table needs of an alert that is raised and not cleared yet."""
+
+    alert_id: Annotated[str, Meta(description="the same from raised to cleared")]
+    kind: AlertKind
+    severity: Severity
+    text: Annotated[str, Meta(description="what was said of it last")]
+    since_ns: Annotated[int | None, Meta(description="when it was raised, Unix ns")]
+    acknowledged: Annotated[bool, Meta(description="a person has taken note of it")]
 
 
 class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.state/1"):
@@ -31,6 +42,15 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     recording_dropped: Annotated[int, Meta(description="frames that the recording had no time for")]
     message: Annotated[str, Meta(description="what is wrong, in words; empty when all is well")]
     version: Annotated[str, Meta(description="of gripmon")]
+    tcp_shift_m: Annotated[
+        tuple[float, float, float] | None,
+        Meta(description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown"),
+    ] = None
+    sigma_m: Annotated[
+        float | None,
+        Meta(description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown"),
+    ] = None
+    open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
