@@ -27,7 +27,8 @@ if __name__ == "__main__":
     log_to_stderr()
     transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
     with sigterm_exits():
-        publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+        routed = PublishSettings(mode="client", connect=(endpoint,))
+        publisher = Published(routed if kind == "routed" else PublishSettings(listen=(endpoint,)), "arm", "wrist")
         if kind == "forgetful":
             raise SystemExit(5)  # without closing the publisher
         if kind == "starting":
@@ -36,7 +37,7 @@ if __name__ == "__main__":
         sys.exit(
             run(
                 ScriptedMonitor(lambda _: {"cam_T_grip": transform}),
-                TickingSource(FRAMES_PER_S) if kind == "ticking" else SilentSource(FRAMES_PER_S),
+                SilentSource(FRAMES_PER_S) if kind == "silent" else TickingSource(FRAMES_PER_S),
                 publisher,
                 Listener(),
                 DaemonSettings(no_camera_alert_after_s=0.5),

@@ -4,7 +4,9 @@ shares.
 
 from __future__ import annotations
 
+from gripmon.wire.files import ZenohFileError
 from gripmon.wire.link import Link
+from gripmon.wire.router import Router
 from gripmon.wire.session import open_session, zenoh_config
 from gripmon.wire.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings, check_name
 
@@ -14,6 +16,8 @@ __all__ = [
     "Link",
     "PublishError",
     "PublishSettings",
+    "Router",
+    "ZenohFileError",
     "check_name",
     "open_session",
     "zenoh_config",

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
 import zenoh
 
-from gripmon.wire.session import in_short, open_session, zenoh_config
+from gripmon.wire.files import in_short, said
+from gripmon.wire.reach import connect_endpoints, missing
+from gripmon.wire.session import open_session, zenoh_config
 from gripmon.wire.settings import PublishSettings
 
 _log = logging.getLogger(__name__)
+
+_LOOK_EVERY_S = 1.0
 
 
 class Link:
@@ -35,9 +40,12 @@ class Link:
         self._fault = ""
         self._closing = threading.Event()
         self._opener: threading.Thread | None = None
+        self._next_look_s = 0.0
         config = zenoh_config(settings, relative_to)
         self._opening_s = 1e-3 * float(config.get_json("transport/unicast/open_timeout"))
-        if config.get_json("mode") == '"client"':
+        self._is_client = said(config, "mode") == "client"
+        self._endpoints = connect_endpoints(config)
+        if self._is_client:
             self._fault = "no Zenoh session yet"
             self._opener = threading.Thread(
                 target=self._open_until_it_works, args=(config,), name="zenoh-open", daemon=True
@@ -52,7 +60,15 @@ class Link:
         return self._session is not None
 
     def fault(self) -> str:
-        """Why there is no session, in a few words for a person; empty if there is one."""
+        """Whom there is no connection to, in a few words for a person; empty if all is well.
+
+        It may be asked all the time: once a second it looks.  A client needs one connection, a peer one to each
+        endpoint that it is to connect to.
+        """
+        session, now_s = self._session, time.monotonic()
+        if session is not None and now_s >= self._next_look_s:
+            self._next_look_s = now_s + _LOOK_EVERY_S
+            self._look(session)
         return self._fault
 
     def attach(self, declare: Callable[[zenoh.Session], None], leave: Callable[[], None] | None = None) -> None:
@@ -82,6 +98,13 @@ class Link:
         if session is not None:
             session.close()
 
+    def _look(self, session: zenoh.Session) -> None:
+        places = missing(session, self._endpoints, one_is_enough=self._is_client)
+        fault = f"no connection to {places}, trying again" if places else ""
+        if fault != self._fault:
+            self._fault = fault
+            _log.log(logging.WARNING if fault else logging.INFO, "Zenoh: %s", fault or "connected")
+
     def _adopt(self, session: zenoh.Session) -> bool:
         """Let everyone declare what they have; False if it came too late."""
         with self._lock:
@@ -91,6 +114,7 @@ class Link:
             for each in declare:
                 each(session)
             self._session, self._fault = session, ""
+            self._next_look_s = time.monotonic() + _LOOK_EVERY_S
         return True
 
     def _open_until_it_works(self, config: zenoh.Config) -> None:

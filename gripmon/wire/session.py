@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import zenoh
 
+from gripmon.wire.files import ZenohFileError, in_short, load_file
 from gripmon.wire.settings import PublishError, PublishSettings
 
 
@@ -21,13 +22,10 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         for key in ("mode", "listen", "connect", "multicast_scouting"):
             if getattr(settings, key) != getattr(defaults, key):
                 raise PublishError(f"publish.{key}: has no effect beside publish.zenoh_config; say it in that file")
-        path = relative_to / settings.zenoh_config
-        if not path.is_file():
-            raise PublishError(f"publish.zenoh_config: no file {path}; give a json5 or yaml file of Zenoh's")
         try:
-            return zenoh.Config.from_file(path)
-        except zenoh.ZError as error:
-            raise PublishError(f"publish.zenoh_config: {path}: {in_short(error)}") from error
+            return load_file(relative_to / settings.zenoh_config)
+        except ZenohFileError as error:
+            raise PublishError(f"publish.zenoh_config: {error}") from error
     if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
         raise PublishError("publish.connect: a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
     config = zenoh.Config()
@@ -37,7 +35,15 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         "listen/endpoints": listen,
         "listen/exit_on_failure": True,
         "connect/endpoints": settings.connect,
+        # Also when a router restarts: Zenoh's own pauses, up to 4 s, would be several seconds without a transform.
+        "connect/retry": {
+            "period_init_ms": round(1e3 * settings.retry_first_s),
+            "period_max_ms": round(1e3 * settings.retry_longest_s),
+            "period_increase_factor": 2,
+        },
         "scouting/multicast/enabled": settings.multicast_scouting,
+        # Somebody's endless message must not fill the memory; an image of 20 megapixels passes.
+        "transport/link/rx/max_message_size": 64 << 20,
         # An express message takes a whole place in the queue, of which there are two: 33 ms without a slice of the
         # processor would lose a frame.
         "transport/link/tx/queue/size/real_time": 8,
@@ -64,8 +70,3 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
             remedy = "stop the program that has it, or choose another port"
             raise PublishError(f"{key}: {taken[1]} is already in use; {remedy}") from error
         raise PublishError(f"{key}: can't open a Zenoh session: {in_short(error)}") from error
-
-
-def in_short(error: zenoh.ZError) -> str:
-    """Zenoh's message without the places in its source files."""
-    return re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).strip()

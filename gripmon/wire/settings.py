@@ -41,9 +41,9 @@ class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         str | None, msgspec.Meta(description="path of a file of Zenoh's (json5, yaml) instead of the keys above")
     ] = None
     retry_first_s: Annotated[
-        float, msgspec.Meta(gt=0.0, description="client without a router: first pause before the next attempt (s)")
-    ] = 0.25
-    retry_longest_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 8.0
+        float, msgspec.Meta(gt=0.0, description="whom to connect to isn't there, or is gone: first pause (s)")
+    ] = 0.1
+    retry_longest_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 1.0
     jaw_max_age_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="a jaw opening received longer ago than this is not used (s)")
     ] = 1.0

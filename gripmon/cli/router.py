@@ -1,0 +1,59 @@
+"""``gripmon router``: a Zenoh router, by a configuration file of Zenoh's."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from gripmon.cli import common
+
+_DESCRIPTION = """\
+Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
+
+FILE is a configuration of Zenoh's (json5 or yaml); zenohd, Zenoh's own router, takes the same one.
+Paths of certificates in it count from its folder. A router that is to connect to another one tries
+again for ever, and says so."""
+
+_EXAMPLES = """\
+  gripmon certificates --out certificates              once: keys for everyone
+  gripmon router configs/zenoh/router.json5            mutual TLS, and who may do what
+  gripmon router configs/zenoh/site.json5              without security, on this machine alone
+
+exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""
+
+_LOOK_EVERY_S = 1.0
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands, "router", route, "a Zenoh router between monitors and their readers", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument("config", metavar="FILE", help="Zenoh's configuration (json5, yaml)")
+
+
+def route(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon router``."""
+    from gripmon.daemon import sigterm_exits
+    from gripmon.wire import Router, ZenohFileError
+
+    with sigterm_exits():
+        try:
+            router = Router(Path(arguments.config))
+        except ZenohFileError as error:
+            raise common.CommandFailedError(f"router: {error}", common.EXIT_USAGE) from None
+        with router:
+            _say(f"listening on {', '.join(router.listens_on)}")
+            said = ""
+            while True:
+                time.sleep(_LOOK_EVERY_S)
+                if (fault := router.fault()) != said:
+                    _say(fault or "connected")
+                    said = fault
+
+
+def _say(text: str) -> None:
+    print(f"router: {text}", file=sys.stderr, flush=True)
