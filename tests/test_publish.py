@@ -238,7 +238,7 @@ def test_the_newest_jaw_opening_wins(publisher: Published, session: zenoh.Sessio
     "message",
     [
         b"",
-        b"0.02",
+        b"0.02 m",
         b"\xff\xfe",
         b'{"opening_m": 0.02}',
         b'{"stamp_ns": 1, "opening_m": NaN}',
@@ -250,7 +250,7 @@ def test_a_malformed_jaw_message_is_counted_and_said(publisher: Published, sessi
     session.put(f"{PREFIX}/jaw", message)
     wait_until(lambda: publisher.jaw.opening_m() is not None and publisher.jaw.malformed == 1, "the malformed message")
     assert publisher.jaw.opening_m() == 0.02
-    assert publisher.jaw.fault() == "1 malformed jaw message"
+    assert publisher.jaw.fault().startswith(f"1 malformed jaw message on {PREFIX}/jaw: ")
 
 
 def test_an_old_jaw_opening_is_not_used(endpoint: str):

@@ -152,7 +152,8 @@ def _corner_values(names: tuple[str, ...], view: View) -> list[dict[str, Any]]:
 
 def _source_report(config: Config) -> dict[str, Any]:
     """Kind, whether frames can come from it now (None: can't be told without starting it), and a few words."""
-    from gripmon.sources import FolderSettings, LiveSettings, VideoSettings
+    from gripmon.sources import FolderSettings, LiveSettings, NetworkSettings, VideoSettings, network_key
+    from gripmon.wire import Keys
 
     source = config.settings.source
     kind = type(source).__struct_config__.tag
@@ -161,6 +162,13 @@ def _source_report(config: Config) -> dict[str, Any]:
     if isinstance(source, LiveSettings):
         reachable, detail = _live_reachable(source)
         return {"kind": kind, "reachable": reachable, "detail": detail}
+    if isinstance(source, NetworkSettings):
+        key = network_key(source, Keys(config.settings.robot, config.settings.camera_name)["image"])
+        return {
+            "kind": kind,
+            "reachable": None,
+            "detail": f"frames on {key}: can't be told without joining the network",
+        }
     return {"kind": kind, "reachable": True, "detail": "made by this program"}
 
 

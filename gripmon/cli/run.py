@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gripmon.recording import Recorder
     from gripmon.records import Alert, ReferenceRecord
     from gripmon.statefile import StateFile
-    from gripmon.wire import Link
+    from gripmon.wire import Keys, Link
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -100,7 +100,8 @@ def run_daemon(
 
     from gripmon import daemon
     from gripmon.monitor import Monitor
-    from gripmon.sources import SourceError, open_source
+    from gripmon.sources import NetworkCamera, SourceError, open_source
+    from gripmon.wire import Keys
 
     settings = config.settings
     estimates = None if out is None else out / "estimates.jsonl"
@@ -124,7 +125,8 @@ def run_daemon(
         recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
         opened.callback(recorder.close)
         try:
-            source = open_source(settings.source, config.directory, scene=config.scene)
+            keys = Keys(settings.robot, settings.camera_name)
+            source = open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
         except SourceError as error:
             raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
         opened.pop_all()  # from here on the daemon closes them
@@ -141,6 +143,7 @@ def run_daemon(
             keeper=daemon.StateKeeper(kept),
             commands=commands,
             notices=_notices(kept),
+            faults=[source.fault] if isinstance(source, NetworkCamera) else [],
             duration_s=duration_s,
         )
 
@@ -198,16 +201,36 @@ def _open_link(config: Config) -> Link | None:
 
 def _open_publisher(config: Config, link: Link | None) -> tuple[Publisher, JawFeed | None, ZenohCommands | None]:
     """The publisher, where the jaw opening comes from (None: with the frames), and where commands come from."""
-    from gripmon.publish import NullPublisher, ZenohCommands, ZenohJaw, ZenohPublisher
+    from gripmon.publish import NullPublisher, ZenohCommands, ZenohPublisher
 
     settings = config.settings
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if link is None:
         return NullPublisher(), jaw, None
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
-    if settings.jaw.source == "zenoh":
-        jaw = ZenohJaw(link, publisher.keys["jaw"])
+    if settings.jaw.source in ("zenoh", "ros2_joint_state"):
+        jaw = _network_jaw(config, link, publisher.keys)
     return publisher, jaw, ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+
+
+def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
+    """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
+    from gripmon.publish import ZenohJaw
+    from gripmon.publish.jaw import opening_of_joints
+    from gripmon.ros2 import JOINT_STATE, Ros2Missing, subscription_key
+    from gripmon.ros2.types import typestore
+
+    jaw = config.settings.jaw
+    travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
+    if jaw.source == "zenoh":
+        return ZenohJaw(link, keys["jaw"], travel_m=travel_m)
+    assert jaw.topic is not None and jaw.opening is not None, "checked with the configuration"
+    try:
+        typestore()
+    except Ros2Missing as error:
+        raise common.CommandFailedError(f"{config.path}: jaw.source: {error}", common.EXIT_USAGE) from None
+    key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
+    return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)
 
 
 def _open_recorder(

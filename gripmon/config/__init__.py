@@ -14,7 +14,8 @@ import gripmon
 from gripmon.camera import Camera, make_camera
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
 from gripmon.config.errors import ConfigError
-from gripmon.config.settings import JawSettings, Settings
+from gripmon.config.inputs import jaw_fault, network_fault, source_fault
+from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.corners import TaughtEdges, TaughtModel
@@ -22,7 +23,7 @@ from gripmon.corners.taught import mismatch
 from gripmon.geometry import from_record, to_record
 from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
 from gripmon.records import Array, ReferenceRecord, to_json
-from gripmon.sources import FolderSettings, LiveSettings, SimulatedScene, SimulatedSettings, VideoSettings
+from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.statefile import AUTO, Owner, calibration_of, default_path
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class Config:
         if settings.state.file != AUTO:
             return None if settings.state.file is None else self.directory / settings.state.file
         # What is replayed or simulated begins anew each time, and so does the camera's motion.
-        live = isinstance(settings.source, LiveSettings)
+        live = isinstance(settings.source, LiveSettings | NetworkSettings)
         return default_path(settings.robot, settings.camera_name) if live else None
 
     @property
@@ -114,11 +115,12 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     config = Config(path, settings, camera, gripper, gripper_path, reference)
     fault = (
         monitor_fault(settings.monitor)
-        or _jaw_fault(settings.jaw, gripper, settings)
+        or jaw_fault(settings, gripper)
+        or network_fault(settings)
         or view_fault(config.view(), gripper, camera)
     )
     if fault is None and check_source:
-        fault = _source_fault(settings, path.parent)
+        fault = source_fault(settings.source, path.parent)
         if isinstance(settings.source, SimulatedSettings) and settings.source.scenario.endswith((".yaml", ".yml")):
             load_scenario(path.parent / settings.source.scenario)
     if fault is not None:
@@ -194,44 +196,6 @@ def _taught(config: Config) -> TaughtModel | None:
     if fault is not None:
         raise ConfigError(path, *fault)
     return model
-
-
-def _jaw_fault(jaw: JawSettings, gripper: Gripper, settings: Settings) -> Fault | None:
-    if jaw.source != "fixed" and not gripper.has_jaw:
-        return Fault("jaw.source", f"is {jaw.source}, but the gripper file has no jaw", "fixed")
-    if jaw.opening_m is not None:
-        if jaw.source != "fixed":
-            return Fault(
-                "jaw.opening_m", f"has no effect with jaw.source {jaw.source}", "jaw.source: fixed, or no opening_m"
-            )
-        if not gripper.has_jaw:
-            return Fault("jaw.opening_m", "the gripper file has no jaw", "no opening_m")
-        if not gripper.jaw_min_m <= jaw.opening_m <= gripper.jaw_max_m:
-            span = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
-            return Fault("jaw.opening_m", f"{jaw.opening_m:g} m is outside the gripper's range", span)
-    if jaw.source == "frames" and isinstance(settings.source, LiveSettings | VideoSettings):
-        kind = "camera" if isinstance(settings.source, LiveSettings) else "video"
-        return Fault("jaw.source", f"is frames, but a {kind} brings no jaw opening", "fixed or zenoh")
-    if jaw.source == "zenoh" and not settings.publish.enabled:
-        return Fault(
-            "jaw.source", "is zenoh, but publish.enabled is false", "publish.enabled: true, or jaw.source: fixed"
-        )
-    return None
-
-
-def _source_fault(settings: Settings, directory: Path) -> Fault | None:
-    source = settings.source
-    if isinstance(source, FolderSettings) and not (directory / source.path).is_dir():
-        return Fault(
-            "source.path",
-            f"there is no folder {directory / source.path}",
-            "a folder with images, relative to this file",
-        )
-    if isinstance(source, VideoSettings) and not (directory / source.path).is_file():
-        return Fault(
-            "source.path", f"there is no file {directory / source.path}", "a video file, relative to this file"
-        )
-    return None
 
 
 def load_scenario(path: Path) -> Scenario:

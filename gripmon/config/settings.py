@@ -11,6 +11,7 @@ from gripmon.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.recording import RecordingSettings
+from gripmon.ros2 import JointOpening
 from gripmon.sources import SourceSettings
 from gripmon.statefile import StateSettings
 from gripmon.wire import PublishSettings
@@ -63,9 +64,10 @@ class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """Where the jaw opening of a frame comes from."""
 
     source: Annotated[
-        Literal["fixed", "frames", "zenoh"],
+        Literal["fixed", "frames", "zenoh", "ros2_joint_state"],
         Meta(
-            description="fixed: opening_m; frames: comes with each frame (simulator, timestamps.csv); zenoh: key …/jaw"
+            description="fixed: opening_m; frames: comes with each frame (simulator, timestamps.csv, network); "
+            "zenoh: key …/jaw; ros2_joint_state: topic and joints"
         ),
     ] = "fixed"
     opening_m: (
@@ -75,6 +77,11 @@ class JawSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         ]
         | None
     ) = None
+    topic: (
+        Annotated[str, Meta(min_length=1, description="full name of a ROS 2 topic with sensor_msgs/JointState")] | None
+    ) = None
+    domain_id: Annotated[int, Meta(ge=0, le=232, description="ROS_DOMAIN_ID of the topic (no unit)")] = 0
+    opening: JointOpening | None = None
 
 
 class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -63,14 +63,16 @@ def run(
     keeper: StateKeeper | None = None,
     commands: CommandFeed | None = None,
     notices: Sequence[Alert] = (),
+    faults: Sequence[Callable[[], str]] = (),
     duration_s: float | None = None,
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
     In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
     frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
-    the monitor's state for a restart; ``notices`` are alerts from the start-up.  The logger ``gripmon`` is left as the
-    caller set it up (see :func:`log_to_stderr`).
+    the monitor's state for a restart; ``notices`` are alerts from the start-up; ``faults`` are asked, before each state
+    message, what else is wrong ("" for nothing).  The logger ``gripmon`` is left as the caller set it up (see
+    :func:`log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
@@ -87,6 +89,7 @@ def run(
         daemon = Daemon(
             monitor, source, publisher, recorder, settings, stop,
             robot=robot, camera=camera, estimates=lines, jaw=jaw, keeper=keeper, commands=commands, notices=notices,
+            faults=faults,
         )  # fmt: skip
         with _steady_interpreter():
             return daemon.run(duration_s)

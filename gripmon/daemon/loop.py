@@ -119,6 +119,7 @@ class Daemon:
         keeper: StateKeeper | None = None,
         commands: CommandFeed | None = None,
         notices: Sequence[Alert] = (),
+        faults: Sequence[Callable[[], str]] = (),
     ) -> None:
         self._monitor = monitor
         self._source = source
@@ -142,6 +143,7 @@ class Daemon:
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
         self._stop = stop
         self._source_broke = False
+        self._further_faults = faults
         self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
         self._said_faults: dict[str, str] = {}  # in the log
 
@@ -332,6 +334,7 @@ class Daemon:
             self._recorder.failure,
             self._estimates.failure,
             self._keeper.failure,
+            *(fault() for fault in self._further_faults),
         )
         message = "; ".join(fault for fault in faults if fault)
         now = (watch.state, watch.verdict, self._source.connected, message, self._reference.revision)

@@ -1,4 +1,4 @@
-"""Where frames come from: a folder of images, a video file, a live camera, a simulated one.
+"""Where frames come from: a folder of images, a video file, a live camera, one on the network, a simulated one.
 
 All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
 """
@@ -10,11 +10,13 @@ from pathlib import Path
 from gripmon.sources.base import READ_TIMEOUT_S, Source, SourceError, Waiting
 from gripmon.sources.folder import FolderSettings, FolderSource
 from gripmon.sources.live import LiveCamera, LiveSettings
+from gripmon.sources.network import NetworkCamera, NetworkSettings, network_key
 from gripmon.sources.newest import NewestFrame
 from gripmon.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
 from gripmon.sources.video import VideoSettings, VideoSource
+from gripmon.wire import Keys, Link
 
-SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings
+SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings | NetworkSettings
 
 __all__ = [
     "READ_TIMEOUT_S",
@@ -22,6 +24,8 @@ __all__ = [
     "FolderSource",
     "LiveCamera",
     "LiveSettings",
+    "NetworkCamera",
+    "NetworkSettings",
     "NewestFrame",
     "SimulatedScene",
     "SimulatedSettings",
@@ -32,15 +36,24 @@ __all__ = [
     "VideoSource",
     "Waiting",
     "make_simulator",
+    "network_key",
     "open_source",
     "settings_for_path",
 ]
 
 
-def open_source(settings: SourceSettings, relative_to: Path = Path(), *, scene: SimulatedScene | None = None) -> Source:
+def open_source(
+    settings: SourceSettings,
+    relative_to: Path = Path(),
+    *,
+    scene: SimulatedScene | None = None,
+    link: Link | None = None,
+    keys: Keys | None = None,
+) -> Source:
     """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
 
-    Only the simulator needs a ``scene``.  Its real-time camera starts another Python process by ``multiprocessing``, so
+    Only the simulator needs a whole ``scene``, and a camera on the network the size of the scene's camera, the session
+    and the monitor's keys.  The simulator's real-time camera starts another Python process by ``multiprocessing``, so
     a script that opens one must keep its own start behind ``if __name__ == "__main__"``.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
@@ -57,6 +70,11 @@ def open_source(settings: SourceSettings, relative_to: Path = Path(), *, scene: 
             return VideoSource(settings, relative_to)
         case LiveSettings():
             return LiveCamera(settings)
+        case NetworkSettings():
+            if link is None or keys is None or scene is None:
+                raise SourceError("kind: zenoh has no session here; publish.enabled: true, and gripmon run")
+            size_px = scene.camera.width_px, scene.camera.height_px
+            return NetworkCamera(settings, link, keys["image"], size_px)
 
 
 def settings_for_path(path: Path) -> FolderSettings | VideoSettings:

@@ -1,0 +1,181 @@
+"""A camera driver's payload -> an image, checked before anything of it is decoded."""
+
+from __future__ import annotations
+
+import functools
+import io
+import warnings
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records import FrameNote, Image, MessageRefused, from_json
+
+if TYPE_CHECKING:
+    from PIL.ImageFile import ImageFile
+
+JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+"""How such a file begins."""
+
+MOST_SCANS = 100
+"""A progressive JPEG has some ten; each one costs as much as the whole image, whatever few bytes it takes."""
+
+
+class PayloadError(ValueError):
+    """A payload that can't be used; the text is "what is wrong; what would be right", in one line."""
+
+
+class Pixels(NamedTuple):
+    """How a pixel lies in memory.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the way to
+    BGR; neither where nothing is to be done.
+    """
+
+    channels: int
+    dtype: str
+    conversion: str | None = None
+    only: int | None = None
+
+
+def _bayer() -> dict[str, Pixels]:
+    # Both ROS and OpenCV name the first two pixels of the first two rows here; OpenCV's short names don't.
+    patterns = ("rggb", "bggr", "gbrg", "grbg")
+    return {f"bayer_{p}{8 * n}": Pixels(1, f"u{n}", f"COLOR_Bayer{p.upper()}2BGR") for p in patterns for n in (1, 2)}
+
+
+ENCODINGS: dict[str, Pixels] = {
+    "mono8": Pixels(1, "u1"),
+    "mono16": Pixels(1, "u2"),
+    "8UC1": Pixels(1, "u1"),
+    "16UC1": Pixels(1, "u2"),
+    "32FC1": Pixels(1, "f4"),
+    "bgr8": Pixels(3, "u1"),
+    "bgr16": Pixels(3, "u2"),
+    "rgb8": Pixels(3, "u1", "COLOR_RGB2BGR"),
+    "rgb16": Pixels(3, "u2", "COLOR_RGB2BGR"),
+    "bgra8": Pixels(4, "u1", "COLOR_BGRA2BGR"),
+    "rgba8": Pixels(4, "u1", "COLOR_RGBA2BGR"),
+    # Brightness alone: it is all that is measured.
+    "yuv422_yuy2": Pixels(2, "u1", only=0),
+    "yuv422": Pixels(2, "u1", only=1),
+    **_bayer(),
+}
+"""Pixel formats of raw frames, named as in ROS 2; more than one byte: little endian."""
+
+
+def read_note(attachment: bytes | None) -> FrameNote:
+    """The attachment; an empty one where there is none.  Raises :class:`PayloadError`."""
+    if not attachment:
+        return FrameNote()
+    try:
+        return from_json(attachment, FrameNote)
+    except MessageRefused as error:
+        raise PayloadError(f"attachment: {error}") from None
+
+
+def check_size(size_px: tuple[int, int], expected_px: tuple[int, int]) -> None:
+    """Raises :class:`PayloadError` unless an image is as large as the camera's, (width, height)."""
+    if size_px != expected_px:
+        came, right = (f"{width}x{height}" for width, height in (size_px, expected_px))
+        raise PayloadError(f"{came} pixels; {right} as the camera's calibration says")
+
+
+def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> Image:
+    """Raw pixels -> H x W, or H x W x 3 (BGR); it may be a read-only view of the payload.
+
+    Raises :class:`PayloadError`.
+    """
+    if note.width is None or note.height is None or note.encoding is None:
+        missing = [name for name in ("width", "height", "encoding") if getattr(note, name) is None]
+        raise PayloadError(f"raw pixels without {', '.join(missing)}; all three in the attachment")
+    check_size((note.width, note.height), expected_px)
+    pixels = ENCODINGS.get(note.encoding)
+    if pixels is None:
+        raise PayloadError(f"encoding {note.encoding!r}; one of {', '.join(ENCODINGS)}")
+    item = int(pixels.dtype[1])
+    row = note.width * pixels.channels * item
+    step = row if note.step is None else note.step
+    if step < row or step % item:
+        raise PayloadError(f"step {step}; at least {row} bytes, a multiple of {item}")
+    if len(payload) != step * note.height:
+        raise PayloadError(f"{len(payload)} bytes; {step * note.height} ({note.height} rows of {step})")
+    rows = np.frombuffer(payload, f"<{pixels.dtype}").reshape(note.height, step // item)
+    image = rows[:, : note.width * pixels.channels]
+    if pixels.channels > 1:
+        image = image.reshape(note.height, note.width, pixels.channels)
+    return _converted(image, pixels)
+
+
+def _converted(image: NDArray[Any], pixels: Pixels) -> Image:
+    if pixels.only is not None:
+        image = image[:, :, pixels.only]
+    # In the machine's own byte order, of which OpenCV knows no other.
+    image = np.ascontiguousarray(image, dtype=f"={pixels.dtype}")
+    if pixels.conversion is None:
+        return image
+    import cv2
+
+    converted: Image = cv2.cvtColor(image, getattr(cv2, pixels.conversion))
+    return converted
+
+
+def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
+    """A JPEG or PNG file -> H x W, or H x W x 3 (BGR), uint8, or uint16 for grey PNGs of 16 bits.
+
+    Its header is held against ``expected_px``, (width, height), before memory is taken or a pixel is decoded.  Pillow
+    does both: OpenCV has no way to the header alone, and writes what it thinks of a damaged file to stderr.  Raises
+    :class:`PayloadError`.
+    """
+    try:
+        if payload.startswith(PNG):
+            _check_png(payload)
+            with _open_file(payload) as checked:
+                check_size(checked.size, expected_px)
+                checked.verify()  # the check sums; the file has to be opened anew after it
+        elif payload.count(b"\xff\xda") > MOST_SCANS:
+            raise PayloadError(f"a JPEG of more than {MOST_SCANS} scans; a usual one")
+        with _open_file(payload) as file:
+            check_size(file.size, expected_px)
+            return _array_of(file)
+    except PayloadError:
+        raise
+    except Exception as error:  # noqa: BLE001  a dozen types, by what is damaged
+        what = " ".join(str(error).split()) or type(error).__name__
+        raise PayloadError(
+            f"damaged {'PNG' if payload.startswith(PNG) else 'JPEG'} file ({what}); a whole one"
+        ) from None
+
+
+def _open_file(payload: bytes) -> ImageFile:
+    """Reads the header.  These two classes alone: Pillow's general ``open`` would try all formats."""
+    jpeg, png = _pillow()
+    return png(io.BytesIO(payload)) if payload.startswith(PNG) else jpeg(io.BytesIO(payload))
+
+
+@functools.cache
+def _pillow() -> tuple[type[ImageFile], type[ImageFile]]:
+    from PIL.JpegImagePlugin import JpegImageFile
+    from PIL.PngImagePlugin import PngImageFile
+
+    # Damaged metadata, which nobody reads here, would be a line on stderr for every frame.
+    warnings.filterwarnings("ignore", module=r"PIL\.")
+    return JpegImageFile, PngImageFile
+
+
+def _check_png(payload: bytes) -> None:
+    if payload[12:16] != b"IHDR" or len(payload) < 33:
+        raise PayloadError("a PNG file without a header; a whole one")
+    bits, colour = payload[24], payload[25]
+    if bits > 8 and colour != 0:
+        raise PayloadError("a PNG file with colours of 16 bits; 8 bits, or grey")
+
+
+def _array_of(file: ImageFile) -> Image:
+    if file.mode in ("L", "I;16"):
+        return np.asarray(file, dtype=np.uint8 if file.mode == "L" else np.uint16)
+    if file.mode in ("1", "LA"):
+        return np.asarray(file.convert("L"))
+    if file.mode in ("RGB", "RGBA", "P"):
+        rgb = np.asarray(file if file.mode != "P" else file.convert("RGB"))
+        return np.ascontiguousarray(rgb[:, :, 2::-1])
+    raise PayloadError(f"a file of colour mode {file.mode}; grey or RGB")
