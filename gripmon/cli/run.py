@@ -189,12 +189,13 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 
 def _open_link(config: Config) -> Link | None:
     """The session; None if nothing is published."""
+    from gripmon.ros2 import network_of
     from gripmon.wire import Link, PublishError
 
     if not config.settings.publish.enabled:
         return None
     try:
-        return Link(config.settings.publish, config.directory)
+        return Link(network_of(config.settings.publish, config.settings.ros2), config.directory)
     except PublishError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
 
@@ -210,7 +211,24 @@ def _open_publisher(config: Config, link: Link | None) -> tuple[Publisher, JawFe
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
         jaw = _network_jaw(config, link, publisher.keys)
-    return publisher, jaw, ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    return _with_ros2(config, link, publisher), jaw, commands
+
+
+def _with_ros2(config: Config, link: Link, publisher: Publisher) -> Publisher:
+    """The publisher, and the ROS 2 node beside it where the configuration wants one."""
+    from gripmon.publish import Publishers
+    from gripmon.ros2 import Ros2Missing, Ros2Publisher, layout_of
+
+    settings = config.settings
+    if not settings.ros2.enabled:
+        return publisher
+    layout = layout_of(settings.ros2, settings.robot, settings.camera_name)
+    try:
+        return Publishers(publisher, {"ROS 2": Ros2Publisher(link, settings.ros2, layout)})
+    except Ros2Missing as error:
+        link.close()
+        raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None
 
 
 def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:

@@ -23,6 +23,7 @@ from gripmon.corners.taught import mismatch
 from gripmon.geometry import from_record, to_record
 from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
 from gripmon.records import Array, ReferenceRecord, to_json
+from gripmon.ros2 import fault_of as ros2_fault
 from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.statefile import AUTO, Owner, calibration_of, default_path
 
@@ -117,6 +118,7 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
         monitor_fault(settings.monitor)
         or jaw_fault(settings, gripper)
         or network_fault(settings)
+        or _ros2_fault(settings)
         or view_fault(config.view(), gripper, camera)
     )
     if fault is None and check_source:
@@ -196,6 +198,11 @@ def _taught(config: Config) -> TaughtModel | None:
     if fault is not None:
         raise ConfigError(path, *fault)
     return model
+
+
+def _ros2_fault(settings: Settings) -> Fault | None:
+    fault = ros2_fault(settings.ros2, settings.publish, settings.robot, settings.camera_name)
+    return None if fault is None else Fault(f"ros2.{fault.key}", fault.wrong, fault.right)
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -11,7 +11,7 @@ from gripmon.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.recording import RecordingSettings
-from gripmon.ros2 import JointOpening
+from gripmon.ros2 import JointOpening, Ros2Settings
 from gripmon.sources import SourceSettings
 from gripmon.statefile import StateSettings
 from gripmon.wire import PublishSettings
@@ -103,6 +103,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     jaw: JawSettings = JawSettings()
     monitor: MonitorSettings = MonitorSettings()
     publish: PublishSettings = PublishSettings()
+    ros2: Ros2Settings = Ros2Settings()
     recording: RecordingSettings = RecordingSettings()
     daemon: DaemonSettings = DaemonSettings()
     state: StateSettings = StateSettings()

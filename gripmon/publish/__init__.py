@@ -19,11 +19,13 @@ from __future__ import annotations
 from gripmon.publish.commands import PendingCommand, ZenohCommands
 from gripmon.publish.jaw import ZenohJaw
 from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
+from gripmon.publish.several import Publishers
 
 __all__ = [
     "NullPublisher",
     "PendingCommand",
     "Publisher",
+    "Publishers",
     "ZenohCommands",
     "ZenohJaw",
     "ZenohPublisher",

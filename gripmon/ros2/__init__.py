@@ -15,6 +15,9 @@ from gripmon.ros2.decode import (
     decode_joint_state,
 )
 from gripmon.ros2.names import NodeName, Qos, RosNameError, subscription_key
+from gripmon.ros2.node import Node
+from gripmon.ros2.publisher import Ros2Publisher
+from gripmon.ros2.settings import Layout, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, Ros2Missing
 
 __all__ = [
@@ -23,13 +26,21 @@ __all__ = [
     "IMAGE",
     "JOINT_STATE",
     "JointOpening",
+    "Layout",
     "MessageError",
+    "Node",
     "NodeName",
     "Qos",
+    "Ros2Fault",
     "Ros2Missing",
+    "Ros2Publisher",
+    "Ros2Settings",
     "RosNameError",
     "decode_compressed_image",
     "decode_image",
     "decode_joint_state",
+    "fault_of",
+    "layout_of",
+    "network_of",
     "subscription_key",
 ]

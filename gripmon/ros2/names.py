@@ -43,6 +43,10 @@ class Qos:
         return f"{reliability}:{durability}:,{depth}:,:,:,,"
 
 
+DEFAULT_QOS = Qos()
+"""ROS 2's default: reliable, volatile, keep last 10."""
+
+
 @dataclass(frozen=True, slots=True)
 class NodeName:
     """A node and its namespace, which begins with ``/``."""

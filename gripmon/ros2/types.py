@@ -17,7 +17,7 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
 class Ros2Missing(ImportError):
-    """The optional dependency is not there."""
+    """The optional dependencies are not there; the text is ``what is wrong; what would be right``."""
 
 
 @functools.cache
@@ -27,9 +27,10 @@ def typestore() -> Typestore:
     Raises :class:`Ros2Missing`.
     """
     try:
+        import xxhash  # noqa: F401  both come with the same extra: said at the start, not at the first node
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise Ros2Missing("ROS 2 needs the package rosbags: pip install 'gripmon[ros2]'") from error
+        raise Ros2Missing(f"needs the package {error.name}; pip install 'gripmon[ros2]'") from error
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -37,3 +38,10 @@ def typestore() -> Typestore:
 def type_hash(type_name: str) -> str:
     """``RIHS01_…`` of a type, as REP-2016 has it."""
     return typestore().hash_rihs01(type_name)
+
+
+def prepare(*type_names: str) -> None:
+    """Have the code for these types generated now, tens of milliseconds that no frame should wait for."""
+    for type_name in type_names:
+        typestore().get_msgdef(type_name)
+        type_hash(type_name)

@@ -1,0 +1,78 @@
+"""Several publishers in place of one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import ParamSpec
+
+import msgspec
+
+from gripmon.publish.publisher import Publisher
+from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+
+_log = logging.getLogger(__name__)
+_P = ParamSpec("_P")
+
+
+class Publishers:
+    """Hands each record to the first publisher and then to the others.
+
+    What the first raises is raised, after the others had the record.  What another one raises is logged once, until it
+    changes, and stands in the ``message`` of the states that the first gets: it never reaches the caller.
+    """
+
+    def __init__(self, first: Publisher, others: dict[str, Publisher]) -> None:
+        """``others`` by the names that they have in messages."""
+        self._first = first
+        self._others = others
+        self._faults: dict[tuple[str, str], str] = {}  # by publisher and method, of which one may work and one not
+
+    def transform(self, record: FrameRecord) -> None:
+        try:
+            self._first.transform(record)
+        finally:
+            for name, other in self._others.items():
+                self._hand(name, other.transform, record)
+
+    def state(self, record: StateRecord) -> None:
+        faults = "; ".join(dict.fromkeys(self._faults.values()))
+        message = f"{record.message}; {faults}" if record.message and faults else record.message or faults
+        try:
+            self._first.state(msgspec.structs.replace(record, message=message))
+        finally:
+            for name, other in self._others.items():
+                self._hand(name, other.state, record)
+
+    def alert(self, record: AlertRecord) -> None:
+        try:
+            self._first.alert(record)
+        finally:
+            for name, other in self._others.items():
+                self._hand(name, other.alert, record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        try:
+            self._first.reference(record)
+        finally:
+            for name, other in self._others.items():
+                self._hand(name, other.reference, record)
+
+    def close(self) -> None:
+        """Close all, the first last."""
+        for name, other in self._others.items():
+            self._hand(name, other.close)
+        self._first.close()
+
+    def _hand(self, name: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> None:
+        what = (name, put.__name__)
+        try:
+            put(*values, **named)
+        except Exception as error:  # noqa: BLE001  said here and in the state
+            text = f"{name} fails: {' '.join(str(error).split()) or type(error).__name__}"
+            if self._faults.get(what) != text:
+                _log.error("%s", text)
+                _log.debug("%s", name, exc_info=error)
+            self._faults[what] = text
+        else:
+            self._faults.pop(what, None)

@@ -1,0 +1,397 @@
+"""The monitor as a ROS 2 node, met by plain Zenoh sessions; its settings; and that nobody suffers when it fails."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import ros2_idl as idl
+import zenoh
+from loopback import (
+    alert_record,
+    frame_record,
+    free_endpoint,
+    plain_session,
+    reference_record,
+    state_record,
+    wait_until,
+)
+from stand_ins import Listener, ScriptedMonitor, TickingSource
+
+from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, StopRequest
+from gripmon.publish import Publishers
+from gripmon.records import AlertEvent, Severity, Verdict
+from gripmon.ros2 import Layout, NodeName, Ros2Fault, Ros2Publisher, Ros2Settings, fault_of, layout_of, network_of
+from gripmon.ros2.messages import inverse
+from gripmon.ros2.node import gid_of
+from gripmon.wire import Link, PublishSettings
+
+TF_KEY = "0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
+POSE_KEY = (
+    "0/arm/wrist/gripmon/cam_T_grip/geometry_msgs::msg::dds_::PoseWithCovarianceStamped_/"
+    "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
+)
+DIAGNOSTICS_KEY = (
+    "0/diagnostics/diagnostic_msgs::msg::dds_::DiagnosticArray_/"
+    "RIHS01_5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+)
+ON = Ros2Settings(enabled=True)
+
+
+def layout(settings: Ros2Settings = ON) -> Layout:
+    return layout_of(settings, "arm", "wrist")
+
+
+class Bench:
+    """A publisher on a link, and in another session a subscriber to everything of its domain."""
+
+    def __init__(self, settings: Ros2Settings, session: zenoh.Session, link: Link) -> None:
+        self.session = session
+        self.publisher = Ros2Publisher(link, settings, layout(settings))
+        self._marks = 0
+        self._samples: list[zenoh.Sample] = []
+        self._subscriber = session.declare_subscriber(f"{settings.domain_id}/**", self._samples.append)
+        wait_until(lambda: self._marked(self._mark()), "the subscription to reach the publisher")
+        self.published()
+
+    def published(self) -> list[zenoh.Sample]:
+        """All that was published since the last call.  Diagnostics have the lowest priority: what was put before the
+        mark arrives before it.
+        """
+        mark = self._mark()
+        wait_until(lambda: self._marked(mark), "the mark")
+        at = next(i for i, sample in enumerate(self._samples) if mark in sample.payload.to_bytes())
+        taken = self._samples[:at]
+        self._samples.clear()
+        return taken
+
+    def payloads(self) -> dict[str, bytes]:
+        """The same by key, where each has one at most."""
+        samples = self.published()
+        payloads = {str(sample.key_expr): sample.payload.to_bytes() for sample in samples}
+        assert len(payloads) == len(samples)
+        return payloads
+
+    def _mark(self) -> bytes:
+        self._marks += 1
+        self.publisher.state(msgspec.structs.replace(state_record(), version=f"mark-{self._marks:04}"))
+        return f"mark-{self._marks:04}".encode()
+
+    def _marked(self, mark: bytes) -> bool:
+        return any(mark in sample.payload.to_bytes() for sample in list(self._samples))
+
+
+@pytest.fixture
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(listen=(endpoint,)))
+    with plain_session(connect=endpoint) as session:
+        yield lambda settings=ON: Bench(settings, session, link)
+    link.close()
+
+
+def status(payload: bytes) -> idl.DiagnosticStatus:
+    (only,) = idl.DiagnosticArray.deserialize(payload).status
+    return only
+
+
+def values(payload: bytes) -> dict[str, str]:
+    return {entry.key: entry.value for entry in status(payload).values}
+
+
+def test_a_valid_frame(make_bench: Callable[..., Bench]):
+    bench, record = make_bench(), frame_record()
+    bench.publisher.transform(record)
+    bench.publisher.reference(reference_record())
+    payloads = bench.payloads()
+    assert set(payloads) == {TF_KEY, POSE_KEY}
+    (placed,) = idl.TFMessage.deserialize(payloads[TF_KEY]).transforms
+    pose = idl.PoseWithCovarianceStamped.deserialize(payloads[POSE_KEY])
+    assert placed.header == pose.header == idl.Header(idl.Time(1_700_000_000, 123_456_796), "wrist_optical_frame")
+    assert placed.child_frame_id == "arm_wrist_gripmon"
+    assert placed.transform.translation == pose.pose.pose.position == idl.Vector3(0.011, -0.022, 0.133)
+    assert placed.transform.rotation == idl.Quaternion(0.1, -0.2, 0.3, 0.9273618495495703)
+    assert tuple(pose.pose.covariance) == record.covariance
+
+
+def test_smoothed_inverse_on_another_domain_under_other_names(make_bench: Callable[..., Bench]):
+    settings = Ros2Settings(
+        enabled=True, domain_id=42, node="watch", namespace="/cell_3", publish="gripper_from_camera",
+        parent_frame="tcp", child_frame="corrected_camera", transform="smoothed", tf_topic="tf", pose_topic="camera",
+    )  # fmt: skip
+    bench, record = make_bench(settings), frame_record()
+    bench.publisher.transform(record)
+    payloads = bench.payloads()
+    tf_key, pose_key = sorted(payloads, reverse=True)
+    assert tf_key.startswith("42/cell_3/tf/tf2_msgs::") and pose_key.startswith("42/cell_3/camera/geometry_msgs::")
+    (placed,) = idl.TFMessage.deserialize(payloads[tf_key]).transforms
+    assert (placed.header.frame_id, placed.child_frame_id) == ("tcp", "corrected_camera")
+    smoothed = record.smoothed
+    expected, covariance = inverse(smoothed, smoothed.covariance)
+    assert placed.transform.translation == idl.Vector3(*expected.translation_m)
+    assert placed.transform.rotation == idl.Quaternion(*expected.rotation_xyzw)
+    pose = idl.PoseWithCovarianceStamped.deserialize(payloads[pose_key])
+    assert pose.pose.covariance == covariance.tolist()
+    bench.publisher.transform(frame_record(smoothed=None))
+    assert not bench.published()
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "changes", "published", "why"),
+    [
+        (("valid",), {}, True, "yes"),
+        (("valid",), {"verdict": Verdict.SUSPECT}, False, "no: verdict suspect"),
+        (("valid", "suspect"), {"verdict": Verdict.SUSPECT}, True, "yes"),
+        (("valid", "suspect"), {"verdict": Verdict.UNKNOWN}, False, "no: verdict unknown"),
+        (("valid", "suspect"), {"verdict": Verdict.SUSPECT, "cam_T_grip": None, "covariance": None}, False,
+         "no: no transform"),
+    ],
+)  # fmt: skip
+def test_what_may_not_be_used_is_not_broadcast(
+    make_bench: Callable[..., Bench], verdicts: tuple[str, ...], changes: dict[str, object], published: bool, why: str
+):
+    bench = make_bench(Ros2Settings(enabled=True, verdicts=verdicts))
+    bench.publisher.transform(frame_record(**changes))
+    bench.publisher.state(state_record())
+    payloads = bench.payloads()
+    assert set(payloads) == ({TF_KEY, POSE_KEY, DIAGNOSTICS_KEY} if published else {DIAGNOSTICS_KEY})
+    assert values(payloads[DIAGNOSTICS_KEY])["broadcast"] == why
+
+
+def test_diagnostics_follow_the_alerts(make_bench: Callable[..., Bench]):
+    bench = make_bench()
+    assert values_after(bench, lambda: None)["broadcast"] == "no: no frame yet"
+    raised = msgspec.structs.replace(alert_record(), event=AlertEvent.RAISED, alert_id="drift-7")
+    # Said at once, not with the next state.
+    bench.publisher.alert(raised)
+    (sample,) = bench.published()
+    assert status(sample.payload.to_bytes()).level == 1 and "moved 1.5 mm" in status(sample.payload.to_bytes()).message
+    worse = msgspec.structs.replace(raised, event=AlertEvent.UPDATED, severity=Severity.ERROR, text="moved 4 mm")
+    bench.publisher.alert(worse)
+    (sample,) = bench.published()
+    assert status(sample.payload.to_bytes()).level == 2
+    assert values(sample.payload.to_bytes())["alerts"] == "drift (error)"
+    bench.publisher.alert(msgspec.structs.replace(worse, event=AlertEvent.CLEARED))
+    (sample,) = bench.published()
+    assert status(sample.payload.to_bytes()).level == 0 and values(sample.payload.to_bytes())["alerts"] == ""
+    bench.publisher.alert(alert_record())  # only noted: neither open nor over
+    assert not bench.published()
+
+
+def values_after(bench: Bench, act: Callable[[], None]) -> dict[str, str]:
+    act()
+    bench.publisher.state(state_record())
+    return values(bench.payloads()[DIAGNOSTICS_KEY])
+
+
+def test_attachments_count_and_name_the_publisher(make_bench: Callable[..., Bench]):
+    bench = make_bench()
+    for seq in range(3):
+        bench.publisher.transform(frame_record(seq))
+    samples = [sample for sample in bench.published() if str(sample.key_expr) == TF_KEY]
+    fields = tuple[zenoh.ext.Int64, zenoh.ext.Int64, bytes]
+    numbers, stamps_ns, gids = zip(
+        *(zenoh.ext.z_deserialize(fields, sample.attachment) for sample in samples), strict=True
+    )
+    assert numbers == (1, 2, 3)
+    assert list(stamps_ns) == sorted(stamps_ns) and stamps_ns[0] > 1_700_000_000_000_000_000
+    (token,) = [token for token in tokens(bench.session) if "/%tf/" in token]
+    assert set(gids) == {gid_of(token)}
+
+
+def tokens(session: zenoh.Session) -> list[str]:
+    return [str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**", timeout=5.0) if reply.ok]
+
+
+def test_the_node_is_in_the_graph_until_it_closes(make_bench: Callable[..., Bench]):
+    bench = make_bench()
+    seen = tokens(bench.session)
+    (node,) = [token for token in seen if "/NN/" in token]
+    zid, node_id = node.split("/")[2:4]
+    (publisher,) = map(str, [*bench.session.info.peers_zid(), *bench.session.info.routers_zid()])
+    assert zid == publisher
+    assert node == f"@ros2_lv/0/{zid}/{node_id}/{node_id}/NN/%/%arm%wrist/gripmon"
+    endpoints = sorted(token.split("/MP/%/%arm%wrist/gripmon/")[1] for token in seen if "/MP/" in token)
+    assert endpoints == [
+        f"%arm%wrist%gripmon%cam_T_grip/{'/'.join(POSE_KEY.split('/')[-2:])}/::,10:,:,:,,",
+        f"%diagnostics/{'/'.join(DIAGNOSTICS_KEY.split('/')[-2:])}/::,10:,:,:,,",
+        f"%tf/{'/'.join(TF_KEY.split('/')[-2:])}/::,100:,:,:,,",
+    ]
+    ids = [token.split("/")[4] for token in seen]
+    assert len(set(ids)) == len(ids) == 4
+    bench.publisher.close()
+    wait_until(lambda: not tokens(bench.session), "the tokens to go")
+    bench.publisher.transform(frame_record())  # and nothing is raised
+
+
+def test_a_client_whose_router_comes_late():
+    """Nothing is kept for it: an old transform would be taken for a new one."""
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(mode="client", connect=(endpoint,), retry_longest_s=0.25))
+    publisher = Ros2Publisher(link, ON, layout())
+    publisher.state(state_record())
+    publisher.transform(frame_record())
+    with plain_session(listen=endpoint, mode="router") as session:
+        samples: list[zenoh.Sample] = []
+        subscriber = session.declare_subscriber("0/**", samples.append)
+        wait_until(lambda: len(tokens(session)) == 4, "the node")
+
+        def arrives() -> bool:
+            publisher.transform(frame_record(9))
+            return bool(samples)
+
+        wait_until(arrives, "a transform")
+        (placed,) = idl.TFMessage.deserialize(samples[0].payload.to_bytes()).transforms
+        assert placed.header.stamp.nanosec == 123_456_789 + 9
+        subscriber.undeclare()
+        link.close()
+
+
+# --- settings ---
+
+
+def test_one_line_turns_it_on(tmp_path: Path):
+    text = (
+        builtin_config("demo.yaml")
+        .read_text()
+        .replace("gripper: grippers", f"gripper: {builtin_config('demo.yaml').parent}/grippers")
+    )
+    path = tmp_path / "demo.yaml"
+    path.write_text(text)
+    assert not load_config(path).settings.ros2.enabled
+    path.write_text(text + "ros2: {enabled: true}\n")
+    settings = load_config(path).settings
+    assert layout_of(settings.ros2, settings.robot, settings.camera_name) == Layout(
+        0, NodeName("gripmon", "/demo/wrist"), "wrist_optical_frame", "demo_wrist_gripmon", "/tf",
+        "/demo/wrist/gripmon/cam_T_grip",
+    )  # fmt: skip
+    joined = network_of(settings.publish, settings.ros2)
+    assert (joined.mode, joined.connect) == ("client", ("tcp/127.0.0.1:7447",))
+    path.write_text(text + "ros2: {enabled: true, child_frame: wrist_optical_frame}\n")
+    with pytest.raises(ConfigError, match=r"demo.yaml: ros2.child_frame: is wrist_optical_frame, the parent's name"):
+        load_config(path)
+
+
+def test_what_the_configuration_says_of_the_network_holds():
+    for said in (
+        PublishSettings(listen=("tcp/127.0.0.1:7777",)),
+        PublishSettings(connect=("tcp/127.0.0.1:7777",)),
+        PublishSettings(mode="client", connect=("tcp/127.0.0.1:7777",)),
+        PublishSettings(zenoh_config="zenoh.json5"),
+    ):
+        assert network_of(said, ON) is said
+    plain = PublishSettings(jaw_max_age_s=3.0)
+    assert network_of(plain, Ros2Settings()) is plain
+    assert network_of(plain, Ros2Settings(enabled=True, router=None)) is plain
+    elsewhere = network_of(plain, Ros2Settings(enabled=True, router="tcp/10.0.0.1:7447"))
+    assert (elsewhere.mode, elsewhere.connect, elsewhere.jaw_max_age_s) == ("client", ("tcp/10.0.0.1:7447",), 3.0)
+
+
+def test_names_of_ours_that_ros_does_not_allow():
+    made = layout_of(ON, "arm-1", "left wrist")
+    assert made.node.namespace == "/arm_1/left_wrist"
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"publish": "gripper_from_camera"}, "parent_frame"),
+        ({"parent_frame": "a", "child_frame": "a"}, "child_frame"),
+        ({"node": "grip-mon"}, "node"),
+        ({"namespace": "arm"}, "namespace"),
+        ({"tf_topic": "/tf/"}, "tf_topic"),
+        ({"pose_topic": "~/cam T grip"}, "pose_topic"),
+    ],
+)
+def test_settings_that_can_not_be(changes: dict[str, str], key: str):
+    settings = Ros2Settings(enabled=True, **changes)
+    with pytest.raises(Ros2Fault) as caught:
+        layout(settings)
+    assert caught.value.key == key and caught.value.wrong and caught.value.right
+    assert fault_of(settings, PublishSettings(), "arm", "wrist").key == key
+    assert fault_of(msgspec.structs.replace(settings, enabled=False), PublishSettings(), "arm", "wrist") is None
+
+
+def test_without_publishing_there_is_no_node():
+    assert fault_of(ON, PublishSettings(enabled=False), "arm", "wrist").key == "enabled"
+
+
+# --- failures ---
+
+
+class Failing(Listener):
+    """Fails in everything, also in closing."""
+
+    def __init__(self) -> None:
+        super().__init__(fails="everything", closing_fails=True)
+
+
+def test_a_failing_node_stops_neither_the_loop_nor_the_other_publisher(caplog: pytest.LogCaptureFixture):
+    """Nor does it count as an error of the daemon, which gives up after some."""
+    caplog.set_level(logging.ERROR)
+    first = Listener()
+    stop = StopRequest()
+    monitor = ScriptedMonitor(lambda seq: stop.request(0) or {} if seq == 20 else {})
+    daemon = Daemon(
+        monitor,
+        TickingSource(200.0),
+        Publishers(first, {"ROS 2": Failing()}),
+        Listener(),
+        DaemonSettings(give_up_after_errors=3, state_period_s=0.01),
+        stop,
+        robot="arm",
+        camera="wrist",
+        estimates=EstimatesFile(None),
+    )
+    assert daemon.run() == 0
+    assert [record.seq for record in first.transforms] == list(range(21))
+    assert "ROS 2 fails: " in first.states[-1].message
+    assert len(first.references) == 1
+    said = [record for record in caplog.records if "ROS 2 fails" in record.message]
+    assert 1 <= len(said) <= 4  # once for each kind of message
+
+
+def test_the_first_publishers_failure_is_the_daemons_to_know():
+    """And the others have the record all the same; an other's fault is forgotten when it works again."""
+    other, failing = Listener(), Listener(fails="everything")
+    publishers = Publishers(failing, {"ROS 2": other})
+    for put, record in (
+        (publishers.transform, frame_record()),
+        (publishers.state, state_record()),
+        (publishers.alert, alert_record()),
+        (publishers.reference, reference_record()),
+    ):
+        with pytest.raises(OSError, match="the line is cut"):
+            put(record)
+    assert (len(other.transforms), len(other.states), len(other.alerts), len(other.references)) == (1, 1, 1, 1)
+    first, flaky = Listener(), Listener(fails="transform")
+    publishers = Publishers(first, {"ROS 2": flaky})
+    publishers.transform(frame_record())
+    publishers.state(state_record(message="no jaw"))
+    assert first.states[-1].message.startswith("no jaw; ROS 2 fails: ")
+    assert flaky.states[-1].message == "no jaw"
+    flaky.fails = ""
+    publishers.transform(frame_record())
+    publishers.state(state_record())
+    assert first.states[-1].message == ""
+    publishers.close()
+    assert (first.closed, flaky.closed) == (1, 1)
+
+
+def test_a_node_that_can_not_be_declared_says_so_with_every_record():
+    """Others wait for the same session."""
+    link = Link(PublishSettings(listen=(free_endpoint(),)))
+    named = dataclasses.replace(layout(), tf_topic="/not a topic")
+    publisher = Ros2Publisher(link, ON, named)
+    reached = []
+    link.attach(reached.append)
+    assert reached
+    with pytest.raises(RuntimeError, match="could not be declared: topic '/not a topic'"):
+        publisher.transform(frame_record())
+    assert not tokens(reached[0])  # nor is half a node in the graph
+    link.close()
