@@ -6,9 +6,12 @@ import argparse
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.wire import Router
 
 _DESCRIPTION = """\
 Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
@@ -20,7 +23,7 @@ again for ever, and says so."""
 _EXAMPLES = """\
   gripmon certificates --out certificates              once: keys for everyone
   gripmon router configs/zenoh/router.json5            mutual TLS, and who may do what
-  gripmon router configs/zenoh/site.json5              without security, on this machine alone
+  gripmon router configs/zenoh/local.json5             without security, on this machine alone
 
 exit codes: 0 SIGTERM; 2 wrong usage or configuration; 130 Ctrl-C"""
 
@@ -47,12 +50,20 @@ def route(arguments: argparse.Namespace) -> int:
             raise common.CommandFailedError(f"router: {error}", common.EXIT_USAGE) from None
         with router:
             _say(f"listening on {', '.join(router.listens_on)}")
-            said = ""
-            while True:
-                time.sleep(_LOOK_EVERY_S)
-                if (fault := router.fault()) != said:
-                    _say(fault or "connected")
-                    said = fault
+            try:
+                _watch(router)
+            finally:
+                _say("stopped")
+
+
+def _watch(router: Router) -> NoReturn:
+    """Say whom the router misses, until a signal ends it."""
+    said = ""
+    while True:
+        time.sleep(_LOOK_EVERY_S)
+        if (fault := router.fault()) != said:
+            _say(fault or "connected")
+            said = fault
 
 
 def _say(text: str) -> None:

@@ -136,7 +136,11 @@ class Client:
             assert reply.err is not None
             error = from_json(reply.err.payload.to_bytes(), CommandError)
             raise NotCarriedOut(f"{monitor}: {error.text}", error.error)
-        raise NotCarriedOut(f"{monitor} doesn't answer; it may be told not to take commands (publish.commands)")
+        # A router's access rules drop without a word what they don't allow.
+        raise NotCarriedOut(
+            f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
+            "may not let you send any"
+        )
 
     def close(self) -> None:
         """Leave the network; iterations and callbacks end."""

@@ -1,0 +1,224 @@
+"""The shipped router with mutual TLS and access rules, against real sessions with and without certificates."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+import zenoh
+from loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
+from published import Published
+from router_process import ROOT, running
+
+from gripmon.cli import main
+from gripmon.client import Client, NotCarriedOut
+from gripmon.records import CommandName, CommandReply
+from gripmon.wire import PublishSettings
+from gripmon.wire.files import load_file
+
+PREFIX = "gripmon/arm/wrist"
+
+
+@dataclass
+class Site:
+    """A router's process, a monitor that is its client and answers commands, and a folder of files for everyone."""
+
+    folder: Path
+    endpoint: str
+    monitor: Published | None = None
+    commands: list[CommandName] = field(default_factory=list)
+    closing: threading.Event = field(default_factory=threading.Event)
+
+    def file(self, name: str) -> Path:
+        return self.folder / f"{name}.json5"
+
+    def session(self, name: str) -> zenoh.Session:
+        return zenoh.open(load_file(self.file(name)))
+
+    def answer(self) -> None:
+        while not self.closing.wait(0.01):
+            while (pending := self.monitor.commands.poll()) is not None:
+                self.commands.append(pending.command.name)
+                pending.answer(
+                    CommandReply(pending.command.name, done=True, text="so be it", reference_id="a", revision=1)
+                )
+
+
+def own_files(folder: Path, endpoint: str) -> None:
+    """The shipped files with another port, and certificates beside them."""
+    for file in (ROOT / "configs" / "zenoh").glob("*.json5"):
+        text = file.read_text()
+        folder.joinpath(file.name).write_text(text.replace("127.0.0.1:7447", endpoint.partition("/")[2]))
+    assert main(["certificates", "--out", str(folder / "certificates")]) == 0
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+    made = Site(tmp_path_factory.mktemp("site"), free_endpoint())
+    own_files(made.folder, made.endpoint)
+    with running(made.file("router"), made.endpoint):
+        made.monitor = Published(PublishSettings(zenoh_config="monitor.json5"), relative_to=made.folder)
+        answering = threading.Thread(target=made.answer)
+        answering.start()
+        try:
+            wait_until(lambda: made.monitor.connected, "the monitor's connection")
+            made.monitor.state(state_record(3))
+            made.monitor.reference(reference_record(4))
+            made.monitor.alert(alert_record("first"))
+            made.monitor.alert(alert_record("second"))
+            yield made
+        finally:
+            made.closing.set()
+            answering.join()
+            made.monitor.close()
+
+
+@pytest.mark.parametrize("name", ["controller", "operator"])
+def test_readers_read_everything(site: Site, name: str):
+    assert site.monitor is not None
+    with Client("arm", "wrist", zenoh_config_file=str(site.file(name))) as client:
+        wait_until(lambda: site.monitor.transform(frame_record()) or client.latest(), "a transform")
+        assert client.latest() == frame_record()
+        assert client.state().seq == 3 and client.reference().revision == 4
+        assert client.alive() == (("arm", "wrist"),)
+
+
+def test_late_joiners_history_works_through_the_rules(site: Site):
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+    with site.session("controller") as session:
+        for leaf, count in (("state", 1), ("reference", 1), ("alert", 2)):
+            subscriber = zenoh.ext.declare_advanced_subscriber(session, f"{PREFIX}/{leaf}", history=history)
+            got: list[dict[str, object]] = []
+            wait_until(
+                lambda s=subscriber, g=got, n=count: (
+                    ((x := s.try_recv()) and g.append(json.loads(x.payload.to_bytes()))) or len(g) == n
+                ),
+                f"the history of {leaf}",
+            )
+            if leaf == "alert":
+                assert [alert["text"] for alert in got] == ["first", "second"]
+
+
+def test_only_the_operator_commands(site: Site):
+    before = len(site.commands)
+    with Client("arm", "wrist", zenoh_config_file=str(site.file("controller"))) as controller:
+        for name in CommandName:
+            with pytest.raises(NotCarriedOut, match="may not let you"):
+                controller.send(name, timeout_s=1.0)
+        with site.session("controller") as session:
+            assert not list(session.get(f"{PREFIX}/cmd/undo", timeout=1.0))
+            assert not list(session.get("gripmon/*/*/cmd/*", timeout=1.0))
+            assert not list(session.get("gripmon/**", timeout=1.0))
+    with Client("arm", "wrist", zenoh_config_file=str(site.file("operator"))) as operator:
+        assert operator.send(CommandName.UNDO).text == "so be it"
+    assert site.commands[before:] == [CommandName.UNDO]
+
+
+def test_send_says_what_may_be_wrong(site: Site):
+    def send(name: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "gripmon", "send", "reset", "--robot", "arm", "--timeout", "3"]
+        command += ["--zenoh-config", str(site.file(name))]
+        return subprocess.run(command, capture_output=True, text=True, timeout=60.0, cwd=ROOT)
+
+    refused, obeyed = send("controller"), send("operator")
+    assert refused.returncode == 3 and refused.stderr.count("\n") == 1 and "may not let you" in refused.stderr
+    assert (obeyed.returncode, obeyed.stdout) == (0, "so be it\n")
+
+
+def test_a_controller_can_neither_speak_for_a_monitor_nor_for_the_jaw(site: Site):
+    heard: list[float] = []
+    read: list[bytes] = []
+    leaves = ("jaw", "image", "state", "transform", "alert", "reference")
+    with (
+        site.session("monitor") as listener,
+        site.session("operator") as operator,
+        site.session("controller") as controller,
+        site.session("robot") as robot,
+    ):
+        _jaw = listener.declare_subscriber(
+            f"{PREFIX}/jaw", lambda sample: heard.append(float(sample.payload.to_string()))
+        )
+        _readers = [
+            operator.declare_subscriber(f"{PREFIX}/{leaf}", lambda sample: read.append(sample.payload.to_bytes()))
+            for leaf in leaves
+        ]
+        for leaf in leaves:
+            controller.put(f"{PREFIX}/{leaf}", "666")
+        _token = controller.liveliness().declare_token("gripmon/fake/wrist/alive")
+        assert ask(controller, f"{PREFIX}/state")[0]["seq"] == 3  # so that the router has had what came before
+        wait_until(lambda: robot.put(f"{PREFIX}/jaw", "0.02") or heard, "the robot's opening")
+        wait_until(lambda: site.monitor.state(state_record(3)) or read, "a state")
+        assert set(heard) == {0.02} and b"666" not in read
+        alive = operator.liveliness().get("gripmon/*/*/alive", timeout=2.0)
+        assert [str(reply.ok.key_expr) for reply in alive] == [f"{PREFIX}/alive"]
+
+
+def test_a_robot_reads_nothing(site: Site):
+    with site.session("robot") as robot, site.session("controller") as controller:
+        stolen: list[zenoh.Sample] = []
+        read: list[zenoh.Sample] = []
+        _robots = robot.declare_subscriber("gripmon/**", stolen.append)
+        _robots_too = robot.declare_subscriber(f"{PREFIX}/transform", stolen.append)
+        _controllers = controller.declare_subscriber(f"{PREFIX}/transform", read.append)
+        wait_until(lambda: site.monitor.transform(frame_record()) or len(read) > 5, "transforms")
+        assert not list(robot.get(f"{PREFIX}/state", timeout=1.0))
+        assert not stolen
+
+
+@pytest.fixture
+def stranger(site: Site, tmp_path: Path) -> Path:
+    """The controller's file beside certificates that somebody else has made."""
+    shutil.copy(site.file("controller"), tmp_path)
+    assert main(["certificates", "--out", str(tmp_path / "certificates")]) == 0
+    return tmp_path
+
+
+def refused(path: Path) -> None:
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(load_file(path)).close()
+
+
+def test_a_certificate_of_another_authority_is_refused(site: Site, stranger: Path):
+    shutil.copy(site.folder / "certificates" / "ca.pem", stranger / "certificates")  # it trusts the router
+    refused(stranger / "controller.json5")
+
+
+def test_a_router_of_another_authority_is_refused(stranger: Path):
+    refused(stranger / "controller.json5")
+
+
+def test_no_certificate_is_refused(site: Site, stranger: Path):
+    shutil.copy(site.folder / "certificates" / "ca.pem", stranger / "certificates")
+    text = (stranger / "controller.json5").read_text()
+    (stranger / "bare.json5").write_text(re.sub(r"connect_(certificate|private_key): .*\n", "", text))
+    refused(stranger / "bare.json5")
+
+
+def test_no_tls_is_refused(site: Site, tmp_path: Path):
+    path = tmp_path / "plain.json5"
+    path.write_text(json.dumps({"mode": "client", "connect": {"endpoints": [site.endpoint]}}))
+    refused(path)
+
+
+def test_a_name_that_no_rule_knows_gets_nothing(site: Site):
+    """The right authority, so the connection stands; and that is all."""
+    assert main(["certificates", "visitor", "--out", str(site.folder / "certificates")]) == 0
+    site.file("visitor").write_text(site.file("controller").read_text().replace("controller", "visitor"))
+    with site.session("visitor") as visitor, site.session("controller") as controller:
+        stolen: list[zenoh.Sample] = []
+        read: list[zenoh.Sample] = []
+        _visitors = visitor.declare_subscriber(f"{PREFIX}/transform", stolen.append)
+        _controllers = controller.declare_subscriber(f"{PREFIX}/transform", read.append)
+        wait_until(lambda: site.monitor.transform(frame_record()) or len(read) > 5, "transforms")
+        assert visitor.info.routers_zid()
+        assert not list(visitor.get(f"{PREFIX}/state", timeout=1.0))
+        assert not list(visitor.liveliness().get("gripmon/*/*/alive", timeout=1.0))
+        assert not stolen

@@ -1,0 +1,224 @@
+"""Shipped configurations, certificates and what is refused before anything listens; and that nothing unpickles."""
+
+from __future__ import annotations
+
+import ast
+import os
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from loopback import accepts, free_endpoint
+from router_process import ROOT, plain_config, running
+
+from gripmon.cli import main
+from gripmon.config import load_config
+from gripmon.wire import PublishError, PublishSettings, zenoh_config
+from gripmon.wire.files import load_file, said
+
+SHIPPED = sorted((ROOT / "configs" / "zenoh").glob("*.json5"))
+LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
+
+
+def endpoints(value: object) -> list[str]:
+    if isinstance(value, dict):
+        return [each for values in value.values() for each in endpoints(values)]
+    return [str(each) for each in value] if isinstance(value, list) else []
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The shipped files with certificates beside them."""
+    made = tmp_path_factory.mktemp("zenoh")
+    for file in SHIPPED:
+        (made / file.name).write_bytes(file.read_bytes())
+    assert main(["certificates", "--out", str(made / "certificates")]) == 0
+    return made
+
+
+@pytest.mark.parametrize("name", [file.name for file in SHIPPED])
+def test_shipped_files_stay_on_this_machine_or_speak_tls(folder: Path, name: str):
+    config = load_file(folder / name)
+    places = endpoints(said(config, "listen/endpoints")) + endpoints(said(config, "connect/endpoints"))
+    assert places
+    assert [p for p in places if not (p.startswith("tls/") or p.startswith(LOOPBACK))] == []
+    assert all("127.0.0.1" in p for p in places)  # nobody else's address is shipped
+    assert said(config, "scouting/multicast/enabled") is False
+    if any(p.startswith("tls/") for p in places):
+        assert said(config, "transport/link/protocols") == ["tls"]
+        assert said(config, "transport/link/tls/enable_mtls") is True
+        assert said(config, "transport/link/tls/verify_name_on_connect") is not False
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.name)
+def test_shipped_configurations_stay_on_this_machine(path: Path):
+    settings = load_config(path, check_source=False, with_taught=False).settings.publish
+    assert all(place.startswith(LOOPBACK) for place in (*settings.listen, *settings.connect))
+    assert not settings.multicast_scouting and settings.zenoh_config is None
+
+
+def test_what_a_file_does_not_say_is_cautious(tmp_path: Path):
+    """Zenoh itself would listen on all interfaces and look for others by multicast."""
+    path = tmp_path / "short.json5"
+    path.write_text("{ mode: 'peer' }")
+    config = zenoh_config(PublishSettings(zenoh_config="short.json5"), tmp_path)
+    assert said(config, "listen/endpoints") == [] and said(config, "scouting/multicast/enabled") is False
+    path.write_text("{ listen: {endpoints: ['tcp/127.0.0.1:1']}, scouting: {multicast: {enabled: true}} }")
+    config = zenoh_config(PublishSettings(zenoh_config="short.json5"), tmp_path)
+    assert said(config, "mode") == "peer"
+    assert (
+        said(config, "listen/endpoints") == ["tcp/127.0.0.1:1"] and said(config, "scouting/multicast/enabled") is True
+    )
+
+
+def test_certificates_count_from_their_file_and_are_there(folder: Path, tmp_path: Path):
+    config = zenoh_config(PublishSettings(zenoh_config="monitor.json5"), folder)
+    assert said(config, "transport/link/tls/connect_certificate") == str(folder / "certificates" / "monitor.pem")
+    (tmp_path / "monitor.json5").write_bytes((folder / "monitor.json5").read_bytes())
+    with pytest.raises(PublishError) as caught:
+        zenoh_config(PublishSettings(zenoh_config="monitor.json5"), tmp_path)
+    assert str(caught.value) == (
+        f"publish.zenoh_config: {tmp_path}/monitor.json5: transport/link/tls/root_ca_certificate: "
+        f"no file {tmp_path}/certificates/ca.pem; gripmon certificates makes one"
+    )
+
+
+def test_a_key_that_others_may_read_is_refused(tmp_path: Path):
+    assert main(["certificates", "--out", str(tmp_path / "certificates")]) == 0
+    path = tmp_path / "monitor.json5"
+    path.write_bytes((ROOT / "configs" / "zenoh" / "monitor.json5").read_bytes())
+    key = tmp_path / "certificates" / "monitor-key.pem"
+    key.chmod(0o640)
+    with pytest.raises(PublishError, match=f"others may read {key}; chmod 600 {key}$"):
+        zenoh_config(PublishSettings(zenoh_config=str(path)))
+
+
+def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    os.umask(0)
+    try:
+        assert main(["certificates", "--out", str(tmp_path), "--host", "10.0.0.5", "--host", "site.example"]) == 0
+    finally:
+        os.umask(0o022)
+    keys = sorted(tmp_path.glob("*-key.pem"))
+    assert [key.name.removesuffix("-key.pem") for key in keys] == [
+        "ca",
+        "controller",
+        "monitor",
+        "operator",
+        "robot",
+        "router",
+    ]
+    assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
+    before = {file: file.read_bytes() for file in tmp_path.iterdir()}
+    assert main(["certificates", "monitor", "arm7", "--out", str(tmp_path)]) == 0
+    assert "monitor-key.pem: there already" in capsys.readouterr().out
+    assert {file: file.read_bytes() for file in before} == before
+    authority = x509.load_pem_x509_certificate(before[tmp_path / "ca.pem"])
+    for name in ("router", "arm7"):
+        certificate = x509.load_pem_x509_certificate((tmp_path / f"{name}.pem").read_bytes())
+        certificate.verify_directly_issued_by(authority)
+        assert certificate.subject.rfc4514_string() == f"CN={name}"
+        uses = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+        assert (x509.ExtendedKeyUsageOID.SERVER_AUTH in uses) is (name == "router")
+    alternatives = x509.load_pem_x509_certificate(before[tmp_path / "router.pem"]).extensions
+    text = str(alternatives.get_extension_for_class(x509.SubjectAlternativeName).value)
+    assert "10.0.0.5" in text and "site.example" in text and "localhost" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "spoil", "text"),
+    [
+        (["../x"], None, "can't be a name"),
+        (["ca"], None, "can't be a name"),
+        (["x"], "ca.pem", "can't be read"),
+        (["x"], "ca-key.pem", "can't be read"),
+    ],
+)
+def test_bad_requests_for_certificates(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], spoil: str | None, text: str
+):
+    assert main(["certificates", "one", "--out", str(tmp_path)]) == 0
+    if spoil is not None:
+        (tmp_path / spoil).write_text("nonsense")
+    try:
+        code = main(["certificates", *arguments, "--out", str(tmp_path)])
+    except SystemExit as ended:
+        code = int(str(ended.code))
+    said_text = capsys.readouterr().err
+    assert code == 2 and text in said_text.splitlines()[-1] and "Traceback" not in said_text
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{", "expected"),
+        ("{ mode: 'router', lisen: {} }", "unknown field `lisen`"),
+        ("{ mode: 'peer' }", "mode: peer doesn't route; router"),
+        ("{}", 'listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]'),
+        ("{ listen: {endpoints: ['tls/127.0.0.1:1']} }", "can't route: "),
+        ("{ listen: {endpoints: ['tcp/256.0.0.1:1']} }", "can't route: "),
+        ("{ listen: {endpoints: ['xyz']} }", ""),
+    ],
+)
+def test_a_router_refuses_bad_files_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], text: str, expected: str
+):
+    path = tmp_path / "router.json5"
+    path.write_text(text)
+    assert main(["router", str(path)]) == 2
+    line = capfd.readouterr().err
+    assert line.startswith(f"router: {path}: ") and line.count("\n") == 1 and expected in line and ".rs" not in line
+
+
+def test_a_router_without_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["router", str(tmp_path / "none.json5")]) == 2
+    assert capsys.readouterr().err == f"router: no file {tmp_path}/none.json5; give a json5 or yaml file of Zenoh's\n"
+
+
+def test_a_router_says_where_it_listens_and_stops_when_told(tmp_path: Path):
+    endpoint = free_endpoint()
+    config = plain_config(tmp_path, endpoint)
+    with running(config, endpoint) as router:
+        second = subprocess.run(
+            [sys.executable, "-m", "gripmon", "router", str(config)],
+            capture_output=True,
+            text=True,
+            cwd=ROOT,
+            timeout=60,
+        )
+        assert second.returncode == 2
+        assert second.stderr == (
+            f"router: {config}: listen.endpoints: {endpoint} is already in use; "
+            "stop the program that has it, or choose another port\n"
+        )
+        assert router.stop() == (0, f"router: listening on {endpoint}\nrouter: stopped\n")
+        assert not accepts(endpoint)
+
+
+def test_nothing_unpickles():
+    """Bytes from the network or a file must never choose the code that runs."""
+    unpicklers = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "jsonpickle"}
+    calls = {"eval", "exec"}
+    faults = []
+    for path in sorted((ROOT / "gripmon").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                used = {alias.name.split(".")[0] for alias in node.names} & unpicklers
+            elif isinstance(node, ast.ImportFrom):
+                used = {(node.module or "").split(".")[0]} & unpicklers
+            elif isinstance(node, ast.Call):
+                name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+                used = {name} & (calls if isinstance(node.func, ast.Name) else set())
+                used |= {
+                    k.arg
+                    for k in node.keywords
+                    if k.arg == "allow_pickle" and getattr(k.value, "value", 1) is not False
+                }
+                used |= {name} & {"unsafe_load", "full_load"}
+            else:
+                continue
+            faults += [f"{path.relative_to(ROOT)}:{node.lineno}: {each}" for each in used]
+    assert not faults
