@@ -1,7 +1,7 @@
 """What tells, for next to nothing a frame, that the judge should be asked although no drift shows.
 
 A lens that lost its focus moves nothing; and a finger that is bent by some tenths of a millimetre may be left aside by
-a joint fit that follows the others.
+a joint fit that follows the others; and a report of the opening that is off by tenths is soon believed to be so.
 """
 
 from __future__ import annotations
@@ -27,6 +27,11 @@ FEWER = 0.8
 RESIDUAL_PX, RESIDUAL_SIGMAS, FEWEST_EDGES = 0.05, 4.0, 2
 """By how much the mean residuals of so many edges must differ from the usual ones: px, and standard deviations."""
 
+JAW_M, JAW_SIGMAS = 5e-5, 3.0
+"""By how much the opening must differ from the report otherwise than usually: m, and standard deviations of one frame,
+of which five have to agree.
+"""
+
 
 class _Usual:
     """Middle of the first values, and of the newest."""
@@ -35,6 +40,7 @@ class _Usual:
         self._first: list[float] = []
         self._newest: deque[float] = deque(maxlen=NEWEST)
         self.usual: float | None = None
+        self.scatter = 0.0  # of the first values
 
     def add(self, value: float) -> float:
         """The newest frames' middle."""
@@ -42,7 +48,7 @@ class _Usual:
         if self.usual is None:
             self._first.append(value)
             if len(self._first) == LEARNT:
-                self.usual = statistics.median(self._first)
+                self.usual, self.scatter = statistics.median(self._first), statistics.pstdev(self._first)
         return statistics.median(self._newest)
 
 
@@ -100,3 +106,38 @@ class ResidualWatch:
         # Means of five frames before a background that stands still scatter as much as one.
         beyond = differs_px > np.maximum(RESIDUAL_PX, RESIDUAL_SIGMAS * scatter_px)
         return len(self._newest) == NEWEST and int(np.count_nonzero(beyond)) >= FEWEST_EDGES
+
+
+class JawWatch:
+    """Whether the jaws are seen elsewhere against what is reported than usually."""
+
+    def __init__(self) -> None:
+        self._error_m = _Usual()
+
+    def add(self, reported_m: float | None, seen_m: float) -> bool:
+        """``seen_m`` by one frame and those before; ``reported_m`` with it, None if nothing was."""
+        if reported_m is None:
+            return False
+        now_m, usual_m = self._error_m.add(seen_m - reported_m), self._error_m.usual
+        return usual_m is not None and abs(now_m - usual_m) > max(JAW_M, JAW_SIGMAS * self._error_m.scatter)
+
+
+class Watches:
+    """All of them on one camera and gripper."""
+
+    def __init__(self, fingers: int) -> None:
+        self._blur, self._fingers = BlurWatch(), FingerWatch(fingers)
+        self._residuals, self._jaw = ResidualWatch(), JawWatch()
+
+    def add(
+        self,
+        blur_px: float | None,
+        shares: Sequence[float],
+        residual_px: Array,
+        reported_m: float | None,
+        seen_m: float,
+    ) -> bool:
+        """Whether any of them would ask, of one frame as each of them wants it."""
+        blurred, fewer = self._blur.add(blur_px), self._fingers.add(shares)
+        contradicted, jaw_elsewhere = self._residuals.add(residual_px), self._jaw.add(reported_m, seen_m)
+        return blurred or fewer or contradicted or jaw_elsewhere

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.camera import Camera
-from gripmon.causes import BlurWatch, CauseJudge, FingerWatch, ResidualWatch
+from gripmon.causes import CauseJudge, Watches
 from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
@@ -89,7 +89,7 @@ class Monitor:
             camera, gripper, settings.causes, np.zeros(6), settings.jaw_sigma_m, settings.jaw_offset_sigma_m
         )
         self._inquiry = Inquiry(judge)
-        self._blur, self._fingers, self._residuals = BlurWatch(), FingerWatch(len(gripper.finger_ids)), ResidualWatch()
+        self._watches = Watches(len(gripper.finger_ids))
         self._average = PoseAverage(settings.smoothing)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
@@ -263,9 +263,9 @@ class Monitor:
             motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
         if motion.stepped:
             self._inquiry.moved_again()
-        odd = self._blur.add(self._tracker.blur_px(measurement))
-        odd |= self._fingers.add(shares)
-        odd |= self._residuals.add(self._tracker.edge_residuals_px(measurement))
+        reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
+        blur_px, residual_px = self._tracker.blur_px(measurement), self._tracker.edge_residuals_px(measurement)
+        odd = self._watches.add(blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)
@@ -334,8 +334,7 @@ class Monitor:
         self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
         if self.reference.restores is None:
             # How edges look from where the camera is now; an undo doesn't move it.
-            fingers = len(self._gripper.finger_ids)
-            self._blur, self._fingers, self._residuals = BlurWatch(), FingerWatch(fingers), ResidualWatch()
+            self._watches = Watches(len(self._gripper.finger_ids))
 
     def _after_restart(self, evidence: Evidence) -> Alert:
         """Whether the picture fits the reference from which the monitor went on."""
