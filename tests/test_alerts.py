@@ -141,6 +141,14 @@ def test_acknowledged_by_id_or_all():
     assert not worse.acknowledged, "worse than what was acknowledged"
 
 
+def test_what_is_acknowledged_while_it_is_over_is_cleared_no_later():
+    told = Told()
+    told.present(alert())
+    assert told.absent() == ()
+    assert len(told.book.acknowledge()) == 1
+    assert [a.event for a in told.absent(CLEAR_S)] == [AlertEvent.CLEARED]
+
+
 def test_after_a_restart_ids_go_on():
     told = Told()
     ids = {told.present(alert(), topic=topic)[0].alert_id for topic in TOPICS}

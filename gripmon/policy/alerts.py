@@ -115,7 +115,8 @@ class AlertBook:
             if entry.alert.acknowledged or alert_id not in ("", entry.alert.alert_id):
                 continue
             seen = msgspec.structs.replace(entry.alert, event=AlertEvent.UPDATED, acknowledged=True)
-            self._keep(topic, seen, entry.said_s)
+            self._open[topic] = replace(entry, alert=seen)  # what is over doesn't begin to be over anew
+            self._changes += 1
             out.append(seen)
         return tuple(out)
 
