@@ -1,0 +1,173 @@
+"""100,000 malformed payloads through everything that reads the network: each is refused in one line, nothing else."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+import psutil
+import pytest
+import zenoh
+from hypothesis import given
+from hypothesis import strategies as st
+from rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
+
+from gripmon.publish.commands import _command
+from gripmon.publish.jaw import JawError, opening_of_joints, opening_of_json
+from gripmon.records import Command, CommandError, CommandFault
+from gripmon.ros2 import JointOpening
+from gripmon.ros2.types import typestore
+from gripmon.sources.network import PayloadDecoder
+from gripmon.sources.payload import PayloadError
+from gripmon.wire import Keys
+
+MOST_GROWTH_BYTES = 48 << 20
+"""Of the resident memory; one frame that is kept of each hundred would be more."""
+
+
+def ros_message(type_name: str, **fields: object) -> bytes:
+    store = typestore()
+    time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    header = header_type(stamp=time_type(sec=1, nanosec=2), frame_id="camera")
+    return bytes(store.serialize_cdr(store.types[type_name](header=header, **fields), type_name))
+
+
+def ros_image() -> bytes:
+    width, height = SIZE_PX
+    return ros_message(
+        "sensor_msgs/msg/Image",
+        height=height, width=width, encoding="mono8", is_bigendian=0, step=width, data=image().ravel(),
+    )  # fmt: skip
+
+
+def ros_file() -> bytes:
+    return ros_message("sensor_msgs/msg/CompressedImage", format="png", data=np.frombuffer(files()[2], np.uint8))
+
+
+def joint_state() -> bytes:
+    return ros_message(
+        "sensor_msgs/msg/JointState",
+        name=["left", "right"], position=np.array([0.015, 0.015]), velocity=np.zeros(0), effort=np.zeros(0),
+    )  # fmt: skip
+
+
+def assert_one_line(error: Exception) -> None:
+    text = str(error)
+    assert text and "\n" not in text, text
+
+
+def refusals(decoder: PayloadDecoder, payloads: Iterable[Rubbish]) -> tuple[Counter[str], int]:
+    """How many were refused, by their first words, and how many were frames of this camera all the same."""
+    refused: Counter[str] = Counter()
+    taken = 0
+    for payload in payloads:
+        try:
+            content = decoder.decode(*payload)
+        except PayloadError as error:
+            assert_one_line(error)
+            refused[str(error)[:12]] += 1
+            continue
+        taken += 1
+        assert content.image.shape[:2] == SIZE_PX[::-1] and content.image.dtype in (np.uint8, np.uint16, np.float32)
+        assert content.stamp_ns is None or 0 <= content.stamp_ns < 2**63
+        assert content.jaw_opening_m is None or 0.0 <= content.jaw_opening_m <= 1.0
+    return refused, taken
+
+
+def resident_bytes() -> int:
+    return psutil.Process().memory_info().rss
+
+
+def assert_still_works(decoder: PayloadDecoder) -> None:
+    for data in files():
+        assert decoder.decode(data, "zenoh/bytes", None).image.shape[:2] == SIZE_PX[::-1]
+    raw = decoder.decode(image().tobytes(), "zenoh/bytes", json.dumps(good_note()).encode())
+    np.testing.assert_array_equal(raw.image, image())
+    assert (raw.stamp_ns, raw.jaw_opening_m) == (5, 0.03)
+
+
+def test_60000_frames(capfd: pytest.CaptureFixture[str]):
+    decoder = PayloadDecoder("auto", SIZE_PX)
+    refusals(decoder, frames(0, 500))  # what is loaded or cached once
+    before = resident_bytes()
+    refused, taken = refusals(decoder, frames(1, 60_000))
+    assert resident_bytes() - before < MOST_GROWTH_BYTES
+    assert sum(refused.values()) + taken == 60_000 and taken < 0.2 * 60_000
+    assert len(refused) > 10, "many kinds of wrong are told from each other"
+    assert_still_works(decoder)
+    assert capfd.readouterr() == ("", ""), "damaged files are no lines on a terminal"
+
+
+@pytest.mark.parametrize("frame_format", ["raw", "jpeg", "png"])
+def test_3000_frames_where_one_format_is_told(frame_format: str):
+    decoder = PayloadDecoder(frame_format, SIZE_PX)
+    refused, taken = refusals(decoder, frames(2, 3_000))
+    assert sum(refused.values()) + taken == 3_000 and taken < 0.2 * 3_000
+
+
+@pytest.mark.parametrize(("frame_format", "good"), [("ros2_image", ros_image()), ("ros2_compressed", ros_file())])
+def test_5000_messages_of_ros_2(frame_format: str, good: bytes):
+    decoder = PayloadDecoder(frame_format, SIZE_PX)
+    refused, taken = refusals(decoder, (Rubbish(data) for data in ros(3, 5_000, good)))
+    assert sum(refused.values()) > 2_500 and refused.total() + taken == 5_000
+    assert decoder.decode(good, "", b"whatever").stamp_ns == 1_000_000_002
+
+
+def test_15000_jaw_messages():
+    count = 0
+    for payload in jaws(4, 16_500):
+        count += 1
+        try:
+            opening_m = opening_of_json(payload)
+        except JawError as error:
+            assert_one_line(error)
+            continue
+        # A number, but none of metres of a gripper: refused by whoever knows the travel.
+        assert abs(opening_m) > 1.0, f"{payload!r} is no opening, but {opening_m} came out"
+    assert count > 15_000
+    assert opening_of_json(b'{"stamp_ns": 1, "opening_m": 0.03}') == opening_of_json(b" 0.03\n") == 0.03
+    assert opening_of_json(b"0") == 0.0
+
+
+def test_5000_joint_states():
+    decode = opening_of_joints(JointOpening(joints=("left", "right")))
+    refused = 0
+    for payload in ros(5, 5_000, joint_state()):
+        try:
+            opening_m = decode(payload)
+        except JawError as error:
+            assert_one_line(error)
+            refused += 1
+            continue
+        assert opening_m is None or np.isfinite(opening_m)
+    assert refused > 2_500
+    assert decode(joint_state()) == 0.03
+
+
+def test_6000_commands():
+    keys, rng = Keys("arm", "wrist"), random.Random(6)
+    for _ in range(6_000):
+        name = rng.choice(["undo", "reset", "*", "", "explode", "accept/x"])
+        payload = broken_json(rng, {"argument": "plate-2"})
+        asked = _command(keys, f"gripmon/arm/wrist/cmd/{name}", zenoh.ZBytes(payload))
+        if isinstance(asked, Command):
+            assert isinstance(asked.argument, str)
+            continue
+        assert isinstance(asked, CommandError) and "\n" not in asked.text
+        assert asked.error is not CommandFault.INTERNAL
+    assert isinstance(_command(keys, "gripmon/arm/wrist/cmd/undo", zenoh.ZBytes(b'{"argument": "x"}')), Command)
+
+
+@given(st.binary(max_size=300), st.text(max_size=20), st.none() | st.binary(max_size=100))
+def test_whatever_comes_is_a_frame_or_refused(payload: bytes, encoding: str, attachment: bytes | None):
+    refusals(PayloadDecoder("auto", SIZE_PX), [Rubbish(payload, encoding, attachment)])
+
+
+@given(st.recursive(st.none() | st.booleans() | st.floats() | st.integers() | st.text(), st.lists, max_leaves=5))
+def test_an_attachment_of_any_content_is_a_note_or_refused(value: object):
+    for name in ("stamp_ns", "jaw_opening_m", "width", "height", "encoding", "step"):
+        note = json.dumps(good_note(**{name: value})).encode()
+        refusals(PayloadDecoder("auto", SIZE_PX), [Rubbish(image().tobytes(), attachment=note)])
