@@ -1,4 +1,6 @@
-"""A camera driver in a process of its own, in step with the monitor: ENDPOINT FOLDER KEY FORMAT PREFIX.
+"""A camera driver in a process of its own, in step with the monitor: ENDPOINT FOLDER KEY FORMAT PREFIX [FIRST LAST].
+
+With a part of the frames their stamps are the time of sending.
 
 It knows plain Zenoh, JSON and the libraries that make images and ROS 2 messages, nothing of gripmon.  After each frame
 it waits for the transform of that frame, so that none is dropped however slow the machine is.
@@ -10,6 +12,7 @@ import csv
 import json
 import queue
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,7 +82,10 @@ FORMATS: dict[str, Callable[[np.ndarray, dict[str, str]], Sent]] = {
 }
 
 
-def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str) -> None:
+def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str, *part: str) -> None:
+    rows = list(csv.DictReader((Path(folder) / "timestamps.csv").open()))
+    if part:
+        rows = rows[int(part[0]) : int(part[1])]
     transforms: queue.SimpleQueue[int] = queue.SimpleQueue()
 
     def heard(sample: zenoh.Sample) -> None:
@@ -91,7 +97,9 @@ def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str) -
         wait_until(lambda: publisher.matching_status.matching, "a monitor that listens")
         alive = session.liveliness()
         wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=5.0)), "the monitor to be alive")
-        for row in csv.DictReader((Path(folder) / "timestamps.csv").open()):
+        for row in rows:
+            if part:
+                row["stamp_ns"] = str(time.time_ns())
             image = cv2.imread(str(Path(folder) / row["file"]), cv2.IMREAD_UNCHANGED)
             payload, encoding, attachment = FORMATS[frame_format](image, row)
             publisher.put(payload, encoding=encoding, attachment=attachment)
