@@ -26,7 +26,20 @@ from gripmon.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Or
 from gripmon.simulator import FrameTruth
 
 ROOT = Path(__file__).resolve().parent.parent
-COMMANDS = ("demo", "run", "router", "send", "schema", "feed", "replay", "simulate", "check", "teach", "certificates")
+COMMANDS = (
+    "demo",
+    "run",
+    "watch",
+    "router",
+    "send",
+    "schema",
+    "feed",
+    "replay",
+    "simulate",
+    "check",
+    "teach",
+    "certificates",
+)
 GRIPMON = (sys.executable, "-m", "gripmon")
 
 

@@ -28,7 +28,7 @@ def payload(**changes: object) -> bytes:
 
 
 def reading(inbox: Inbox, policy: Policy | None = None, now_s: float = 100.0, wall_ns: int = 0) -> Reading:
-    return judge(inbox.heard, inbox.heard.entry, policy or Policy(), now_s, wall_ns, "")
+    return judge(inbox.heard, inbox.heard.entry, policy or Policy(), now_s, wall_ns, lambda: "")
 
 
 def heard(now_s: float = 100.0, **changes: object) -> Inbox:

@@ -28,7 +28,7 @@ FOREIGN = {
     "rerun": {"recording", "report"},
     "rosbags": {"ros2"},
 }
-HEAVY = ("numpy", "scipy", "cv2", "zenoh", "rerun", "yaml", "msgspec", "tqdm", "rosbags")
+HEAVY = ("numpy", "scipy", "cv2", "zenoh", "rerun", "yaml", "msgspec", "tqdm", "rosbags", "rich")
 
 
 def room_of(path: Path) -> str:

@@ -10,24 +10,30 @@
             stop(reading.reason)
 
 :class:`TransformClient` gives the newest transform and whether it may be used.  :class:`Client` reads every message as
-it is, and sends commands.  Nothing here waits for the monitor to start, and nothing needs help when a monitor or a
-router ends and comes again.  Neither NumPy nor OpenCV is loaded.
+it is, and sends commands.  :class:`Fleet` knows how all monitors on the network are.  Nothing here waits for a monitor
+to start, and nothing needs help when a monitor or a router ends and comes again.  Neither NumPy nor OpenCV is loaded.
 """
 
 from __future__ import annotations
 
+from gripmon.client.fleet import Fleet
 from gripmon.client.names import MonitorName
 from gripmon.client.reader import Client, NotCarriedOut
 from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
+from gripmon.client.status import Condition, MonitorStatus, trouble
 from gripmon.client.transforms import TransformClient
 
 __all__ = [
     "Client",
+    "Condition",
+    "Fleet",
     "MonitorName",
+    "MonitorStatus",
     "NotCarriedOut",
     "NotUsable",
     "Policy",
     "Reading",
     "TransformClient",
     "Unusable",
+    "trouble",
 ]

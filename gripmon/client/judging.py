@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from gripmon.client.inbox import Entry, Heard, several
 from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
@@ -11,10 +12,12 @@ from gripmon.records import FrameRecord, Verdict
 _Refusal = tuple[Unusable, str]
 
 
-def judge(heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_ns: int, fault: str) -> Reading:
+def judge(
+    heard: Heard, entry: Entry | None, policy: Policy, now_s: float, wall_ns: int, fault: Callable[[], str]
+) -> Reading:
     """The reading of ``entry`` at ``now_s`` by the monotonic clock, ``wall_ns`` by the wall clock.
 
-    ``heard`` says who is there, ``fault`` why there is no session (empty if there is one).
+    ``heard`` says who is there; ``fault`` is asked only where there is no entry: whom there is no connection to.
     """
     if entry is None:
         why, reason = _cut_off(heard, None) or _silence(heard, fault)
@@ -60,11 +63,11 @@ def _cut_off(heard: Heard, entry: Entry | None) -> _Refusal | None:
     return Unusable.GONE, "the monitor is gone"
 
 
-def _silence(heard: Heard, fault: str) -> _Refusal:
+def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
     if heard.unreadable:
         return Unusable.UNREADABLE, f"no transform came that can be read: {heard.unreadable}"
-    if fault:
-        return Unusable.NOT_CONNECTED, fault
+    if text := fault():
+        return Unusable.NOT_CONNECTED, text
     return Unusable.NOTHING_YET, f"no transform came yet{'' if heard.present else ', and no monitor is seen'}"
 
 

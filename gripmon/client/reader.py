@@ -11,6 +11,7 @@ import msgspec
 import zenoh
 
 from gripmon.client.names import MonitorName, monitor_name
+from gripmon.client.network import reader_settings
 from gripmon.records import (
     CommandError,
     CommandFault,
@@ -21,7 +22,7 @@ from gripmon.records import (
     StateRecord,
     from_json,
 )
-from gripmon.wire import DEFAULT_ENDPOINT, Keys, PublishSettings, open_session, zenoh_config
+from gripmon.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 
@@ -59,10 +60,7 @@ class Client:
         configuration.
         """
         self.keys = Keys(robot, camera if camera is not None else "*")
-        if zenoh_config_file is not None:
-            settings = PublishSettings(zenoh_config=zenoh_config_file)
-        else:
-            settings = PublishSettings(listen=(), connect=tuple(connect))
+        settings = reader_settings(connect, zenoh_config_file)
         self._session = open_session(zenoh_config(settings), settings)
         self._depth = depth
         self._heard: MonitorName | None = None

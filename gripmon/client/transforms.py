@@ -13,8 +13,9 @@ from gripmon.client.inbox import Entry, Inbox
 from gripmon.client.iterators import AsyncReadings, Readings
 from gripmon.client.judging import judge
 from gripmon.client.names import monitor_name
+from gripmon.client.network import reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
-from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link, PublishSettings
+from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
 
 
 class TransformClient:
@@ -49,11 +50,7 @@ class TransformClient:
         self._inbox = Inbox()
         self._threads: list[threading.Thread] = []
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
-        if zenoh_config_file is not None:
-            settings = PublishSettings(zenoh_config=zenoh_config_file)
-        else:
-            settings = PublishSettings(listen=(), connect=tuple(connect))
-        self._link = Link(settings)
+        self._link = Link(reader_settings(connect, zenoh_config_file))
         self._link.attach(self._declare)
 
     def __enter__(self) -> Self:
@@ -63,9 +60,13 @@ class TransformClient:
         self.close()
 
     def latest(self) -> Reading:
-        """The newest transform and whether it may be used now, at once: without a lock, a system call or an error."""
+        """The newest transform and whether it may be used now, at once.
+
+        It takes no lock, makes no system call and raises nothing.  (Before the first transform it looks at the session,
+        too, to say whom there is no connection to.)
+        """
         heard = self._inbox.heard
-        return judge(heard, heard.entry, self.policy, time.monotonic(), time.time_ns(), self._link.fault())
+        return judge(heard, heard.entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
 
     def require(self) -> Reading:
         """As :meth:`latest`, but raises :class:`NotUsable` unless the policy allows the transform."""
@@ -123,7 +124,13 @@ class TransformClient:
 
     def judge(self, entry: Entry) -> Reading:
         """The reading of a message, as of now."""
-        return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._link.fault())
+        return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
+
+    def _fault(self) -> str:
+        try:
+            return self._link.fault()
+        except zenoh.ZError:  # another thread closes the session just now
+            return "the client is being closed"
 
     def _declare(self, session: zenoh.Session) -> None:
         # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.

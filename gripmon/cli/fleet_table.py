@@ -1,0 +1,153 @@
+"""The table of ``gripmon watch``: one row a monitor, for a terminal, a log or a program."""
+
+from __future__ import annotations
+
+import datetime
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from gripmon.client import MonitorStatus
+
+COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "fps", "heard s", "reference", "alerts")
+_FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
+_STYLES = {
+    "gone": "bold red", "silent": "bold red", "unknown": "red", "stopped": "dim", "suspect": "yellow", "valid": "green"
+}  # fmt: skip
+_MARKS = {"error": "!!", "warning": "!", "info": "i"}
+
+
+class Row(NamedTuple):
+    """What is shown of one monitor, as text; ``condition`` colours it."""
+
+    condition: str
+    cells: tuple[str, ...]
+
+
+def row(status: MonitorStatus) -> Row:
+    """The cells in the order of :data:`COLUMNS`; drift and sigma of a monitor that is gone are what it said last."""
+    state = status.state
+    there = state is not None and status.condition in ("valid", "suspect", "unknown")
+    rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
+    cells = (
+        printable(str(status.name)),
+        _what(status),
+        state.verdict.value if state is not None and there else "unknown",
+        _number(1e3, status.drift_m, ".3f"),
+        _number(1e3, None if state is None else state.sigma_m, ".3f"),
+        _number(1.0, rate if there else None, ".1f"),
+        f"{_age_s(status):.1f}",
+        "-" if state is None else f"{state.revision} {printable(state.reference_id)}",
+        _alerts(status),
+    )
+    return Row(status.condition.value, cells)
+
+
+def summary(statuses: Sequence[MonitorStatus], fault: str) -> str:
+    """How many there are of each condition, and what is wrong with the network."""
+    counts = Counter(status.condition for status in statuses)
+    parts = [f"{count} {condition}" for condition, count in sorted(counts.items(), key=lambda item: _order(item[0]))]
+    text = f"{len(statuses)} monitor{'s' * (len(statuses) != 1)}" + (f": {', '.join(parts)}" if parts else "")
+    return text + (f"; {printable(fault)}" if fault else "")
+
+
+def plain(statuses: Sequence[MonitorStatus], fault: str) -> str:
+    """Aligned columns without colours."""
+    lines = [COLUMNS, *(row(status).cells for status in statuses)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    table = ["  ".join(c.ljust(width) for c, width in zip(cells, widths, strict=True)).rstrip() for cells in lines]
+    return "\n".join([*table, summary(statuses, fault)])
+
+
+def line(status: MonitorStatus) -> str:
+    """One monitor in one line of a log."""
+    cells = row(status).cells
+    named = ", ".join(f"{name} {cell}" for name, cell in zip(COLUMNS[3:-2], cells[3:-2], strict=True) if cell != "-")
+    return f"{cells[0]}: {cells[1]}, {cells[2]}, {named}, reference {cells[-2]}; {cells[-1] or 'no open alerts'}"
+
+
+def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> RenderableType:
+    """For a terminal of that height: the worst monitors, as many as fit."""
+    from rich.table import Table
+    from rich.text import Text
+
+    shown = statuses[: max(1, height - _FRAME_LINES)]
+    out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
+    for name in COLUMNS:
+        number = name in COLUMNS[3:7]
+        out.add_column(
+            name,
+            justify="right" if number else "left",
+            no_wrap=True,
+            overflow="ellipsis",
+            ratio=1 if name == "alerts" else None,
+        )
+    for status in shown:
+        condition, cells = row(status)
+        # Text, not markup: what came from the network has no say in how it looks.
+        out.add_row(*(Text(cell) for cell in cells), style=_STYLES[condition])
+    rest = len(statuses) - len(shown)
+    out.caption = Text(summary(statuses, fault) + (f"; {rest} more than fit here, none in more trouble" * (rest > 0)))
+    out.caption_justify = "left"
+    return out
+
+
+def as_data(status: MonitorStatus) -> dict[str, Any]:
+    """For ``--json``: what the table is made from."""
+    return {
+        "robot": status.name.robot,
+        "camera": status.name.camera,
+        "condition": status.condition.value,
+        "gone_since_ns": status.gone_since_ns,
+        "state_age_s": round(status.state_age_s, 3),
+        "drift_m": status.drift_m,
+        "transforms_per_s": status.transforms_per_s,
+        "transform_age_s": status.transform_age_s,
+        "state": status.state,
+    }
+
+
+def clock(stamp_ns: int) -> str:
+    """Local time of day with the date if that isn't today's."""
+    when = datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
+    today = when.date() == datetime.datetime.now().astimezone().date()
+    return when.strftime("%H:%M:%S" if today else "%Y-%m-%d %H:%M:%S")
+
+
+def printable(text: str) -> str:
+    """The text without what a terminal would obey: it came from the network."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _order(condition: Any) -> int:
+    from gripmon.client import Condition
+
+    return list(Condition).index(condition)
+
+
+def _what(status: MonitorStatus) -> str:
+    if status.gone_since_ns is not None:
+        return f"{status.condition} since {clock(status.gone_since_ns)}"
+    state = "starting" if status.state is None else printable(status.state.state)
+    return f"silent, was {state}" if status.condition == "silent" else state
+
+
+def _age_s(status: MonitorStatus) -> float:
+    return status.state_age_s if status.transform_age_s is None else status.transform_age_s
+
+
+def _alerts(status: MonitorStatus) -> str:
+    """How many of which severity, and the worst one's text; without one, what the monitor says is wrong."""
+    if not status.alerts:
+        return printable(status.state.message) if status.state is not None else ""
+    counts = Counter(alert.severity for alert in status.alerts)
+    marks = " ".join(f"{_MARKS[severity]}{count}" for severity, count in counts.items())
+    worst = status.alerts[0]
+    return f"{marks} {printable(worst.text)}{' (acknowledged)' * worst.acknowledged}"
+
+
+def _number(scale: float, value: float | None, how: str) -> str:
+    return "-" if value is None else format(scale * value, how)

@@ -1,0 +1,209 @@
+"""``gripmon watch``: how every monitor on the network is, and what they say."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import common, fleet_table
+from gripmon.cli.alert_log import AlertLog
+
+if TYPE_CHECKING:
+    from gripmon.client import Fleet, MonitorStatus
+
+_DESCRIPTION = """\
+A live table of all monitors on the network, the worst first: those that are gone, silent or have no
+transform, then the suspect ones, then by the severest open alert and by drift. A monitor that
+vanished stays listed.
+
+On a terminal the table is drawn anew with every period. Elsewhere one line is printed whenever a
+monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
+
+With --alerts every alert of every monitor is printed as it comes, the last ones from before too, and
+when a monitor appears or vanishes; --out appends them to a file as JSON lines, each once."""
+
+_EXAMPLES = """\
+  gripmon watch
+  gripmon watch --once --connect tcp/10.0.0.5:7447
+  gripmon watch --alerts --out fleet-alerts.jsonl
+
+exit codes: 0 done (--once, --seconds); 2 wrong usage; 3 with --once: no monitor is on the network;
+130 Ctrl-C"""
+
+_ALERT_PERIOD_S = 0.2
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands,
+        "watch",
+        watch,
+        "a live table of all monitors, or their alerts",
+        _DESCRIPTION,
+        _EXAMPLES,
+    )
+    parser.add_argument(
+        "--connect",
+        action="append",
+        metavar="ENDPOINT",
+        help="a monitor's or a router's Zenoh endpoint, several times if need be; default: tcp/127.0.0.1:7447",
+    )
+    parser.add_argument("--zenoh-config", metavar="FILE", help="a configuration file of Zenoh's instead of --connect")
+    parser.add_argument("--alerts", action="store_true", help="print the alerts instead of the table")
+    parser.add_argument("--out", metavar="FILE", help="with --alerts: append them to this file, JSON lines")
+    parser.add_argument("--transforms", action="store_true", help="listen to every frame's transform for rate and age")
+    parser.add_argument("--once", action="store_true", help="print the table once, after --seconds, and end")
+    parser.add_argument("--json", action="store_true", help="JSON lines instead of text")
+    parser.add_argument(
+        "--period", type=common.positive_number, default=1.0, metavar="S", help="between two tables (s); default: 1"
+    )
+    parser.add_argument(
+        "--seconds", type=common.positive_number, metavar="S", help="end after so long (s); with --once 3 by default"
+    )
+
+
+def watch(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon watch``."""
+    _check(arguments)
+    logging.getLogger("gripmon.wire").setLevel(logging.ERROR)  # a connection that is missing stands in the table
+    log = _open_log(arguments) if arguments.alerts else None
+    with _open_fleet(arguments, log) as fleet:
+        seconds = 3.0 if arguments.once and arguments.seconds is None else arguments.seconds
+        end_s = None if seconds is None else time.monotonic() + seconds
+        if log is not None:
+            _repeat(log.write, _ALERT_PERIOD_S, end_s)
+        elif arguments.once:
+            time.sleep(seconds or 0.0)
+            return _show_once(fleet, as_json=arguments.json)
+        elif arguments.json:
+            _repeat(lambda: _print_json(fleet), arguments.period, end_s)
+        elif sys.stdout.isatty():
+            _live(fleet, arguments.period, end_s)
+        else:
+            _repeat(_Changes(fleet).show, arguments.period, end_s)
+    return common.EXIT_DONE
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    wrong = ""
+    if arguments.connect and arguments.zenoh_config:
+        wrong = "--connect has no effect beside --zenoh-config; one of them"
+    elif arguments.out and not arguments.alerts:
+        wrong = "--out is for alerts; add --alerts, or redirect the output of --json"
+    elif arguments.alerts and (arguments.once or arguments.transforms):
+        wrong = "--alerts prints alerts alone; leave out --once and --transforms"
+    if wrong:
+        raise common.CommandFailedError(f"watch: {wrong}", common.EXIT_USAGE)
+
+
+def _open_log(arguments: argparse.Namespace) -> AlertLog:
+    path = Path(arguments.out) if arguments.out else None
+    if path is not None:
+        common.check_file(path)
+    try:
+        return AlertLog(path, as_json=arguments.json)
+    except OSError as error:
+        raise common.CommandFailedError(
+            f"--out {path}: can't be read ({error.strerror}); a file of your own", common.EXIT_USAGE
+        ) from None
+
+
+def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
+    from gripmon.client import Fleet
+    from gripmon.wire import DEFAULT_ENDPOINT, PublishError
+
+    try:
+        return Fleet(
+            connect=arguments.connect or (DEFAULT_ENDPOINT,),
+            zenoh_config_file=arguments.zenoh_config,
+            transforms=arguments.transforms,
+            on_alert=None if log is None else log.alert,
+            on_presence=None if log is None else log.presence,
+        )
+    except PublishError as error:
+        raise common.CommandFailedError(f"watch: {error}", common.EXIT_USAGE) from None
+
+
+def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> None:
+    """Act now and after every period, once more at the end."""
+    while True:
+        act()
+        now_s = time.monotonic()
+        if end_s is not None and now_s >= end_s:
+            return
+        time.sleep(period_s if end_s is None else min(period_s, end_s - now_s))
+
+
+def _sorted(fleet: Fleet) -> list[MonitorStatus]:
+    from gripmon.client import trouble
+
+    return sorted(fleet.monitors(), key=trouble)
+
+
+def _show_once(fleet: Fleet, *, as_json: bool) -> int:
+    statuses = _sorted(fleet)
+    if as_json:
+        _print_json(fleet)
+    elif statuses:
+        print(fleet_table.plain(statuses, fleet.fault()))
+    if not statuses:
+        raise common.CommandFailedError(
+            f"watch: no monitor is on the network; {fleet.fault() or 'is --connect right?'}"
+        )
+    return common.EXIT_DONE
+
+
+def _print_json(fleet: Fleet) -> None:
+    import msgspec
+
+    told = {
+        "stamp_ns": time.time_ns(),
+        "fault": fleet.fault(),
+        "unreadable": fleet.unreadable,
+        "monitors": [fleet_table.as_data(status) for status in _sorted(fleet)],
+    }
+    print(msgspec.json.encode(told).decode(), flush=True)
+
+
+def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
+    from rich.console import Console
+    from rich.live import Live
+
+    console = Console()
+    with Live(console=console, auto_refresh=False, screen=True) as live:
+        _repeat(
+            lambda: live.update(fleet_table.table(_sorted(fleet), fleet.fault(), console.size.height), refresh=True),
+            period_s,
+            end_s,
+        )
+
+
+class _Changes:
+    """One line for each monitor that is another way than when it was printed last."""
+
+    def __init__(self, fleet: Fleet) -> None:
+        self._fleet = fleet
+        self._said: dict[object, object] = {}
+        self._fault = ""
+
+    def show(self) -> None:
+        """Print what has changed."""
+        if (fault := self._fleet.fault()) != self._fault:
+            self._fault = fault
+            print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.printable(fault) or 'connected'}", flush=True)
+        for status in _sorted(self._fleet):
+            state = status.state
+            what = (
+                status.condition,
+                state and (state.state, state.verdict, state.revision, state.message),
+                tuple((alert.alert_id, alert.severity, alert.acknowledged) for alert in status.alerts),
+            )
+            if self._said.get(status.name) != what:
+                self._said[status.name] = what
+                print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.line(status)}", flush=True)
