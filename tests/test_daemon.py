@@ -18,7 +18,7 @@ from daemon_bench import NEVER, Bench, pause
 from loopback import frame_record, reference_record
 from stand_ins import REFUSED, ScriptedMonitor
 
-from gripmon.daemon import EstimatesFile, log_to_stderr
+from gripmon.daemon import EstimatesFile, Reports, log_to_stderr
 from gripmon.records import (
     Alert,
     AlertEvent,
@@ -199,6 +199,27 @@ def test_a_jaw_feed_replaces_the_frames_opening_and_its_fault_is_said():
     assert bench.monitor.frames[0].jaw_opening_m == 0.0125
     assert bench.recording.offered[0][0].jaw_opening_m == 0.0125
     assert bench.states[1] == (State.TRACKING, "2 malformed jaw messages")
+
+
+def test_faults_and_counts_of_those_around_the_loop_are_said_in_the_state():
+    counts = [0, 0]
+
+    def more(_: object) -> None:
+        counts[:] = [4, 3]
+
+    reports = Reports(
+        faults=(lambda: "no Zenoh session yet" if counts[0] else "", lambda: None, lambda: "2 malformed frames"),
+        unsent=lambda: counts[0],
+        malformed=lambda: counts[1],
+    )
+    bench = Bench([0, more, 1])
+    bench.run(reports=reports, jaw=Jaw())
+    jaw = "2 malformed jaw messages"
+    assert bench.states[1:3] == [
+        (State.TRACKING, f"{jaw}; 2 malformed frames"),
+        (State.TRACKING, f"{jaw}; no Zenoh session yet; 2 malformed frames"),
+    ]
+    assert [(said.transforms_unsent, said.malformed) for said in bench.network.states[1:3]] == [(0, 0), (4, 3)]
 
 
 def test_without_a_feed_the_frames_opening_stays():

@@ -113,6 +113,14 @@ def test_late_joiners_get_the_last_one(publisher: Published, endpoint: str, leaf
         assert json.loads(samples[-1].payload.to_bytes()) == json.loads(msgspec.json.encode(records[0]))
 
 
+def test_the_last_transform_can_be_asked_for(publisher: Published, session: zenoh.Session):
+    for seq in (1, 2, 3):
+        publisher.transform(frame_record(seq))
+    expected = json.loads(msgspec.json.encode(frame_record(3)))
+    assert ask(session, f"{PREFIX}/transform") == [expected]
+    assert ask(session, "gripmon/*/*/transform") == [expected]
+
+
 def test_a_question_before_the_first_state_is_answered_in_words(session: zenoh.Session):
     replies = list(session.get(f"{PREFIX}/state", timeout=5.0))
     assert [reply.err.payload.to_string() for reply in replies] == ["nothing published on this key yet"]

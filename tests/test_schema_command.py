@@ -65,7 +65,7 @@ def heard() -> Iterator[dict[str, list[object]]]:
             yield {
                 "transform": [
                     said(session, "transform", lambda: publisher.transform(frame_record())),
-                    said(session, "transform", lambda: publisher.transform(NULLS)),
+                    said(session, "transform", lambda: publisher.transform(NULLS), NULLS.seq),
                 ],
                 "state": [said(session, "state", lambda: publisher.state(state_record()))],
                 "alert": [said(session, "alert", lambda: publisher.alert(alert_record()))],
@@ -77,18 +77,21 @@ def heard() -> Iterator[dict[str, list[object]]]:
         publisher.close()
 
 
-def said(session: zenoh.Session, leaf: str, put: object) -> object:
+def said(session: zenoh.Session, leaf: str, put: object, seq: int | None = None) -> object:
+    """What arrives on a key, of that frame if one is named."""
     subscriber = session.declare_subscriber(f"gripmon/arm/wrist/{leaf}")
-    samples: list[zenoh.Sample] = []
+    heard: list[object] = []
 
     def arrived() -> bool:
         put()  # type: ignore[operator]
         while (sample := subscriber.try_recv()) is not None:
-            samples.append(sample)
-        return bool(samples)
+            message = json.loads(sample.payload.to_bytes())
+            if seq is None or message["seq"] == seq:
+                heard.append(message)
+        return bool(heard)
 
     wait_until(arrived, leaf)
-    return json.loads(samples[-1].payload.to_bytes())
+    return heard[-1]
 
 
 def asked(session: zenoh.Session, publisher: Published, name: str, payload: bytes | None) -> object:

@@ -7,16 +7,17 @@ import contextlib
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.daemon import JawFeed
+    from gripmon.daemon import JawFeed, Reports
     from gripmon.publish import Publisher, ZenohCommands
     from gripmon.recording import Recorder
     from gripmon.records import Alert, ReferenceRecord
+    from gripmon.sources import Source
     from gripmon.statefile import StateFile
     from gripmon.wire import Keys, Link
 
@@ -100,7 +101,7 @@ def run_daemon(
 
     from gripmon import daemon
     from gripmon.monitor import Monitor
-    from gripmon.sources import NetworkCamera, SourceError, open_source
+    from gripmon.sources import SourceError, open_source
     from gripmon.wire import Keys
 
     settings = config.settings
@@ -119,8 +120,8 @@ def run_daemon(
             config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
         )
         link = _open_link(config)
-        publisher, jaw, commands = _open_publisher(config, link)
-        opened.callback(publisher.close)
+        network = _open_network(config, link)
+        opened.callback(network.publisher.close)
         on_network()
         recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
         opened.callback(recorder.close)
@@ -133,17 +134,17 @@ def run_daemon(
         return daemon.run(
             monitor,
             source,
-            publisher,
+            network.publisher,
             recorder,
             settings.daemon,
             robot=settings.robot,
             camera=settings.camera_name,
             estimates=estimates,
-            jaw=jaw,
+            jaw=network.jaw,
             keeper=daemon.StateKeeper(kept),
-            commands=commands,
+            commands=network.commands,
+            reports=_with_source(network.reports, source),
             notices=_notices(kept),
-            faults=[source.fault] if isinstance(source, NetworkCamera) else [],
             duration_s=duration_s,
         )
 
@@ -200,19 +201,45 @@ def _open_link(config: Config) -> Link | None:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
 
 
-def _open_publisher(config: Config, link: Link | None) -> tuple[Publisher, JawFeed | None, ZenohCommands | None]:
-    """The publisher, where the jaw opening comes from (None: with the frames), and where commands come from."""
-    from gripmon.publish import NullPublisher, ZenohCommands, ZenohPublisher
+class _Network(NamedTuple):
+    """The publisher, where the jaw opening comes from (None: with the frames), where commands come from, and what the
+    state message says of all this.
+    """
+
+    publisher: Publisher
+    jaw: JawFeed | None
+    commands: ZenohCommands | None
+    reports: Reports
+
+
+def _open_network(config: Config, link: Link | None) -> _Network:
+    from gripmon.daemon import Reports
+    from gripmon.publish import NullPublisher, ZenohCommands, ZenohJaw, ZenohPublisher
 
     settings = config.settings
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if link is None:
-        return NullPublisher(), jaw, None
+        return _Network(NullPublisher(), jaw, None, Reports())
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
         jaw = _network_jaw(config, link, publisher.keys)
     commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
-    return _with_ros2(config, link, publisher), jaw, commands
+    heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
+    reports = Reports((link.fault,), lambda: publisher.unsent, lambda: sum(each.malformed for each in heard))
+    return _Network(_with_ros2(config, link, publisher), jaw, commands, reports)
+
+
+def _with_source(reports: Reports, source: Source) -> Reports:
+    """The reports, and what a camera on the network says beside them."""
+    from gripmon.sources import NetworkCamera
+
+    if not isinstance(source, NetworkCamera):
+        return reports
+    return dataclasses.replace(
+        reports,
+        faults=(*reports.faults, source.fault),
+        malformed=lambda: reports.malformed() + source.malformed,
+    )
 
 
 def _with_ros2(config: Config, link: Link, publisher: Publisher) -> Publisher:

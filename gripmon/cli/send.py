@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
@@ -23,18 +24,21 @@ Tell a running monitor something, and print its answer.
   reset             go back to the configured reference, likewise
   acknowledge [ID]  take note of an open alert, or of all
   state             print the references, a proposal and the open alerts
+  snapshot          write the newest frame's image, and what the monitor made of it, to --out
 
-What can't be done is refused with a reason, and nothing changes."""
+What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
+answer came, --request with that id asks for the same again, which is not carried out twice."""
 
 _EXAMPLES = """\
   gripmon send state --robot arm1
   gripmon send undo --robot arm1
   gripmon send undo recalibration-3-1f0c9a2b --robot arm1 --camera wrist
+  gripmon send snapshot --robot arm1 --out now        now/snapshot.png and now/snapshot.json
 
 exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
 
 _WITH_ARGUMENT = ("accept", "reject", "undo", "acknowledge")
-_NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state")
+_NAMES = ("recalibrate", "accept", "reject", "undo", "reset", "acknowledge", "state", "snapshot")
 
 
 def add_parser(commands: Any) -> None:
@@ -58,18 +62,18 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--timeout", type=common.positive_number, default=5.0, metavar="S", help="how long to wait (s); default: 5"
     )
+    parser.add_argument("--out", metavar="DIR", help="where a snapshot goes; made if it is missing")
+    parser.add_argument("--request", metavar="REQUEST", help="id of an earlier request that got no answer")
     parser.add_argument("--json", action="store_true", help="print the whole answer as one line of JSON")
 
 
 def send(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon send``."""
-    if arguments.id and arguments.name not in _WITH_ARGUMENT:
-        raise common.CommandFailedError(
-            f"send: {arguments.name} takes no ID, but {arguments.id} is given; leave it out", common.EXIT_USAGE
-        )
-    if arguments.connect and arguments.zenoh_config:
-        raise common.CommandFailedError("send: --connect has no effect beside --zenoh-config; one of them", 2)
-    reply = _ask(arguments)
+    if wrong := _misuse(arguments):
+        raise common.CommandFailedError(f"send: {wrong}", common.EXIT_USAGE)
+    out = None if arguments.out is None else common.make_directory(Path(arguments.out))
+    reply, image = _ask(arguments)
+    written = _write(reply, image, out) if out is not None and reply.done else []
     if arguments.json:
         from gripmon.records import to_json
 
@@ -77,15 +81,32 @@ def send(arguments: argparse.Namespace) -> int:
     elif not reply.done:
         print(f"refused: {reply.text}", file=sys.stderr)
     else:
-        print(reply.text)
-        if reply.monitor is not None:
+        print("\n".join([reply.text, *map(str, written)]))
+        if reply.monitor is not None and reply.snapshot is None:
             print(_table(reply.monitor))
     return common.EXIT_DONE if reply.done else common.EXIT_FAILED
 
 
-def _ask(arguments: argparse.Namespace) -> CommandReply:
+def _misuse(arguments: argparse.Namespace) -> str:
+    """What can't go together, and what would be right."""
+    name = arguments.name
+    if arguments.id and name not in _WITH_ARGUMENT:
+        return f"{name} takes no ID, but {arguments.id} is given; leave it out"
+    if arguments.connect and arguments.zenoh_config:
+        return "--connect has no effect beside --zenoh-config; one of them"
+    if name == "snapshot" and arguments.out is None:
+        return "snapshot has nowhere to go; --out DIR"
+    if name != "snapshot" and arguments.out is not None:
+        return f"{name} writes nothing; leave --out out"
+    if name in ("state", "snapshot") and arguments.request is not None:
+        return f"{name} changes nothing and is answered anew each time; leave --request out"
+    return ""
+
+
+def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
+    """The reply, and the image of a snapshot."""
     from gripmon.client import Client, NotCarriedOut
-    from gripmon.records import CommandName
+    from gripmon.records import CommandFault, CommandName
     from gripmon.wire import DEFAULT_ENDPOINT
 
     try:
@@ -99,11 +120,37 @@ def _ask(arguments: argparse.Namespace) -> CommandReply:
         raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
     with client:
         try:
-            return client.send(CommandName(arguments.name), arguments.id, arguments.timeout)
+            if arguments.out is not None:
+                return client.snapshot(arguments.timeout)
+            name = CommandName(arguments.name)
+            return client.send(name, arguments.id, arguments.timeout, request_id=arguments.request), None
+        except ValueError as error:
+            raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
         except LookupError as error:
             raise common.CommandFailedError(f"send: {error.args[0]} (--camera)", common.EXIT_USAGE) from None
         except NotCarriedOut as error:
-            raise common.CommandFailedError(f"send: {error}", common.EXIT_FAILED) from None
+            again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
+            raise common.CommandFailedError(f"send: {error}{again}", common.EXIT_FAILED) from None
+
+
+def _write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
+    """The image of a snapshot and snapshot.json, in place of earlier ones; each is there whole or not at all."""
+    from gripmon.atomic import write_atomically
+    from gripmon.records import to_json
+
+    images = {"png": out / "snapshot.png", "jpeg": out / "snapshot.jpg"}
+    files = {out / "snapshot.json": to_json(reply) + b"\n"}
+    about = None if reply.snapshot is None else reply.snapshot.image
+    if image is not None and about is not None and about.encoding in images:  # a name from outside makes no path
+        files = {images[about.encoding]: image} | files
+    try:
+        for path in images.values():
+            path.unlink(missing_ok=True)
+        for path, data in files.items():
+            write_atomically(path, data)
+    except OSError as error:
+        raise common.not_writable(path, error) from None
+    return list(files)
 
 
 def _table(state: MonitorState) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import uuid
 from collections.abc import Callable, Iterator, Sequence
 from typing import Self, TypeVar
 
@@ -17,10 +18,13 @@ from gripmon.records import (
     CommandFault,
     CommandName,
     CommandReply,
+    CommandRequest,
     FrameRecord,
+    MessageRefused,
     ReferenceRecord,
     StateRecord,
     from_json,
+    to_json,
 )
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 
@@ -30,12 +34,13 @@ _T = TypeVar("_T", bound=msgspec.Struct)
 class NotCarriedOut(Exception):
     """A command got no answer of the monitor itself: none is there, or it had no time for it; ``fault`` says which.
 
-    A refusal is no exception but an answer: ``CommandReply.done`` is false.
+    A refusal is no exception but an answer: ``CommandReply.done`` is false.  Sent again with the same ``request_id`` it
+    is not carried out twice.
     """
 
-    def __init__(self, text: str, fault: CommandFault | None = None) -> None:
+    def __init__(self, text: str, fault: CommandFault | None = None, request_id: str = "") -> None:
         super().__init__(text)
-        self.fault = fault
+        self.fault, self.request_id = fault, request_id
 
 
 class Client:
@@ -118,27 +123,22 @@ class Client:
         replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
         return tuple(sorted({monitor_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
-    def send(self, name: CommandName, argument: str = "", timeout_s: float = 5.0) -> CommandReply:
+    def send(
+        self, name: CommandName, argument: str = "", timeout_s: float = 5.0, *, request_id: str | None = None
+    ) -> CommandReply:
         """Tell the monitor something (:class:`gripmon.records.Command`) and wait for its answer.
 
-        A refused command has changed nothing.  Raises :class:`NotCarriedOut`; LookupError if the name is that of more
-        than one monitor.
+        A refused command has changed nothing.  ``request_id`` (64 characters at most; by default a new one) is that of
+        an earlier attempt: if it was carried out then, its answer comes again.  Raises :class:`NotCarriedOut`;
+        LookupError if the name is that of more than one monitor; ValueError for a request that can't be one.
         """
-        monitor = self._only_one(timeout_s)
-        payload = msgspec.json.encode({"argument": argument}) if argument else b""
-        for reply in self._session.get(
-            Keys(*monitor)[f"cmd/{name.value}"], payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL
-        ):
-            if reply.ok is not None:
-                return from_json(reply.ok.payload.to_bytes(), CommandReply)
-            assert reply.err is not None
-            error = from_json(reply.err.payload.to_bytes(), CommandError)
-            raise NotCarriedOut(f"{monitor}: {error.text}", error.error)
-        # A router's access rules drop without a word what they don't allow.
-        raise NotCarriedOut(
-            f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
-            "may not let you send any"
-        )
+        return self._ask(name, argument, timeout_s, request_id)[0]
+
+    def snapshot(self, timeout_s: float = 5.0) -> tuple[CommandReply, bytes | None]:
+        """The monitor's state and newest frame, and a file of its image, as ``reply.snapshot.image`` says; None if it
+        has none.  Raises as :meth:`send`.
+        """
+        return self._ask(CommandName.SNAPSHOT, "", timeout_s, None)
 
     def close(self) -> None:
         """Leave the network; iterations and callbacks end."""
@@ -166,6 +166,26 @@ class Client:
                 answer = from_json(reply.ok.payload.to_bytes(), record_type)
         return answer
 
+    def _ask(
+        self, name: CommandName, argument: str, timeout_s: float, request_id: str | None
+    ) -> tuple[CommandReply, bytes | None]:
+        """The answer of the one monitor that is meant, and what is attached to it."""
+        monitor = self._only_one(timeout_s)
+        request = CommandRequest(argument, uuid.uuid4().hex if request_id is None else request_id)
+        payload = to_json(request)
+        from_json(payload, CommandRequest)  # what the monitor would refuse
+        for reply in self._session.get(
+            Keys(*monitor)[f"cmd/{name.value}"], payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL
+        ):
+            return _answer(reply, monitor, request.id)
+        # A router's access rules drop without a word what they don't allow.
+        raise NotCarriedOut(
+            f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
+            "may not let you send any",
+            None,
+            request.id,
+        )
+
     def _only_one(self, timeout_s: float) -> MonitorName:
         """The one monitor that is meant, as soon as it is seen."""
         end_s = time.monotonic() + timeout_s
@@ -188,3 +208,20 @@ class Client:
             raise LookupError(
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
+
+
+def _answer(reply: zenoh.Reply, who: MonitorName, request_id: str) -> tuple[CommandReply, bytes | None]:
+    """What a monitor replied, and what is attached to it.  Raises :class:`NotCarriedOut` for anything else."""
+    try:
+        if reply.ok is not None:
+            attached = reply.ok.attachment
+            answer = from_json(reply.ok.payload.to_bytes(), CommandReply)
+            return answer, None if attached is None else attached.to_bytes()
+        assert reply.err is not None
+        if reply.err.encoding != zenoh.Encoding.APPLICATION_JSON:  # Zenoh's own word
+            raise NotCarriedOut(f"{who} has not answered in time; it may still do it", CommandFault.TIMEOUT, request_id)
+        error = from_json(reply.err.payload.to_bytes(), CommandError)
+    except MessageRefused as refused:
+        text = f"{who} has answered, but that can't be read: {refused}"
+        raise NotCarriedOut(text, None, request_id) from None
+    raise NotCarriedOut(f"{who}: {error.text}", error.error, request_id)

@@ -14,13 +14,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, CommandFeed, Daemon, JawFeed, MonitorLike, StopRequest
+from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, Daemon, StopRequest
+from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
+from gripmon.daemon.snapshots import Snapshots
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
 from gripmon.records import Alert
@@ -36,6 +39,7 @@ __all__ = [
     "EstimatesFile",
     "JawFeed",
     "MonitorLike",
+    "Reports",
     "StateKeeper",
     "StopRequest",
     "log_to_stderr",
@@ -62,17 +66,16 @@ def run(
     jaw: JawFeed | None = None,
     keeper: StateKeeper | None = None,
     commands: CommandFeed | None = None,
+    reports: Reports | None = None,
     notices: Sequence[Alert] = (),
-    faults: Sequence[Callable[[], str]] = (),
     duration_s: float | None = None,
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
     In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
     frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
-    the monitor's state for a restart; ``notices`` are alerts from the start-up; ``faults`` are asked, before each state
-    message, what else is wrong ("" for nothing).  The logger ``gripmon`` is left as the caller set it up (see
-    :func:`log_to_stderr`).
+    the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
+    from the start-up.  The logger ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
@@ -86,13 +89,25 @@ def run(
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(source.close)
         lines = closing.enter_context(contextlib.closing(EstimatesFile(estimates)))
+        snapshots = closing.enter_context(contextlib.closing(Snapshots()))
+        own = _faults(jaw, recorder, lines, keeper)
+        reports = reports or Reports()
         daemon = Daemon(
             monitor, source, publisher, recorder, settings, stop,
-            robot=robot, camera=camera, estimates=lines, jaw=jaw, keeper=keeper, commands=commands, notices=notices,
-            faults=faults,
+            robot=robot, camera=camera, estimates=lines, jaw=jaw, keeper=keeper, commands=commands, snapshots=snapshots,
+            reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
         )  # fmt: skip
         with _steady_interpreter():
             return daemon.run(duration_s)
+
+
+def _faults(
+    jaw: JawFeed | None, recorder: Recorder, lines: EstimatesFile, keeper: StateKeeper | None
+) -> list[Callable[[], str | None]]:
+    """Whom to ask what is wrong, in the order in which it is said."""
+    faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
+    faults += [lambda: recorder.failure, lambda: lines.failure]
+    return faults if keeper is None else [*faults, lambda: keeper.failure]
 
 
 def log_to_stderr(*, verbose: bool = False) -> None:

@@ -8,14 +8,16 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import ParamSpec, Protocol
+from typing import ParamSpec
 
 import msgspec
 
 from gripmon import __version__
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
+from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
+from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
@@ -25,16 +27,13 @@ from gripmon.records import (
     AlertKind,
     AlertRecord,
     Cause,
-    Command,
     CommandError,
     CommandFault,
-    CommandReply,
+    CommandName,
     Frame,
     FrameRecord,
-    MeasurementTrace,
     MonitorState,
     OpenAlert,
-    ReferenceRecord,
     Severity,
     State,
     StateRecord,
@@ -50,41 +49,6 @@ KEEP_LAST_EVERY_S = 60.0
 """How old the last transform that is kept may be; references and alerts are kept when they change."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
-
-
-class MonitorLike(Protocol):
-    """What the loop needs of :class:`gripmon.monitor.Monitor`."""
-
-    @property
-    def reference(self) -> ReferenceRecord: ...
-    def process(self, frame: Frame) -> FrameRecord: ...
-    def ponder(self) -> None: ...
-    def trace(self) -> MeasurementTrace | None: ...
-    def command(self, command: Command, stamp_ns: int) -> CommandReply: ...
-    def state(self) -> MonitorState: ...
-    @property
-    def state_revision(self) -> int: ...
-
-
-class Asked(Protocol):
-    """A command whose asker waits for the answer."""
-
-    @property
-    def command(self) -> Command: ...
-    def answer(self, answer: CommandReply | CommandError) -> None: ...
-
-
-class CommandFeed(Protocol):
-    """Where commands come from, e.g. :class:`gripmon.publish.ZenohCommands`; ``poll`` doesn't wait."""
-
-    def poll(self) -> Asked | None: ...
-
-
-class JawFeed(Protocol):
-    """Where the jaw opening comes from when the frames don't bring it, e.g. :class:`gripmon.publish.ZenohJaw`."""
-
-    def opening_m(self) -> float | None: ...
-    def fault(self) -> str: ...
 
 
 class StopRequest:
@@ -118,8 +82,9 @@ class Daemon:
         jaw: JawFeed | None = None,
         keeper: StateKeeper | None = None,
         commands: CommandFeed | None = None,
+        snapshots: Snapshots | None = None,
+        reports: Reports | None = None,
         notices: Sequence[Alert] = (),
-        faults: Sequence[Callable[[], str]] = (),
     ) -> None:
         self._monitor = monitor
         self._source = source
@@ -133,6 +98,9 @@ class Daemon:
         self._kept_revision: int | None = None
         self._open_alerts: tuple[OpenAlert, ...] = ()  # the monitor's
         self._commands = commands
+        self._snapshots = snapshots or Snapshots()
+        self._newest: tuple[Frame, FrameRecord] | None = None
+        self._reports = reports or Reports()
         self._notices = notices
         self._reference, self._reference_due = monitor.reference, True
         self._seq = -1
@@ -143,7 +111,6 @@ class Daemon:
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
         self._stop = stop
         self._source_broke = False
-        self._further_faults = faults
         self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
         self._said_faults: dict[str, str] = {}  # in the log
 
@@ -204,6 +171,7 @@ class Daemon:
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
         self._deliver("transform", self._publisher.transform, record)
+        self._newest = frame, record
         # The rest is less urgent.
         self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:
@@ -253,7 +221,10 @@ class Daemon:
         self._deliver("state's keeping", self._keep_changes, at_once=True)
         if answer and answer.done and self._keeper.failure:
             answer = msgspec.structs.replace(answer, text=f"{answer.text}; but {self._keeper.failure}")
-        self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
+        if answer and answer.done and command.name is CommandName.SNAPSHOT:
+            self._deliver("answer", self._snapshots.answer, asked, answer, self._newest)
+        else:
+            self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
 
     def _keep_now(self) -> None:
         self._kept_revision = self._monitor.state_revision
@@ -326,16 +297,8 @@ class Daemon:
 
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
-        watch, said = self._watch, self._said
-        faults = (
-            watch.message,
-            watch.undelivered,
-            self._jaw.fault() if self._jaw else "",
-            self._recorder.failure,
-            self._estimates.failure,
-            self._keeper.failure,
-            *(fault() for fault in self._further_faults),
-        )
+        watch, said, reports = self._watch, self._said, self._reports
+        faults = (watch.message, watch.undelivered, *(ask() for ask in reports.faults))
         message = "; ".join(fault for fault in faults if fault)
         now = (watch.state, watch.verdict, self._source.connected, message, self._reference.revision)
         due = now_s >= self._next_state_s
@@ -364,6 +327,8 @@ class Daemon:
             tcp_shift_m=watch.tcp_shift_m,
             sigma_m=watch.sigma_m,
             open_alerts=watch.standing(self._open_alerts),
+            transforms_unsent=reports.unsent(),
+            malformed=reports.malformed(),
         )
         self._deliver("state", self._publisher.state, self._said)
         if due:

@@ -301,12 +301,12 @@ class Monitor:
             done, text = False, str(refusal)
         if self.reference is not before:
             self._begin()
-        state = self.state() if command.name is CommandName.STATE else None
+        state = self.state() if command.name in (CommandName.STATE, CommandName.SNAPSHOT) else None
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
 
     def _obey(self, command: Command, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
         name, reference = command.name, self.reference
-        if name is CommandName.STATE:
+        if name in (CommandName.STATE, CommandName.SNAPSHOT):
             return f"{self._policy.state}, {reference.reference_id} in force, revision {reference.revision}", ()
         if name is CommandName.ACKNOWLEDGE:
             seen = self._policy.alerts.acknowledge(command.argument)

@@ -2,7 +2,8 @@
 
 Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.records`):
 
-``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested
+``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested; a
+               ``get`` brings the last one
 ``state``      once a second and on every change; late joiners get the last one
 ``reference``  on every new revision; late joiners get the last one
 ``alert``      when there is one; an advanced subscriber with history gets the last 32

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections import deque
+from collections import OrderedDict, deque
+from collections.abc import Callable
 
 import zenoh
 
@@ -17,67 +18,101 @@ from gripmon.records import (
     CommandRequest,
     MessageRefused,
     from_json,
+    largest_bytes,
     to_json,
 )
 from gripmon.wire import Keys, Link
+from gripmon.wire.malformed import Malformed
 
 _log = logging.getLogger(__name__)
 
-_WAITING_MOST = 16
 TIMEOUT_S = 2.0
 """So long the loop has for a command; then the asker is told that it has not answered."""
 
+_WAITING_MOST = 16
+_REMEMBERED_MOST = 256
+_QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
+"""They change nothing, and their answers are large: asked again they are answered anew, not from memory."""
+
+_STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
+
 
 class PendingCommand:
-    """A command whose asker waits.  It is answered once: by the loop, or when its time is over."""
+    """A command, and all who wait for its answer: whoever sent it, perhaps several times under the same id.
 
-    def __init__(self, command: Command, query: zenoh.Query, key: str, timeout_s: float) -> None:
+    It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
+    """
+
+    def __init__(self, command: Command, timeout_s: float) -> None:
         self.command = command
-        self._query: zenoh.Query | None = query  # None once it is answered: Zenoh then ends the asker's waiting
-        self._key = key
         self._timeout_s = timeout_s
-        self._taken = False
-        self._lock = threading.Lock()
-        self._timer = threading.Timer(timeout_s, self._time_is_over)
-        self._timer.daemon = True
-        self._timer.start()
+        self._lock = threading.Lock()  # guards what follows
+        self._askers: list[_Asker] = []
+        self._answer: CommandReply | CommandError | None = None
+        self._taken = self._dropped = False
+
+    def join(self, query: zenoh.Query, key: str) -> bool:
+        """Add somebody who waits, or tell the answer that is there; False if it was given up and never carried out."""
+        with self._lock:
+            if self._dropped:
+                return False
+            answer = self._answer
+            if answer is None:
+                self._askers.append(asker := _Asker(query, key))
+        if answer is not None:
+            _reply(query, key, answer)
+        else:
+            asker.wait(self._timeout_s, lambda: self._time_is_over(asker))
+        return True
 
     def take(self) -> bool:
-        """The loop is about to carry it out; False if its asker was told that it won't be."""
+        """The loop is about to carry it out; False if all its askers were told that it won't be."""
         with self._lock:
-            self._taken = self._query is not None
+            self._taken = bool(self._askers)
+            self._dropped = not self._taken
             return self._taken
 
-    def answer(self, answer: CommandReply | CommandError) -> None:
-        """Tell the asker; nothing happens if it was told something already."""
-        self._timer.cancel()
+    def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
+        """Tell those who still wait, and whoever asks again."""
         with self._lock:
-            query, self._query = self._query, None
-        if query is not None:
-            _reply(query, self._key, answer)
+            self._answer = answer
+            askers, self._askers = self._askers, []
+        for asker in askers:
+            asker.tell(answer, attachment)
 
-    def _time_is_over(self) -> None:
+    def _time_is_over(self, asker: _Asker) -> None:
         with self._lock:
-            became = "it may still be carried out, ask for the state" if self._taken else "it is not carried out"
-            query, self._query = self._query, None
-        if query is not None:
-            text = f"the monitor has not answered within {self._timeout_s:g} s; {became}"
-            _reply(query, self._key, CommandError(CommandFault.TIMEOUT, text))
+            if asker not in self._askers:
+                return
+            self._askers.remove(asker)
+            lives = self._taken or bool(self._askers)
+            became = "it may still be carried out, ask for the state" if lives else "it is not carried out"
+        text = f"the monitor has not answered within {self._timeout_s:g} s; {became}"
+        asker.tell(CommandError(CommandFault.TIMEOUT, text))
 
 
 class ZenohCommands:
-    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload ``{"argument": "…"}`` or none.
+    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`gripmon.records.CommandRequest` or none.
 
     It replies a :class:`gripmon.records.CommandReply` as JSON, or as an error a :class:`gripmon.records.CommandError`.
+    What was carried out under an id is not carried out again: the last 256 answers are remembered.
     """
 
     def __init__(self, link: Link, keys: Keys, *, timeout_s: float = TIMEOUT_S) -> None:
         self._keys = keys
+        self._malformed = Malformed("command", keys["cmd"])
         self._timeout_s = timeout_s
         self._waiting: deque[PendingCommand] = deque()
+        self._lock = threading.Lock()  # guards what is known by its id
+        self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
         link.attach(self._attach, self.close)
+
+    @property
+    def malformed(self) -> int:
+        """Requests so far whose payload was none."""
+        return self._malformed.count
 
     def poll(self) -> PendingCommand | None:
         """The next command to carry out and answer, at once; None if there is none."""
@@ -91,7 +126,7 @@ class ZenohCommands:
         """Tell those who still wait that the monitor stops."""
         self._closed = True
         while (pending := self.poll()) is not None:
-            pending.answer(CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out"))
+            pending.answer(_STOPPING)
 
     def _attach(self, session: zenoh.Session) -> None:
         # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
@@ -102,48 +137,97 @@ class ZenohCommands:
         # Zenoh swallows an exception here and the asker would see an empty result: always answer in words.
         key = str(query.key_expr)
         try:
-            self._queue(query, key)
-        except Exception as error:  # noqa: BLE001  as just said
-            _log.debug("command on %s", key, exc_info=error)
-            _reply(query, key, CommandError(CommandFault.INTERNAL, f"{type(error).__name__}: {error}"))
+            error = self._queue(query, key)
+        except Exception as fault:  # noqa: BLE001  as just said
+            _log.debug("command on %s", key, exc_info=fault)
+            error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
+        if error is not None:
+            _reply(query, key, error)
 
-    def _queue(self, query: zenoh.Query, key: str) -> None:
-        asked = _command(self._keys, key, query.payload)
-        if isinstance(asked, Command):
-            if self._closed:
-                asked = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
-            elif len(self._waiting) >= _WAITING_MOST:
-                asked = CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
-            else:
-                self._waiting.append(PendingCommand(asked, query, key, self._timeout_s))
-                return
-        _reply(query, key, asked)
+    def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
+        """Let the loop answer; an error if it won't."""
+        name = _name(self._keys, key)
+        if isinstance(name, CommandError):
+            return name
+        request = _request(query.payload)
+        if isinstance(request, CommandError):
+            self._malformed.add(request.text)
+            return request
+        if self._closed:
+            return _STOPPING
+        command = Command(name, request.argument)
+        with self._lock:
+            known = self._known.get(request.id)
+            if known is not None and known.command != command:
+                text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
+                return CommandError(CommandFault.ID_REUSED, text)
+            if known is not None and known.join(query, key):
+                return None
+            if len(self._waiting) >= _WAITING_MOST:
+                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
+            pending = PendingCommand(command, self._timeout_s)
+            pending.join(query, key)
+            self._remember(request.id, pending)
+            self._waiting.append(pending)
+        return None
+
+    def _remember(self, request_id: str, pending: PendingCommand) -> None:
+        if request_id and pending.command.name not in _QUESTIONS:
+            self._known[request_id] = pending
+            self._known.move_to_end(request_id)
+            if len(self._known) > _REMEMBERED_MOST:
+                self._known.popitem(last=False)
 
 
-def _command(keys: Keys, key: str, payload: zenoh.ZBytes | None) -> Command | CommandError:
-    """What is asked for, or what is wrong with it."""
+class _Asker:
+    """One query that waits for its answer."""
+
+    def __init__(self, query: zenoh.Query, key: str) -> None:
+        self._query, self._key = query, key
+        self._timer: threading.Timer | None = None
+
+    def wait(self, timeout_s: float, is_over: Callable[[], None]) -> None:
+        self._timer = threading.Timer(timeout_s, is_over)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def tell(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        _reply(self._query, self._key, answer, attachment)
+
+
+def _name(keys: Keys, key: str) -> CommandName | CommandError:
+    """Which command is asked for on a key, or what is wrong with it."""
     name = key.rpartition("/")[2]
     if "*" in key or key != keys[f"cmd/{name}"]:
         # What changes a calibration must name it: a pattern may reach more monitors than was thought of.
         text = f"{key} is a pattern; name the monitor: {keys['cmd/<name>']}"
         return CommandError(CommandFault.SEVERAL, text)
     try:
-        known = CommandName(name)
+        return CommandName(name)
     except ValueError:
         text = f"there is no command {name}; one of {', '.join(CommandName)}"
         return CommandError(CommandFault.UNKNOWN, text)
-    data = b"" if payload is None else payload.to_bytes()
+
+
+def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
+    """What a payload says, or what is wrong with it."""
     try:
-        request = from_json(data, CommandRequest) if data else CommandRequest()
+        if payload is None or not len(payload):
+            return CommandRequest()
+        if len(payload) > (most := largest_bytes(CommandRequest)):  # before a copy of it is made
+            raise MessageRefused(f"{len(payload)} bytes; at most {most}")
+        return from_json(payload.to_bytes(), CommandRequest)
     except MessageRefused as error:
-        return CommandError(CommandFault.MALFORMED, f'{error}; a payload is {{"argument": "…"}}, or none')
-    return Command(known, request.argument)
+        text = f'{error}; a payload is {{"id": "…", "argument": "…"}}, both may be left out'
+        return CommandError(CommandFault.MALFORMED, text)
 
 
-def _reply(query: zenoh.Query, key: str, answer: CommandReply | CommandError) -> None:
+def _reply(query: zenoh.Query, key: str, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
     try:
         if isinstance(answer, CommandReply):
-            query.reply(key, to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON)
+            query.reply(key, to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON, attachment=attachment)
         else:
             query.reply_err(to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON)
     except zenoh.ZError as error:  # the asker, or the session, is gone

@@ -126,12 +126,14 @@ def _keeping_publisher(
 
 
 class _LastValue:
-    """A key whose last value is there for whoever comes later."""
+    """A key whose last value is there for whoever asks."""
 
-    def __init__(self, session: zenoh.Session, key: str) -> None:
+    def __init__(
+        self, session: zenoh.Session, key: str, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+    ) -> None:
         self._key = key
         self._last: bytes | None = None
-        self._publisher = _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1)
+        self._publisher = publisher
         # Answered in Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
         answer = zenoh.handlers.Callback(self._answer, indirect=False)
         self._queryable = session.declare_queryable(key, answer, complete=True)
@@ -153,16 +155,20 @@ class _Wire:
     """Everything declared on one open session."""
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
-        self.transform = session.declare_publisher(
+        # No cache here: a transform is worth nothing to who didn't ask for the last one.
+        transforms = session.declare_publisher(
             keys["transform"],
             encoding=_JSON,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
+        self.transform = _LastValue(session, keys["transform"], transforms)
         self.alert = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
-        self.state = _LastValue(session, keys["state"])
-        self.reference = _LastValue(session, keys["reference"])
+        self.state, self.reference = (
+            _LastValue(session, key, _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1))
+            for key in (keys["state"], keys["reference"])
+        )
         self._alive = session.liveliness().declare_token(keys["alive"])
 
     def close(self) -> None:

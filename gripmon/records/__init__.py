@@ -13,7 +13,16 @@ exp(omega) R``.
 from __future__ import annotations
 
 from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
-from gripmon.records.commands import Command, CommandError, CommandFault, CommandName, CommandReply, CommandRequest
+from gripmon.records.commands import (
+    Command,
+    CommandError,
+    CommandFault,
+    CommandName,
+    CommandReply,
+    CommandRequest,
+    Snapshot,
+    SnapshotImage,
+)
 from gripmon.records.evidence import EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
     CornerFault,
@@ -72,6 +81,8 @@ __all__ = [
     "Refusal",
     "Severity",
     "Smoothed",
+    "Snapshot",
+    "SnapshotImage",
     "StandingAlert",
     "State",
     "StateRecord",

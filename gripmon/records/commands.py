@@ -8,6 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from gripmon.records.frames import FrameRecord
 from gripmon.records.references import MonitorState
 from gripmon.records.values import OpenEnum
 
@@ -22,6 +23,7 @@ class CommandName(enum.StrEnum):
     RESET = "reset"
     ACKNOWLEDGE = "acknowledge"
     STATE = "state"
+    SNAPSHOT = "snapshot"
 
 
 class Command(msgspec.Struct, frozen=True):
@@ -45,6 +47,33 @@ class CommandRequest(
     argument: Annotated[
         str, Meta(max_length=256, description="the reference, proposal or alert that is meant; empty: see the command")
     ] = ""
+    id: Annotated[
+        str,
+        Meta(
+            max_length=64,
+            description="of this request: sent again, it gets the same answer and isn't carried out again; empty: none",
+        ),
+    ] = ""
+
+
+class SnapshotImage(msgspec.Struct, frozen=True):
+    """The image of a snapshot; the file itself is attached to the reply."""
+
+    encoding: Annotated[str, Meta(description="png, which loses nothing, or jpeg for more than 32 MiB of pixels")]
+    width_px: Annotated[int, Meta(description="columns")]
+    height_px: Annotated[int, Meta(description="rows")]
+    pixels: Annotated[str, Meta(description="mono8, mono16, bgr8 or bgr16 as decoded by OpenCV; float images: 16 bit")]
+    size_bytes: Annotated[int, Meta(description="of the attachment")]
+
+
+class Snapshot(msgspec.Struct, frozen=True):
+    """The newest frame: what the monitor made of it, and its image."""
+
+    record: Annotated[FrameRecord, Meta(description="the transform message of that frame")]
+    jaw_reported_m: Annotated[
+        float | None, Meta(description="the opening that the robot had reported, m; null if none")
+    ]
+    image: Annotated[SnapshotImage | None, Meta(description="null if the frame has none that can be kept")]
 
 
 class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.reply/1"):
@@ -57,8 +86,12 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
     revision: Annotated[int, Meta(description="of the reference in force afterwards")]
     monitor: Annotated[
         MonitorState | None,
-        Meta(description="answers state: references, a proposal, open alerts, by which commands name them; else null"),
+        Meta(
+            description="answers state and snapshot: references, a proposal, open alerts, by which commands name them; "
+            "else null"
+        ),
     ] = None
+    snapshot: Annotated[Snapshot | None, Meta(description="answers snapshot; else null")] = None
 
 
 class CommandFault(OpenEnum):
@@ -70,6 +103,7 @@ class CommandFault(OpenEnum):
     BUSY = "busy"
     TIMEOUT = "timeout"
     STOPPING = "stopping"
+    ID_REUSED = "id_reused"
     INTERNAL = "internal_error"
 
 

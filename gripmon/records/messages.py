@@ -51,6 +51,8 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         Meta(description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown"),
     ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
+    transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
+    malformed: Annotated[int, Meta(description="messages received that were none: jaw openings, frames, commands")] = 0
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):

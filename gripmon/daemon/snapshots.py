@@ -1,0 +1,122 @@
+"""Answers to ``snapshot``: the loop hands over the newest frame, a thread makes a file of its image."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import queue
+import threading
+from typing import NamedTuple
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.daemon.neighbours import Asked
+from gripmon.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
+
+_log = logging.getLogger(__name__)
+
+LARGEST_EXACT_BYTES = 32 << 20
+"""Pixels beyond this are sent as JPEG with 8 bits: a PNG would take seconds, and is hardly smaller than they are."""
+
+_LARGEST_FILE_BYTES = 40 << 20
+_JPEG_QUALITY = 95
+_WAITING_MOST = 2
+_NICENESS = 10  # the loop goes first
+_CLOSE_WITHIN_S = 1.0
+_PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
+
+
+class _Job(NamedTuple):
+    asked: Asked
+    reply: CommandReply
+    frame: Frame
+    record: FrameRecord
+
+
+class Snapshots:
+    """Completes replies in a thread of its own, which is started by the first."""
+
+    def __init__(self) -> None:
+        self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
+        self._thread: threading.Thread | None = None
+
+    def answer(self, asked: Asked, reply: CommandReply, newest: tuple[Frame, FrameRecord] | None) -> None:
+        """Send the reply with the newest frame and its record, soon; without one it is refused."""
+        if newest is None:
+            asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))
+            return
+        try:
+            self._jobs.put_nowait(_Job(asked, reply, *newest))
+        except queue.Full:
+            text = f"{_WAITING_MOST} snapshots are being made; try again later"
+            asked.answer(CommandError(CommandFault.BUSY, text))
+            return
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._run, name="gripmon-snapshots", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Complete what is in hand, if that takes no longer than a second."""
+        if self._thread is not None:
+            with contextlib.suppress(queue.Full):
+                self._jobs.put(None, timeout=_CLOSE_WITHIN_S)
+            self._thread.join(_CLOSE_WITHIN_S)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)  # of this thread alone, on Linux
+        while (job := self._jobs.get()) is not None:
+            try:
+                _complete(job)
+            except Exception as error:  # noqa: BLE001  said to the asker
+                _log.debug("snapshot", exc_info=error)
+                job.asked.answer(CommandError(CommandFault.INTERNAL, f"{type(error).__name__}: {error}"))
+
+
+def _complete(job: _Job) -> None:
+    frame = job.frame
+    image, data, said = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
+    if (encoded := encode(frame.image)) is not None:
+        image, data = encoded
+        said = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
+    snapshot = Snapshot(job.record, frame.jaw_opening_m, image)
+    text = f"frame {frame.seq}, {job.record.state}, transform {job.record.verdict}: {said}"
+    job.asked.answer(msgspec.structs.replace(job.reply, text=text, snapshot=snapshot), data)
+
+
+def encode(image: object) -> tuple[SnapshotImage, bytes] | None:
+    """A file of an image (H, W) or (H, W, 3), BGR, uint8, uint16 or float32 in 0..1; None for what is none of these.
+
+    PNG with the very pixels, floats rounded to 16 bits; JPEG for more than :data:`LARGEST_EXACT_BYTES`, and None if
+    even that is larger than a reply may be.
+    """
+    pixels = _integers(image)
+    if pixels is None:
+        return None
+    exact = pixels.nbytes <= LARGEST_EXACT_BYTES
+    if exact:
+        done, file = cv2.imencode(".png", pixels, (cv2.IMWRITE_PNG_COMPRESSION, 1))
+    else:
+        pixels = (pixels >> 8).astype(np.uint8) if pixels.dtype == np.uint16 else pixels
+        done, file = cv2.imencode(".jpg", pixels, (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+    if not done or file.nbytes > _LARGEST_FILE_BYTES:
+        return None
+    height_px, width_px = pixels.shape[:2]
+    layout = _PIXELS[str(pixels.dtype), pixels.ndim]
+    data = file.tobytes()
+    return SnapshotImage("png" if exact else "jpeg", width_px, height_px, layout, len(data)), data
+
+
+def _integers(image: object) -> NDArray[np.uint8] | NDArray[np.uint16] | None:
+    if not isinstance(image, np.ndarray) or image.size == 0:
+        return None
+    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
+        return None
+    if image.dtype == np.float32:
+        scaled = np.nan_to_num(image * np.float32(65535.0), nan=0.0, posinf=65535.0, neginf=0.0)
+        return np.clip(np.rint(scaled), 0.0, 65535.0).astype(np.uint16)
+    return image if image.dtype in (np.uint8, np.uint16) else None

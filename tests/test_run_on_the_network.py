@@ -1,0 +1,138 @@
+"""``gripmon run`` as users start it, on a network that is wrong, not there yet, or full of nonsense."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import zenoh
+from loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
+
+from gripmon.config import builtin_config
+
+ROOT = Path(__file__).resolve().parent.parent
+PREFIX = "gripmon/demo/wrist"
+
+
+def configured(folder: Path, publish: str, *more: str) -> Path:
+    """The demo's configuration, slower, with another section ``publish``."""
+    text = builtin_config("demo.yaml").read_text()
+    start = text.index("publish:")
+    end = text.index("\n\n", start) if "\n\n" in text[start:] else len(text)
+    text = f"{text[:start]}publish: {publish}{text[end:]}"
+    grippers = builtin_config("demo.yaml").parent / "grippers"
+    for before, after in (("gripper: grippers/", f"gripper: {grippers}/"), ("fps: 60.0", "fps: 10.0")):
+        assert text.count(before) == 1
+        text = text.replace(before, after)
+    path = folder / "here.yaml"
+    path.write_text("\n".join([text, *more]))
+    return path
+
+
+@contextmanager
+def running(config: Path) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "gripmon", "run", str(config)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def refused(config: Path) -> str:
+    """What a run that can't start says: one line, exit code 2."""
+    command = [sys.executable, "-m", "gripmon", "run", str(config)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60.0, cwd=ROOT)
+    assert done.returncode == 2, done.stderr
+    (line,) = done.stderr.splitlines()
+    return line
+
+
+@pytest.fixture
+def endpoint() -> str:
+    return free_endpoint()
+
+
+def test_a_port_in_use_is_said_in_one_line(tmp_path: Path, endpoint: str):
+    config = configured(tmp_path, f"{{listen: [{endpoint}]}}")
+    with plain_session(listen=endpoint, mode="peer"):
+        line = refused(config)
+    assert line == (
+        f"{config}: publish.listen: {endpoint} is already in use; stop the program that has it, or choose another port"
+    )
+
+
+@pytest.mark.parametrize(
+    ("file", "text", "said"),
+    [
+        ("there.json5", None, "publish.zenoh_config: no file "),
+        ("there.json5", "{mode: 'peer', listen: 3}", "publish.zenoh_config: "),
+        ("there.json5", "no json", "publish.zenoh_config: "),
+        ("there.yaml", "mode: sideways", "publish.zenoh_config: "),
+    ],
+)
+def test_a_bad_zenoh_configuration_is_said_in_one_line(tmp_path: Path, file: str, text: str | None, said: str):
+    if text is not None:
+        (tmp_path / file).write_text(text)
+    config = configured(tmp_path, f"{{zenoh_config: {file}}}")
+    line = refused(config)
+    assert line.startswith(f"{config}: {said}") and file in line and ".rs:" not in line
+
+
+def test_a_router_that_comes_later_hears_what_was_missed(tmp_path: Path, endpoint: str):
+    config = configured(tmp_path, f"{{mode: client, connect: [{endpoint}], retry_longest_s: 0.5}}")
+    with running(config) as process:
+        said: list[str] = []
+        assert process.stderr is not None
+        while "no Zenoh session yet, trying again" not in (line := process.stderr.readline()):
+            assert line, "it goes on without a router"
+            said.append(line)
+        while "state " not in process.stderr.readline():
+            assert process.poll() is None
+        with plain_session(listen=endpoint, mode="router") as router:
+            states: list[dict] = []  # type: ignore[type-arg]
+            wait_until(lambda: states.extend(ask(router, f"{PREFIX}/state")) or states, "the state", 60.0)
+            wait_until(lambda: ask(router, f"{PREFIX}/state")[0]["frames"] > states[0]["frames"], "frames go on", 60.0)
+            state = ask(router, f"{PREFIX}/state")[0]
+        assert state["transforms_unsent"] > 0 and state["schema"] == "gripmon.state/1"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(WAIT_S) == 0
+    assert not [line for line in said if "Traceback" in line]
+
+
+def test_malformed_messages_are_counted_in_the_state(tmp_path: Path, endpoint: str):
+    config = configured(tmp_path, f"{{listen: [{endpoint}]}}")
+    config.write_text(config.read_text().replace("source: frames", "source: zenoh"))
+    with running(config) as process, opened_when_it_listens(process, endpoint) as session:
+        wait_until(lambda: ask(session, f"{PREFIX}/state"), "the state", 60.0)
+        for reply in session.get(f"{PREFIX}/cmd/undo", payload=b"nonsense", timeout=WAIT_S):
+            assert reply.err is not None
+            assert json.loads(reply.err.payload.to_bytes())["schema"] == "gripmon.error/1"
+        wait_until(lambda: ask(session, f"{PREFIX}/state")[0]["malformed"] == 1, "the count")
+
+
+def test_a_killed_monitor_is_missed(tmp_path: Path, endpoint: str):
+    """kill -9: the liveliness token is gone without anybody's doing."""
+    config = configured(tmp_path, f"{{listen: [{endpoint}]}}")
+    with running(config) as process, opened_when_it_listens(process, endpoint) as session:
+        tokens = session.liveliness().declare_subscriber(f"{PREFIX}/alive", history=True)
+        wait_until(lambda: (sample := tokens.try_recv()) is not None and sample.kind == zenoh.SampleKind.PUT, "alive")
+        process.kill()
+        wait_until(lambda: (sample := tokens.try_recv()) is not None and sample.kind == zenoh.SampleKind.DELETE, "gone")
+
+
+@contextmanager
+def opened_when_it_listens(process: subprocess.Popen[str], endpoint: str) -> Iterator[zenoh.Session]:
+    from loopback import accepts
+
+    wait_until(lambda: process.poll() is not None or accepts(endpoint), "the daemon to listen", 60.0)
+    assert process.poll() is None
+    with plain_session(connect=endpoint) as session:
+        yield session
