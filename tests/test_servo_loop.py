@@ -6,12 +6,13 @@ import json
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
-from gripmon.client import Policy
+from gripmon.client import Policy, Reading
 from gripmon.geometry import exp_rotation, from_record, invert, make_transform
-from gripmon.records import Verdict
+from gripmon.records import Smoothed, Transform, Verdict
 
 pytest.importorskip("pinocchio")
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
@@ -149,6 +150,36 @@ def test_a_new_revision_needs_the_object_seen_anew():
     assert not any(world.go(new, 0.5, seen=False))
     world.step(new)
     assert world.step(new)
+
+
+def test_what_the_client_refuses_is_unknown_to_the_controller():
+    from servoing.controller import given_by
+
+    turn = exp_rotation(np.array([0.2, -0.4, 0.9]))
+    covariance = np.zeros((6, 6))
+    covariance[:3, :3] = turn @ np.diag([1e-6, 2e-6, 9e-6]) ** 2 @ turn.T
+    flat, half = tuple(covariance.ravel().tolist()), tuple((0.25 * covariance).ravel().tolist())
+    frame, average = Transform((0.001, 0.002, 0.119), (0.6, 0.0, 0.0, 0.8)), (0.0011, 0.0021, 0.1191)
+    good = Reading(
+        monitor=None, verdict=Verdict.SUSPECT, usable=True, why=None, reason="", age_s=0.01, transform=frame,
+        covariance=flat, smoothed=Smoothed(average, frame.rotation_xyzw, half), reference_id="plate", revision=4,
+    )  # fmt: skip
+
+    def change(**changes: object) -> Reading:
+        return msgspec.structs.replace(good, **changes)
+
+    raw, smooth = given_by(good, 0.01, smoothed=False), given_by(good, 0.02, smoothed=True)
+    np.testing.assert_allclose(raw.cam_T_grip, from_record(frame))
+    np.testing.assert_allclose(smooth.cam_T_grip[:3, 3], average)
+    assert raw.sigma_m == pytest.approx(9e-6) and smooth.sigma_m == pytest.approx(4.5e-6)
+    assert (raw.verdict, raw.age_s, raw.reference) == (Verdict.SUSPECT, 0.01, ("plate", 4)) and smooth.age_s == 0.02
+    without = given_by(change(smoothed=None), 0.0, smoothed=True)
+    np.testing.assert_array_equal(without.cam_T_grip, raw.cam_T_grip)
+    for smoothed in (False, True):
+        refused = given_by(change(verdict=Verdict.VALID, usable=False), 0.0, smoothed=smoothed)
+        assert refused.verdict is Verdict.UNKNOWN and refused.cam_T_grip is None and refused.sigma_m is None
+    nothing = given_by(change(transform=None, covariance=None, smoothed=None), 0.0, smoothed=True)
+    assert nothing.verdict is Verdict.UNKNOWN and nothing.cam_T_grip is None
 
 
 def test_a_command_that_isn_t_renewed_ends():

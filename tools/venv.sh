@@ -1,4 +1,4 @@
-# Sourced by tools/demo, tools/test and tools/bench: makes or reuses a virtual environment with this checkout installed in it.
+# Sourced by tools/demo, tools/test, tools/bench and tools/servo: makes or reuses a virtual environment with this checkout installed in it.
 # GRIPMON_VENV: where (default .venv in the checkout).  PYTHON: which interpreter (default: the first one that is new enough).
 
 checkout=$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)

@@ -64,7 +64,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--runs", type=_count, default=10, metavar="N", help="of each of the four rows (default 10)")
     parser.add_argument("--seed", type=_seed, default=1, metavar="N", help="of everything random (default 1)")
     parser.add_argument("--fps", type=_rate, default=30.0, metavar="HZ", help="frame rate of the camera (default 30)")
-    parser.add_argument("--realtime", action="store_true", help="a live camera instead of every frame in turn")
+    parser.add_argument(
+        "--realtime", action="store_true", help="a live camera; needs a machine with nothing else to do"
+    )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw distance over time, a run of each row (PNG)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
     parser.add_argument("--markdown", action="store_true", help="print the table for a document, too")
