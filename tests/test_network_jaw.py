@@ -1,0 +1,168 @@
+"""The jaw opening from the network: a message, a number, joint states of ROS 2; and what is no opening."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import zenoh
+from loopback import free_endpoint, plain_session, wait_until
+
+from gripmon.publish import ZenohJaw
+from gripmon.publish.jaw import DecodeOpening, opening_of_joints
+from gripmon.ros2 import JOINT_STATE, JointOpening, subscription_key
+from gripmon.ros2.types import type_hash, typestore
+from gripmon.wire import Link, PublishSettings, malformed
+from gripmon.wire.malformed import Malformed
+
+KEY = "gripmon/arm/wrist/jaw"
+TRAVEL_M = (0.0, 0.06)
+NODE_KEY = "3/gripper/joint_states/sensor_msgs::msg::dds_::JointState_"
+"""Written by hand from the rules of rmw_zenoh: domain, topic, type as DDS names it."""
+
+
+class Robot:
+    """A session that reports, and the jaw that hears it."""
+
+    def __init__(self, session: zenoh.Session, jaw: ZenohJaw, key: str) -> None:
+        self.jaw = jaw
+        self._publisher = session.declare_publisher(key)
+        wait_until(lambda: self._publisher.matching_status.matching, "the jaw to listen")
+
+    def says(self, payload: str | bytes, expected_m: float | None) -> None:
+        self._publisher.put(payload)
+        wait_until(lambda: self.jaw.opening_m() == expected_m, f"an opening of {expected_m} m from {payload!r}")
+
+    def errs(self, payload: str | bytes) -> None:
+        before = self.jaw.malformed
+        self._publisher.put(payload)
+        wait_until(lambda: self.jaw.malformed == before + 1, f"{payload!r} to be refused")
+
+
+@contextmanager
+def robot(
+    key: str = KEY, own_key: str = KEY, decode: DecodeOpening | None = None, max_age_s: float = 60.0
+) -> Iterator[Robot]:
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(listen=(endpoint,), jaw_max_age_s=max_age_s))
+    try:
+        with plain_session(connect=endpoint) as session:
+            yield Robot(session, ZenohJaw(link, key, decode, travel_m=TRAVEL_M), own_key)
+    finally:
+        link.close()
+
+
+def test_a_message_or_a_number_of_metres():
+    with robot() as arm:
+        arm.says("0.034", 0.034)
+        arm.says(json.dumps({"stamp_ns": 1, "opening_m": 0.02}), 0.02)
+        arm.says(" 3.5e-2\n", 0.035)
+        arm.says("0", 0.0)
+        arm.says(b'\n {"schema": "gripmon.jaw/1", "opening_m": 0.01, "stamp_ns": 0, "more": [1]}', 0.01)
+        assert arm.jaw.malformed == 0 and arm.jaw.fault() == ""
+
+
+def test_no_opening_of_this_gripper_is_refused_and_the_last_one_stays():
+    with robot() as arm:
+        arm.says("-0.0009", -0.0009)  # as far off as a frame may say, too
+        arm.says("0.034", 0.034)
+        wrong = ["34", "-0.002", "0.0611", "1e308", "NaN", "Infinity", "1e999", "nan", "", "[0.03]", '"0.03"', "null"]
+        wrong += ["true", '{"opening_m": 0.03}', '{"stamp_ns": 1, "opening_m": 34}', "0.03 0.03", "9" * 5000]
+        wrong += ['{"stamp_ns": 1, "opening_m": 0.02, "schema": "gripmon.jaw/2"}', "[" * 3000]
+        for payload in wrong:
+            arm.errs(payload)
+        assert arm.jaw.opening_m() == 0.034
+        assert arm.jaw.fault() == (
+            f"over 10 malformed jaw messages on {KEY}: opening 34 m; 0 to 0.06 m as the gripper file says"
+        )
+
+
+def test_rubbish_keeps_no_opening_young():
+    with robot(max_age_s=0.2) as arm:
+        arm.says("0.034", 0.034)
+
+        def is_old() -> bool:
+            arm.errs("34")
+            return arm.jaw.opening_m() is None
+
+        wait_until(is_old, "the opening to grow old")
+        assert arm.jaw.fault().startswith("no jaw opening for 0.2 s or longer, ")
+
+
+def joint_state(**positions: float) -> bytes:
+    """In CDR, by rosbags."""
+    store = typestore()
+    stamp = store.types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = store.types["std_msgs/msg/Header"](stamp=stamp, frame_id="")
+    nothing = np.zeros(0)
+    values = np.array(list(positions.values()), dtype=float)
+    message = store.types[JOINT_STATE](
+        header=header, name=list(positions), position=values, velocity=nothing, effort=nothing
+    )
+    return bytes(store.serialize_cdr(message, JOINT_STATE))
+
+
+def test_joint_states_of_a_node():
+    """Two fingers that turn: opening is an offset and a scale away from the sum of their angles."""
+    key = subscription_key(3, "/gripper/joint_states", JOINT_STATE)
+    decode = opening_of_joints(JointOpening(joints=("left", "right"), scale=-0.05, offset_m=0.06))
+    with robot(key, f"{NODE_KEY}/{type_hash(JOINT_STATE)}", decode) as arm:
+        arm.says(joint_state(elbow=1.0, left=0.2, right=0.4), 0.06 - 0.05 * 0.6000000000000001)
+        arm.says(joint_state(right=0.1, left=0.1), 0.06 - 0.05 * 0.2)
+        for wrong in (
+            joint_state(left=0.1),
+            joint_state(left=0.1, right=math.nan),
+            joint_state(left=0.1, right=math.inf),
+            joint_state(left=-9.0, right=0.0),
+            joint_state(left=0.1, right=0.1)[:-3],
+            b"0.034",
+            bytes(1 << 19),
+        ):
+            arm.errs(wrong)
+        before = arm.jaw.malformed
+        arm.says(joint_state(elbow=1.0, wrist=2.0), 0.06 - 0.05 * 0.2)  # another node's: passed over
+        arm.says(joint_state(left=0.2, right=0.2), 0.06 - 0.05 * 0.4)
+        assert arm.jaw.malformed == before
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    now_s = [1000.0]
+    monkeypatch.setattr(malformed.time, "monotonic", lambda: now_s[0])
+    return now_s
+
+
+def test_what_is_malformed_is_said_once_an_occasion(clock: list[float], caplog: pytest.LogCaptureFixture):
+    seen = Malformed("frame", "a/b")
+    assert seen.fault() == ""
+    said = []
+    for count in range(1, 2001):
+        clock[0] += 0.01
+        seen.add(f"reason {count}")
+        if not said or said[-1] != seen.fault():
+            said.append(seen.fault())
+    assert said == [
+        "1 malformed frame on a/b: reason 1",
+        "some malformed frames on a/b: reason 1",
+        "over 10 malformed frames on a/b: reason 1",
+        "over 100 malformed frames on a/b: reason 1",
+        "over 1,000 malformed frames on a/b: reason 1",
+    ]
+    assert [r.message for r in caplog.records] == ["malformed frame on a/b: reason 1 (said once)"]
+    clock[0] += malformed.REMEMBERED_S + 1.0
+    assert seen.fault() == ""
+    seen.add("another reason")
+    assert seen.fault() == "1 malformed frame on a/b: another reason"
+    assert seen.count == 2001 and len(caplog.records) == 2
+
+
+def test_a_stranger_writes_no_lines_of_his_own(caplog: pytest.LogCaptureFixture):
+    seen = Malformed("frame", "a/b")
+    seen.add("bad\n2026-01-01 INFO all is well\x1b[2J\u202e" + "x" * 10_000)
+    text = seen.fault()
+    assert len(text) < 300 and text.isprintable() and "\x1b" not in caplog.records[0].message
+    assert "bad 2026-01-01 INFO all is well?[2J?xxx" in text
