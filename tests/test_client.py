@@ -151,6 +151,7 @@ def test_a_message_that_is_no_record_is_an_error(publisher: Published, client: C
             return False
 
         wait_until(broken, "the malformed message")
+        assert client.latest() == frame_record(1)  # said once; what was there stays
 
 
 @pytest.mark.parametrize("names", [("a/b", None), ("arm", "a b"), ("", None)])

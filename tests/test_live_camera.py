@@ -145,11 +145,13 @@ def test_a_stream_that_falls_silent_is_opened_again(servers: list[MjpegServer]):
     servers.append(MjpegServer())
     camera = camera_at(servers[0].port, read_timeout_s=0.3)
     try:
-        next_frame(camera)
+        last = next_frame(camera)
         servers[0].silent.set()
         next_waiting(camera, "next attempt")
+        assert not camera.connected
         servers[0].silent.clear()
-        next_frame(camera)
+        back = next_frame(camera)
+        assert camera.connected and back.seq > last.seq and back.stamp_ns > last.stamp_ns
     finally:
         camera.close()
 

@@ -24,7 +24,7 @@ from loopback import (
 )
 from published import Published
 
-from gripmon.publish import NullPublisher
+from gripmon.publish import NullPublisher, Publisher
 from gripmon.records import Verdict
 from gripmon.wire import Keys, PublishError, PublishSettings
 
@@ -292,6 +292,10 @@ def test_a_jaw_opening_grows_old_though_nobody_asked(endpoint: str):
 
 
 def test_the_null_publisher_takes_everything():
+    def methods(kind: type) -> set[str]:
+        return {name for name in vars(kind) if not name.startswith("_")}
+
+    assert methods(NullPublisher) == methods(Publisher)
     publisher = NullPublisher()
     publisher.transform(frame_record(verdict=Verdict.UNKNOWN))
     publisher.state(state_record())

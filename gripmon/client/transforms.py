@@ -59,18 +59,18 @@ class TransformClient:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    def latest(self) -> Reading:
-        """The newest transform and whether it may be used now, at once.
+    def latest(self, policy: Policy | None = None) -> Reading:
+        """The newest transform and whether it may be used now, at once; by the client's policy or another one.
 
         It takes no lock, makes no system call and raises nothing.  (Before the first transform it looks at the session,
         too, to say whom there is no connection to.)
         """
         heard = self._inbox.heard
-        return judge(heard, heard.entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
+        return judge(heard, heard.entry, policy or self.policy, time.monotonic(), time.time_ns(), self._fault)
 
-    def require(self) -> Reading:
+    def require(self, policy: Policy | None = None) -> Reading:
         """As :meth:`latest`, but raises :class:`NotUsable` unless the policy allows the transform."""
-        reading = self.latest()
+        reading = self.latest(policy)
         if not reading.usable:
             raise NotUsable(reading)
         return reading
