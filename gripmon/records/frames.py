@@ -130,7 +130,7 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     ]
     corners: Annotated[tuple[CornerRecord, ...], Meta(description="all of the gripper file, in its order")]
     alerts: Annotated[tuple[Alert, ...], Meta(description="what this frame raised, updated or cleared")]
-    latency_ns: Annotated[int, Meta(description="from handed over to judged, ns; 0 in a replay")] = 0
+    latency_ns: Annotated[int, Meta(description="from handed over to judged, ns")] = 0
     reason: Annotated[str | None, Meta(description="why nothing was measured; null when all is well")] = None
     name: Annotated[str, Meta(description="file or stream that the frame came from")] = ""
 

@@ -50,7 +50,7 @@ class MonitorState(msgspec.Struct, frozen=True):
     """What survives a restart."""
 
     references: Annotated[
-        tuple[ReferenceRecord, ...], Meta(description="from the configured one to the one in force, the newest 1000")
+        tuple[ReferenceRecord, ...], Meta(description="the configured one and the newest 999, the last one in force")
     ]
     proposal: Annotated[
         ReferenceRecord | None, Meta(description="a new reference that waits for an operator; null if there is none")
