@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 import ros2_idl as idl
-from loopback import alert_record, frame_record, state_record
+from loopback import frame_record, state_record
 from scipy.spatial.transform import Rotation
 
-from gripmon.records import AlertKind, AlertRecord, Severity, State, Transform, Verdict
+from gripmon.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
 from gripmon.ros2.messages import ERROR, OK, STALE, WARN, Messages, inverse
 from gripmon.ros2.types import DIAGNOSTICS, POSE, TF, typestore
 
@@ -83,8 +83,8 @@ def test_the_covariance_of_the_inverse():
     )
 
 
-def alert(severity: Severity, *, acknowledged: bool = False) -> AlertRecord:
-    return msgspec.structs.replace(alert_record(f"a {severity}"), severity=severity, acknowledged=acknowledged)
+def alert(severity: Severity, *, acknowledged: bool = False) -> StandingAlert:
+    return StandingAlert("7", AlertKind.DRIFT, severity, f"a {severity}", 5, acknowledged)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +102,7 @@ def alert(severity: Severity, *, acknowledged: bool = False) -> AlertRecord:
         ({"message": "no jaw opening received"}, [], WARN),
     ],
 )
-def test_levels_of_diagnostics(messages: Messages, changes: dict[str, object], alerts: list[AlertRecord], level: int):
+def test_levels_of_diagnostics(messages: Messages, changes: dict[str, object], alerts: list[StandingAlert], level: int):
     state = msgspec.structs.replace(state_record(), **changes)
     payload = cdr(messages.diagnostics("gripmon: arm/wrist", state, None, alerts, "yes"), DIAGNOSTICS)
     (status,) = idl.DiagnosticArray.deserialize(payload).status
@@ -112,7 +112,9 @@ def test_levels_of_diagnostics(messages: Messages, changes: dict[str, object], a
 
 
 def test_values_of_diagnostics(messages: Messages):
-    state = msgspec.structs.replace(state_record(), stamp_ns=STAMP_NS + 250_000_000)
+    state = msgspec.structs.replace(
+        state_record(), stamp_ns=STAMP_NS + 250_000_000, tcp_shift_m=(0.001, -0.002, 0.003), sigma_m=12e-6
+    )
     frame = frame_record(0, stamp_ns=STAMP_NS, reason="blurred")
     payload = cdr(
         messages.diagnostics("gripmon: arm/wrist", state, frame, [alert(Severity.WARNING)], "no: verdict suspect"),
@@ -136,6 +138,7 @@ def test_values_of_diagnostics(messages: Messages):
         "tcp shift (mm)": "3.7417",  # of (1, -2, 3) mm
         "tcp shift x y z in the camera frame (mm)": "1.0000 -2.0000 3.0000",
         "rotation (deg)": "0.1490",  # of 2.6 mrad
+        "position sigma (mm)": "0.0120",
         "alerts": f"{AlertKind.DRIFT} (warning)",
         "camera connected": "true",
         "frames per s": "30.00",

@@ -25,7 +25,7 @@ from stand_ins import Listener, ScriptedMonitor, TickingSource
 from gripmon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, StopRequest
 from gripmon.publish import Publishers
-from gripmon.records import AlertEvent, Severity, Verdict
+from gripmon.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 from gripmon.ros2 import Layout, NodeName, Ros2Fault, Ros2Publisher, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.ros2.messages import inverse
 from gripmon.ros2.node import gid_of
@@ -181,6 +181,12 @@ def test_diagnostics_follow_the_alerts(make_bench: Callable[..., Bench]):
     assert status(sample.payload.to_bytes()).level == 0 and values(sample.payload.to_bytes())["alerts"] == ""
     bench.publisher.alert(alert_record())  # only noted: neither open nor over
     assert not bench.published()
+    # The state knows of those, too, that were raised before this node was there.
+    kept = StandingAlert("creep-2", AlertKind.CREEP, Severity.WARNING, "creeps", 5, acknowledged=False)
+    bench.publisher.state(msgspec.structs.replace(state_record(), open_alerts=(kept,)))
+    (sample,) = bench.published()
+    assert status(sample.payload.to_bytes()).level == 1
+    assert values(sample.payload.to_bytes())["alerts"] == "creep (warning)"
 
 
 def values_after(bench: Bench, act: Callable[[], None]) -> dict[str, str]:
@@ -337,16 +343,18 @@ def test_a_failing_node_stops_neither_the_loop_nor_the_other_publisher(caplog: p
     first = Listener()
     stop = StopRequest()
     monitor = ScriptedMonitor(lambda seq: stop.request(0) or {} if seq == 20 else {})
+    both = Publishers(first, {"ROS 2": Failing()})
     daemon = Daemon(
         monitor,
         TickingSource(200.0),
-        Publishers(first, {"ROS 2": Failing()}),
+        both,
         Listener(),
         DaemonSettings(give_up_after_errors=3, state_period_s=0.01),
         stop,
         robot="arm",
         camera="wrist",
         estimates=EstimatesFile(None),
+        faults=[both.fault],
     )
     assert daemon.run() == 0
     assert [record.seq for record in first.transforms] == list(range(21))
@@ -372,13 +380,11 @@ def test_the_first_publishers_failure_is_the_daemons_to_know():
     first, flaky = Listener(), Listener(fails="transform")
     publishers = Publishers(first, {"ROS 2": flaky})
     publishers.transform(frame_record())
-    publishers.state(state_record(message="no jaw"))
-    assert first.states[-1].message.startswith("no jaw; ROS 2 fails: ")
-    assert flaky.states[-1].message == "no jaw"
+    publishers.state(state_record())
+    assert publishers.fault() == "ROS 2 fails: the line is cut"
     flaky.fails = ""
     publishers.transform(frame_record())
-    publishers.state(state_record())
-    assert first.states[-1].message == ""
+    assert publishers.fault() == ""
     publishers.close()
     assert (first.closed, flaky.closed) == (1, 1)
 

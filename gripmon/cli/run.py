@@ -214,7 +214,7 @@ class _Network(NamedTuple):
 
 def _open_network(config: Config, link: Link | None) -> _Network:
     from gripmon.daemon import Reports
-    from gripmon.publish import NullPublisher, ZenohCommands, ZenohJaw, ZenohPublisher
+    from gripmon.publish import NullPublisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
 
     settings = config.settings
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
@@ -225,8 +225,11 @@ def _open_network(config: Config, link: Link | None) -> _Network:
         jaw = _network_jaw(config, link, publisher.keys)
     commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
     heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
-    reports = Reports((link.fault,), lambda: publisher.unsent, lambda: sum(each.malformed for each in heard))
-    return _Network(_with_ros2(config, link, publisher), jaw, commands, reports)
+    ros2 = _ros2_node(config, link)
+    publishers = Publishers(publisher, {} if ros2 is None else {"ROS 2": ros2})
+    faults = (link.fault, publishers.fault)
+    reports = Reports(faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard))
+    return _Network(publishers, jaw, commands, reports)
 
 
 def _with_source(reports: Reports, source: Source) -> Reports:
@@ -242,17 +245,15 @@ def _with_source(reports: Reports, source: Source) -> Reports:
     )
 
 
-def _with_ros2(config: Config, link: Link, publisher: Publisher) -> Publisher:
-    """The publisher, and the ROS 2 node beside it where the configuration wants one."""
-    from gripmon.publish import Publishers
+def _ros2_node(config: Config, link: Link) -> Publisher | None:
+    """The monitor as a ROS 2 node, where the configuration wants one."""
     from gripmon.ros2 import Ros2Missing, Ros2Publisher, layout_of
 
     settings = config.settings
     if not settings.ros2.enabled:
-        return publisher
-    layout = layout_of(settings.ros2, settings.robot, settings.camera_name)
+        return None
     try:
-        return Publishers(publisher, {"ROS 2": Ros2Publisher(link, settings.ros2, layout)})
+        return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
     except Ros2Missing as error:
         link.close()
         raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None

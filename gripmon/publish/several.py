@@ -6,8 +6,6 @@ import logging
 from collections.abc import Callable
 from typing import ParamSpec
 
-import msgspec
-
 from gripmon.publish.publisher import Publisher
 from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 
@@ -18,8 +16,8 @@ _P = ParamSpec("_P")
 class Publishers:
     """Hands each record to the first publisher and then to the others.
 
-    What the first raises is raised, after the others had the record.  What another one raises is logged once, until it
-    changes, and stands in the ``message`` of the states that the first gets: it never reaches the caller.
+    What the first raises is raised, after the others had the record.  What another one raises never reaches the caller:
+    it is logged once, until it changes, and :meth:`fault` says it.
     """
 
     def __init__(self, first: Publisher, others: dict[str, Publisher]) -> None:
@@ -36,10 +34,8 @@ class Publishers:
                 self._hand(name, other.transform, record)
 
     def state(self, record: StateRecord) -> None:
-        faults = "; ".join(dict.fromkeys(self._faults.values()))
-        message = f"{record.message}; {faults}" if record.message and faults else record.message or faults
         try:
-            self._first.state(msgspec.structs.replace(record, message=message))
+            self._first.state(record)
         finally:
             for name, other in self._others.items():
                 self._hand(name, other.state, record)
@@ -63,6 +59,10 @@ class Publishers:
         for name, other in self._others.items():
             self._hand(name, other.close)
         self._first.close()
+
+    def fault(self) -> str:
+        """What is wrong with the others, in a few words for a person; empty if nothing is."""
+        return "; ".join(dict.fromkeys(self._faults.values()))
 
     def _hand(self, name: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> None:
         what = (name, put.__name__)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gripmon.geometry import from_record, invert, skew, to_record
-from gripmon.records import AlertRecord, Array, FrameRecord, Severity, State, StateRecord, Transform, Verdict
+from gripmon.records import Array, FrameRecord, Severity, StandingAlert, State, StateRecord, Transform, Verdict
 from gripmon.ros2.types import DIAGNOSTICS, POSE, TF, prepare, typestore
 
 OK, WARN, ERROR, STALE = range(4)
@@ -78,7 +78,7 @@ class Messages:
         return self._pose_stamped(header, self._with_covariance(pose, np.fromiter(covariance, np.float64, 36)))
 
     def diagnostics(
-        self, name: str, state: StateRecord, frame: FrameRecord | None, alerts: Sequence[AlertRecord], broadcast: str
+        self, name: str, state: StateRecord, frame: FrameRecord | None, alerts: Sequence[StandingAlert], broadcast: str
     ) -> Any:
         """``diagnostic_msgs/DiagnosticArray`` with one status.
 
@@ -94,7 +94,7 @@ class Messages:
         return self._diagnostics(self.header(state.stamp_ns, frame=""), [status])
 
 
-def level_of(state: StateRecord, alerts: Iterable[AlertRecord]) -> int:
+def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
     """Stale without frames; else the worst of the verdict, what the state complains of, and the open alerts that nobody
     has acknowledged.
     """
@@ -104,14 +104,14 @@ def level_of(state: StateRecord, alerts: Iterable[AlertRecord]) -> int:
     return max(_OF_VERDICT[state.verdict], WARN if state.message else OK, *levels, OK)
 
 
-def summary_of(state: StateRecord, alerts: Iterable[AlertRecord]) -> str:
+def summary_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> str:
     """One line for a person."""
     said = [f"{state.state}, transform {state.verdict}", state.message, *(alert.text for alert in alerts)]
     return "; ".join(part for part in said if part)
 
 
 def values_of(
-    state: StateRecord, frame: FrameRecord | None, alerts: Iterable[AlertRecord], broadcast: str
+    state: StateRecord, frame: FrameRecord | None, alerts: Iterable[StandingAlert], broadcast: str
 ) -> list[tuple[str, str]]:
     """The keys and values of the status."""
     values = [
@@ -124,11 +124,14 @@ def values_of(
     if frame is not None:
         values.append(("frame age (s)", f"{1e-9 * (state.stamp_ns - frame.stamp_ns):.3f}"))
         values.append(("reason", frame.reason or ""))
-    if frame is not None and frame.drift is not None:
-        shift_mm = [1e3 * m for m in frame.drift.tcp_shift_m]
+    if state.tcp_shift_m is not None:
+        shift_mm = [1e3 * m for m in state.tcp_shift_m]
         values.append(("tcp shift (mm)", f"{math.hypot(*shift_mm):.4f}"))
         values.append(("tcp shift x y z in the camera frame (mm)", " ".join(f"{mm:.4f}" for mm in shift_mm)))
+    if frame is not None and frame.drift is not None:
         values.append(("rotation (deg)", f"{math.degrees(frame.drift.rotation_rad):.4f}"))
+    if state.sigma_m is not None:
+        values.append(("position sigma (mm)", f"{1e3 * state.sigma_m:.4f}"))
     values += [
         ("alerts", ", ".join(f"{alert.kind} ({alert.severity})" for alert in alerts)),
         ("camera connected", str(state.camera_connected).lower()),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from gripmon.records import AlertEvent, AlertRecord, FrameRecord, ReferenceRecord, StateRecord, Transform
+from gripmon.records import AlertEvent, AlertRecord, FrameRecord, ReferenceRecord, StandingAlert, StateRecord, Transform
 from gripmon.ros2.messages import Messages, inverse
 from gripmon.ros2.names import Qos
 from gripmon.ros2.node import Node, TopicPublisher
@@ -49,7 +49,7 @@ class Ros2Publisher:
         self._fault = ""
         self._frame: FrameRecord | None = None
         self._state: StateRecord | None = None
-        self._alerts: dict[str, AlertRecord] = {}
+        self._alerts: dict[str, StandingAlert] = {}  # those that are open
         link.attach(self._adopt, self._leave)
 
     def transform(self, record: FrameRecord) -> None:
@@ -67,6 +67,7 @@ class Ros2Publisher:
     def state(self, record: StateRecord) -> None:
         """Publish diagnostics."""
         self._state = record
+        self._alerts = {alert.alert_id: alert for alert in record.open_alerts}
         self._diagnose()
 
     def alert(self, record: AlertRecord) -> None:
@@ -76,7 +77,9 @@ class Ros2Publisher:
         if record.event is AlertEvent.CLEARED:
             self._alerts.pop(record.alert_id, None)
         else:
-            self._alerts[record.alert_id] = record
+            self._alerts[record.alert_id] = StandingAlert(
+                record.alert_id, record.kind, record.severity, record.text, record.since_ns, record.acknowledged
+            )
         self._diagnose()
 
     def reference(self, record: ReferenceRecord) -> None:
