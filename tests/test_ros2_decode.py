@@ -23,6 +23,7 @@ from gripmon.ros2 import (
     decode_joint_state,
     subscription_key,
 )
+from gripmon.ros2.decode import MOST_JOINT_STATE_BYTES
 
 HEADER = idl.Header(idl.Time(1_700_000_000, 123_456_789), "wrist_optical_frame")
 STAMP_NS = 1_700_000_000_123_456_789
@@ -109,6 +110,11 @@ def test_a_length_beyond_the_payload():
     struct.pack_into("<I", payload, length_at, 2**32 - 1)
     with pytest.raises(MessageError, match="4294967295"):
         decode_image(bytes(payload))
+
+
+def test_payloads_beyond_all_measure():
+    with pytest.raises(MessageError, match=r"^sensor_msgs/msg/JointState: 262145 bytes; at most 262144 are taken$"):
+        decode_joint_state(bytes(MOST_JOINT_STATE_BYTES + 1))
 
 
 @pytest.mark.parametrize(("name", "said"), [("jpeg", "jpeg"), ("png", "bgr8; png compressed bgr8"), ("jpeg", "")])

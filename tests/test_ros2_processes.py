@@ -181,19 +181,37 @@ def test_another_implementation_knows_the_node_and_decodes_tf(router: tuple[str,
         }
 
 
+def test_topics_that_it_listens_to_are_shown_in_the_graph(router: tuple[str, zenoh.Session], tmp_path: Path):
+    """Whatever `ros2.enabled` says: drivers want to know."""
+    endpoint, session = router
+    path = configuration(tmp_path, {"enabled": False})
+    settings = yaml.safe_load(path.read_text())
+    settings["source"] = {"kind": "zenoh", "topic": "/camera/image_raw", "format": "ros2_image"}
+    settings["jaw"] = {
+        "source": "ros2_joint_state", "topic": "/joint_states", "opening": {"joints": ["left_finger", "right_finger"]},
+    }  # fmt: skip
+    settings["publish"] = {"mode": "client", "connect": [endpoint]}
+    path.write_text(yaml.safe_dump(settings))
+    with process("-m", "gripmon", "run", str(path)) as started:
+        wait_until(lambda: started.poll() is not None or len(tokens(session)) == 3, "the subscriptions", 60.0)
+        seen = [token.split("/")[5:] for token in tokens(session)]
+    types = {"%camera%image_raw": "sensor_msgs/msg/Image", "%joint_states": "sensor_msgs/msg/JointState"}
+    for topic, type_name in types.items():
+        (one,) = [token for token in seen if topic in token]
+        assert one[:4] == ["MS", "%", "%demo%wrist", "gripmon_input"] and one[6] == JAZZY_HASHES[type_name]
+
+
+def tokens(session: zenoh.Session) -> list[str]:
+    replies = session.liveliness().get("@ros2_lv/0/**", timeout=5.0)
+    return [str(reply.ok.key_expr) for reply in replies if reply.ok]
+
+
 def test_the_node_leaves_the_graph_when_the_daemon_is_killed(router: tuple[str, zenoh.Session], tmp_path: Path):
     endpoint, session = router
-
-    def tokens() -> list[str]:
-        replies = session.liveliness().get("@ros2_lv/0/**", timeout=5.0)
-        return [str(reply.ok.key_expr) for reply in replies if reply.ok]
-
-    with process(
-        "-m", "gripmon", "run", str(configuration(tmp_path, {"enabled": True, "router": endpoint}))
-    ) as started:
-        wait_until(lambda: len(tokens()) == 4, "the node and its publishers", 60.0)
+    with daemon(endpoint, tmp_path, survives=False) as started:
+        wait_until(lambda: len(tokens(session)) == 4, "the node and its publishers", 60.0)
         started.kill()
-        wait_until(lambda: not tokens(), "the tokens to go")
+        wait_until(lambda: not tokens(session), "the tokens to go")
 
 
 def test_without_rosbags_it_says_what_to_install(tmp_path: Path):

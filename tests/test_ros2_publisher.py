@@ -26,9 +26,22 @@ from gripmon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, StopRequest
 from gripmon.publish import Publishers
 from gripmon.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
-from gripmon.ros2 import Layout, NodeName, Ros2Fault, Ros2Publisher, Ros2Settings, fault_of, layout_of, network_of
+from gripmon.ros2 import (
+    HeardTopic,
+    Layout,
+    Listeners,
+    NodeName,
+    Ros2Fault,
+    Ros2Publisher,
+    Ros2Settings,
+    fault_of,
+    layout_of,
+    network_of,
+)
 from gripmon.ros2.messages import inverse
+from gripmon.ros2.names import dds_type
 from gripmon.ros2.node import gid_of
+from gripmon.ros2.types import type_hash
 from gripmon.wire import Link, PublishSettings
 
 TF_KEY = "0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
@@ -256,6 +269,27 @@ def test_a_client_whose_router_comes_late():
         assert placed.header.stamp.nanosec == 123_456_789 + 9
         subscriber.undeclare()
         link.close()
+
+
+def test_subscriptions_are_shown_in_the_graph():
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(listen=(endpoint,)))
+    image, joints = "sensor_msgs/msg/Image", "sensor_msgs/msg/JointState"
+    name = NodeName("gripmon_input", "/arm/wrist")
+    heard = [(0, "/cam/image_raw", image), (0, "/js", joints), (7, "/js", joints)]
+    Listeners(link, name, [HeardTopic(*each) for each in heard])
+    with plain_session(connect=endpoint) as session:
+        wait_until(lambda: len(tokens(session)) == 5, "two nodes, three subscriptions")
+        parts = [token.split("/") for token in tokens(session)]
+        node = ("MS", "%", "%arm%wrist", "gripmon_input")
+        assert sorted((p[1], *p[5:]) for p in parts if p[5] == "MS") == sorted(
+            (str(domain), *node, topic.replace("/", "%"), dds_type(name), type_hash(name), "2::,5:,:,:,,")
+            for domain, topic, name in heard
+        )
+        nodes = {p[1]: p[3] for p in parts if p[5] == "NN"}
+        assert set(nodes) == {"0", "7"} and all(p[3] == nodes[p[1]] for p in parts)
+        link.close()
+        wait_until(lambda: not tokens(session), "the tokens to go")
 
 
 # --- settings ---

@@ -130,6 +130,7 @@ def run_daemon(
             source = open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
         except SourceError as error:
             raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
+        _show_listeners(config, link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run(
             monitor,
@@ -257,6 +258,24 @@ def _ros2_node(config: Config, link: Link) -> Publisher | None:
     except Ros2Missing as error:
         link.close()
         raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None
+
+
+def _show_listeners(config: Config, link: Link | None) -> None:
+    """Let ROS 2 know of the topics that frames and jaw opening come from."""
+    from gripmon.ros2 import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners, NodeName, as_token
+    from gripmon.sources import NetworkSettings
+
+    settings = config.settings
+    jaw, source = settings.jaw, settings.source
+    topics = []
+    if jaw.source == "ros2_joint_state" and jaw.topic is not None:
+        topics.append(HeardTopic(jaw.domain_id, jaw.topic, JOINT_STATE))
+    if isinstance(source, NetworkSettings) and source.topic is not None:
+        type_name = IMAGE if source.format == "ros2_image" else COMPRESSED_IMAGE
+        topics.append(HeardTopic(source.domain_id, source.topic, type_name))
+    if link is not None and topics:
+        namespace = f"/{as_token(settings.robot)}/{as_token(settings.camera_name)}"
+        Listeners(link, NodeName("gripmon_input", namespace), topics)
 
 
 def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:

@@ -14,8 +14,9 @@ from gripmon.ros2.decode import (
     decode_image,
     decode_joint_state,
 )
-from gripmon.ros2.names import NodeName, Qos, RosNameError, subscription_key
+from gripmon.ros2.names import NodeName, Qos, RosNameError, as_token, subscription_key
 from gripmon.ros2.node import Node
+from gripmon.ros2.presence import HeardTopic, Listeners
 from gripmon.ros2.publisher import Ros2Publisher
 from gripmon.ros2.settings import Layout, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, Ros2Missing
@@ -25,8 +26,10 @@ __all__ = [
     "ENCODINGS",
     "IMAGE",
     "JOINT_STATE",
+    "HeardTopic",
     "JointOpening",
     "Layout",
+    "Listeners",
     "MessageError",
     "Node",
     "NodeName",
@@ -36,6 +39,7 @@ __all__ = [
     "Ros2Publisher",
     "Ros2Settings",
     "RosNameError",
+    "as_token",
     "decode_compressed_image",
     "decode_image",
     "decode_joint_state",
