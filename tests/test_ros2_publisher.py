@@ -23,7 +23,7 @@ from loopback import (
 from stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.config import ConfigError, builtin_config, load_config
-from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, StopRequest
+from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
 from gripmon.publish import Publishers
 from gripmon.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 from gripmon.ros2 import (
@@ -388,7 +388,7 @@ def test_a_failing_node_stops_neither_the_loop_nor_the_other_publisher(caplog: p
         robot="arm",
         camera="wrist",
         estimates=EstimatesFile(None),
-        faults=[both.fault],
+        reports=Reports((both.fault,)),
     )
     assert daemon.run() == 0
     assert [record.seq for record in first.transforms] == list(range(21))
