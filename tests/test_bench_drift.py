@@ -87,11 +87,33 @@ def test_tables_say_what_is_met():
     assert "10, NOT MET |" in table
 
 
-def test_bad_numbers_are_refused(capsys: pytest.CaptureFixture[str]):
+def test_the_charts_that_meet_working_noise_are_those_that_have_learnt_quiet_noise(monkeypatch: pytest.MonkeyPatch):
+    """Each in few frames: what was counted is told, and the line says all of it."""
+    seen: list[tuple[str, int]] = []
+
+    def count(charts, model, streams, frames, rng, tick):
+        test = charts["ours"].test
+        seen.append((model.regime, int(test.windows.frames.max())))
+        return count_alarms(charts, model, streams, frames, rng, tick)
+
+    monkeypatch.setattr("benchmarks.drift_streams.count_alarms", count)
+    monkeypatch.setattr(drift, "CHANGE_STREAMS", 4)
+    monkeypatch.setattr(drift, "CHANGE_FRAMES", BLOCK_FRAMES)
+    change = drift._change(1, lambda n: None)
+    assert [regime for regime, _ in seen] == ["quiet", "working"]
+    assert seen[0][1] == 0
+    assert seen[1][1] > BLOCK_FRAMES // 2
+    assert (change["changes"], change["frames"]) == (4, BLOCK_FRAMES)
+    line = drift._change_line({"changes": 4, "frames": 1024, "before": 2, "after": 3})
+    assert "4 changes: 3 in the 1024 frames after each, 2 in as many before" in line
+
+
+@pytest.mark.parametrize("option", ["--frames", "--streams", "--warm-up"])
+def test_bad_numbers_are_refused(option: str, capsys: pytest.CaptureFixture[str]):
     import argparse
 
     parser = argparse.ArgumentParser()
     drift.add_parser(parser.add_subparsers())
     with pytest.raises(SystemExit):
-        parser.parse_args(["drift", "--frames", "0"])
+        parser.parse_args(["drift", option, "0"])
     assert "at least 1" in capsys.readouterr().err

@@ -23,6 +23,8 @@ False alarms of an unmoved camera, counted against the contract of one a day, wi
 generalised Pareto tail fitted to the largest statistics of 1024 frames each; the tail's estimate is validated where
 alarms can be counted, at a contract of 1000 a day.  Delays after steps and in creeps, beside a bare threshold on the
 TCP's shift and Hotelling's T² of single frames, both tuned to one false alarm a day in the same regime by such a tail.
+Motions begin after --warm-up frames, by which a test that learns has learnt; streams are as long as --streams of them
+need to be for all frames.  At last the noise changes from quiet to working half-way, ten minutes each.
 The other parts of the same decisions have benchmarks of their own: causes, recalibration, smoothing."""
 
 REQUIRED = {0.1: 3, 0.05: 10}
@@ -32,6 +34,9 @@ STEPS_MM = (0.02, 0.05, 0.1, 0.5, 4.5)
 CREEPS_MM_PER_MIN = (0.01, 0.1)
 STREAMS = 256
 WARM_UP = 4096
+CHANGE_STREAMS, CHANGE_FRAMES = 64, 36_864
+"""Of the change of regime: before it and after it, ten minutes each."""
+
 LOOK_FRAMES, CREEP_FRAMES = 600, 36_000
 
 
@@ -45,6 +50,20 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "--frames", type=_count, default=10_000_000, metavar="N", help="of false alarms, each regime (default 10^7)"
+    )
+    parser.add_argument(
+        "--streams",
+        type=_count,
+        default=STREAMS,
+        metavar="N",
+        help=f"side by side (default {STREAMS}); fewer are longer",
+    )
+    parser.add_argument(
+        "--warm-up",
+        type=_count,
+        default=WARM_UP,
+        metavar="N",
+        help=f"frames before a motion begins (default {WARM_UP})",
     )
     parser.add_argument("--no-creep", action="store_true", help="leave out creeps, which take longest")
     parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
@@ -68,26 +87,33 @@ def run(arguments: argparse.Namespace) -> int:
     from benchmarks.noise_model import REGIMES
 
     about = machine.description()
-    frames = -(-arguments.frames // (STREAMS * BLOCK_FRAMES)) * BLOCK_FRAMES
-    print(f"gripmon {about['commit']}, {about['date']}, {about['cpu']}; seed {arguments.seed}\n", flush=True)
-    document: dict[str, Any] = {"machine": about, "seed": arguments.seed, "regimes": {}}
+    streams, warm_up = arguments.streams, arguments.warm_up
+    frames = -(-arguments.frames // (streams * BLOCK_FRAMES)) * BLOCK_FRAMES
+    print(f"gripmon {about['commit']}, {about['date']}, {about['cpu']}; seed {arguments.seed}")
+    print(f"{streams} streams of {frames} frames; motions after {warm_up} frames\n", flush=True)
+    document: dict[str, Any] = {"machine": about, "seed": arguments.seed, "streams": streams, "warm_up": warm_up}
+    document["regimes"] = {}
     for regime in REGIMES:
         with tqdm(desc=regime, unit="frame", unit_scale=True, file=sys.stderr, disable=None) as bar:
-            alarms = _false_alarms(regime, frames, arguments.seed, bar.update)
+            alarms = _false_alarms(regime, streams, frames, arguments.seed, bar.update)
             print(_alarm_table(regime, alarms), flush=True)
-            rows = _delays(regime, alarms, arguments.seed, not arguments.no_creep, bar.update)
+            motions = _motions(streams, arguments.seed, not arguments.no_creep)
+            rows = _delays(regime, alarms, streams, warm_up, arguments.seed, motions, bar.update)
             print(_delay_table(regime, rows), flush=True)
         document["regimes"][regime] = {
             "alarms": {name: _plain(of) for name, of in alarms.items()},
             "delays": {name: {chart: _percentiles(v) for chart, v in row.items()} for name, row in rows.items()},
         }
+    with tqdm(desc="change", unit="frame", unit_scale=True, file=sys.stderr, disable=None) as bar:
+        document["change"] = _change(arguments.seed, bar.update)
+    print(_change_line(document["change"]), flush=True)
     if arguments.json is not None:
         arguments.json.write_text(json.dumps(document, indent=1) + "\n")
     kept = [of["alarms"]["ours, 1 a day"]["per_day_95"][0] <= 1.0 for of in document["regimes"].values()]
     return int(not all(kept))
 
 
-def _false_alarms(regime: str, frames: int, seed: int, tick: Callable[[int], Any]) -> dict[str, Alarms]:
+def _false_alarms(regime: str, streams: int, frames: int, seed: int, tick: Callable[[int], Any]) -> dict[str, Alarms]:
     """Every chart without the camera having moved; the peers with thresholds of one, to be tuned by their tails."""
     import numpy as np
 
@@ -96,23 +122,23 @@ def _false_alarms(regime: str, frames: int, seed: int, tick: Callable[[int], Any
 
     model = NoiseModel.load(regime)
     rng = np.random.default_rng(seed)
-    out = count_alarms({"ours, 1 a day": Ours(STREAMS, 1.0)}, model, STREAMS, frames, rng, tick)
+    out = count_alarms({"ours, 1 a day": Ours(streams, 1.0)}, model, streams, frames, rng, tick)
     few = max(frames // 8 // BLOCK_FRAMES, 8) * BLOCK_FRAMES
     others: dict[str, Chart] = {
-        "ours, 1000 a day": Ours(STREAMS, 1000.0),
+        "ours, 1000 a day": Ours(streams, 1000.0),
         "bare threshold": Bare(1e-4),
         "Hotelling T²": Hotelling(40.0),
     }
-    return {**out, **count_alarms(others, model, STREAMS, few, rng, tick)}
+    return {**out, **count_alarms(others, model, streams, few, rng, tick)}
 
 
-def _motions(seed: int, creeps: bool) -> dict[str, Callable[[int], np.ndarray]]:
+def _motions(streams: int, seed: int, creeps: bool) -> dict[str, Callable[[int], np.ndarray]]:
     """What is added to the shift, by name: steps along the camera's axes and in random directions, and creeps."""
     import numpy as np
 
     from benchmarks.drift_streams import FRAMES_PER_S
 
-    directions = np.random.default_rng(seed).normal(size=(STREAMS, 3))
+    directions = np.random.default_rng(seed).normal(size=(streams, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     axes = {**{name: np.eye(3)[k] for k, name in enumerate("xyz")}, "any": directions}
 
@@ -132,7 +158,13 @@ def _motions(seed: int, creeps: bool) -> dict[str, Callable[[int], np.ndarray]]:
 
 
 def _delays(
-    regime: str, alarms: dict[str, Alarms], seed: int, creeps: bool, tick: Callable[[int], Any]
+    regime: str,
+    alarms: dict[str, Alarms],
+    streams: int,
+    warm_up: int,
+    seed: int,
+    motions: dict[str, Callable[[int], np.ndarray]],
+    tick: Callable[[int], Any],
 ) -> dict[str, dict[str, np.ndarray]]:
     import numpy as np
 
@@ -141,19 +173,42 @@ def _delays(
 
     model = NoiseModel.load(regime)
     charts: dict[str, Chart] = {
-        "ours": Ours(STREAMS, 1.0),
+        "ours": Ours(streams, 1.0),
         "bare": Bare(1e-4 * tuned_threshold(alarms["bare threshold"], 1.0)),
         "T²": Hotelling(40.0 * tuned_threshold(alarms["Hotelling T²"], 1.0)),
     }
-    motions = _motions(seed, creeps)
     slow = {name: motion for name, motion in motions.items() if name.startswith("creep")}
     quick = {name: motion for name, motion in motions.items() if name not in slow}
     out = {}
     for some, frames in ((quick, LOOK_FRAMES), (slow, CREEP_FRAMES)):
         if some:
             rng = np.random.default_rng(seed + 1)
-            out |= delays(charts, model, STREAMS, WARM_UP, some, frames, rng, tick)
+            out |= delays(charts, model, streams, warm_up, some, frames, rng, tick)
     return out
+
+
+def _change(seed: int, tick: Callable[[int], Any]) -> dict[str, int]:
+    """Alarms in so many frames of quiet, and in as many of working noise that the same charts meet next."""
+    import numpy as np
+
+    from benchmarks.drift_streams import Ours, count_alarms
+    from benchmarks.noise_model import NoiseModel
+
+    charts: dict[str, Chart] = {"ours": Ours(CHANGE_STREAMS, 1.0)}
+    rng = np.random.default_rng(seed + 2)
+    counts = {
+        name: count_alarms(charts, NoiseModel.load(regime), CHANGE_STREAMS, CHANGE_FRAMES, rng, tick)["ours"].count
+        for name, regime in (("before", "quiet"), ("after", "working"))
+    }
+    return {"changes": CHANGE_STREAMS, "frames": CHANGE_FRAMES, **counts}
+
+
+def _change_line(of: dict[str, int]) -> str:
+    return (
+        "### quiet, then working: alarms of an unmoved camera\n\n"
+        f"{of['changes']} changes: {of['after']} in the {of['frames']} frames after each, {of['before']} in as many "
+        "before\n"
+    )
 
 
 def _alarm_table(regime: str, alarms: dict[str, Alarms]) -> str:
