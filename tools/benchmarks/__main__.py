@@ -6,9 +6,9 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, causes, drift, latency, recalibration, recovery, series, smoothing
+from benchmarks import accuracy, causes, drift, latency, recalibration, recovery, series, smoothing, wire
 
-_BENCHMARKS = (accuracy, causes, drift, latency, recalibration, recovery, series, smoothing)
+_BENCHMARKS = (accuracy, causes, drift, latency, recalibration, recovery, series, smoothing, wire)
 
 
 def main() -> int:

@@ -81,7 +81,7 @@ def measure(plan: Plan) -> dict[str, Any]:
         for size in plan.sizes:
             name = f"{size[0]}x{size[1]}"
             path = Path(scratch) / f"{name}.npz"
-            _render(size, plan, path)
+            render(size, plan.ring, path)
             parts: dict[str, Callable[..., dict[str, Any]]] = {
                 "latency": _latency, "stages": _stages, "recording": _recording,
             }  # fmt: skip
@@ -89,22 +89,22 @@ def measure(plan: Plan) -> dict[str, Any]:
                 parts["memory"] = _memory
             for part, function in parts.items():
                 print(f"{name}: {part} …", file=sys.stderr)
-                results.setdefault(part, {})[name] = _in_new_process(function, size, path, plan)
+                results.setdefault(part, {})[name] = in_new_process(function, size, path, plan)
             path.unlink()
     results["machine"]["load_after"] = machine.load()
     return results
 
 
-def _render(size: tuple[int, int], plan: Plan, path: Path) -> None:
+def render(size: tuple[int, int], count: int, path: Path) -> None:
     from tqdm import tqdm
 
     from benchmarks import scene
 
-    with tqdm(total=plan.ring, desc=f"render {size[0]}x{size[1]}", unit="frame", file=sys.stderr, disable=None) as bar:
-        scene.render(size, plan.ring, bar.update).save(path)
+    with tqdm(total=count, desc=f"render {size[0]}x{size[1]}", unit="frame", file=sys.stderr, disable=None) as bar:
+        scene.render(size, count, bar.update).save(path)
 
 
-def _in_new_process(function: Callable[..., _T], *arguments: Any) -> _T:
+def in_new_process(function: Callable[..., _T], *arguments: Any) -> _T:
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max_workers=1, mp_context=context, initializer=_quiet) as pool:
         return pool.submit(function, *arguments).result()

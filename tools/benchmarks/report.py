@@ -11,7 +11,7 @@ _LABEL, _COLUMN = 58, 16
 def as_text(results: dict[str, Any]) -> str:
     """The whole report."""
     sizes = list(results["latency"])
-    lines = [*_machine(results["machine"]), "", _row("", *(size.replace("x", " x ") for size in sizes))]
+    lines = [*machine_lines(results["machine"]), "", _row("", *(size.replace("x", " x ") for size in sizes))]
     lines += _latency([results["latency"][size] for size in sizes])
     lines += ["", "share of each stage, of the mean (a run of its own, with stop watches in it)"]
     lines += _stages([results["stages"][size] for size in sizes])
@@ -23,7 +23,7 @@ def as_text(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _machine(machine: dict[str, Any]) -> list[str]:
+def machine_lines(machine: dict[str, Any]) -> list[str]:
     packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
     return [
         f"gripmon {machine['commit']}, {machine['date']}",

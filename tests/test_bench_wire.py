@@ -1,0 +1,77 @@
+"""``tools/bench wire`` in small: every condition is measured, every message counted.  No speed is asserted."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch):
+    """Also in the processes that the benchmark starts."""
+    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        del sys.modules[name]
+
+
+def test_the_whole_run_in_small():
+    from benchmarks import wire, wire_runs
+
+    plan = wire_runs.Plan(
+        size=(384, 288), ring=8, block=20, settle=5, rounds=2, more_subscribers=1, restarts=1,
+        before_s=0.5, down_s=0.25, after_s=6.0,
+    )  # fmt: skip
+    results = wire.measure(plan)
+    measured = results["conditions"]
+    for condition in wire_runs.CONDITIONS:
+        row = measured[condition]
+        assert row["frames"] == 30
+        assert 0.0 < row["judged_us"]["median"] <= row["loop_us"]["p99"]
+        # What is in another process's callback has been judged before.
+        assert row["received_us"]["median"] > row["judged_us"]["median"]
+        assert row["lost"] == 0
+    assert len(measured["alone"]["loop_p99_by_round_us"]) == 2
+    (turn,) = results["restarts"]["runs"]
+    assert turn["router_away_s"] > 0.0
+    assert turn["lost"] >= turn["lost_while_away"] > 0
+    assert turn["recovery_s"] is None or turn["recovery_s"] > -turn["router_away_s"]
+    assert results["restarts"]["exceptions"] == measured["exceptions"] == 0
+    text = wire.as_text(results)
+    assert text.count("  met") + text.count("NOT MET") == len(wire.verdicts(results)) == 5
+
+
+def figures(median_us: float, stopped_us: float, recovery_s: float | None, exceptions: int) -> dict[str, Any]:
+    def row(median: float, tail: float) -> dict[str, Any]:
+        times = {"median": median, "p99": tail, "max": tail}
+        return {"received_us": times, "loop_us": times, "judged_us": times | {"median": 1000.0}}
+
+    measured = {condition: row(median_us, 2000.0) for condition in ("alone", "blocked")}
+    measured |= {"stopped": row(median_us, stopped_us), "exceptions": exceptions}
+    return {"conditions": measured, "restarts": {"runs": [{"recovery_s": recovery_s}], "exceptions": 0}}
+
+
+@pytest.mark.parametrize(
+    ("values", "missed"),
+    [
+        ((1499.0, 2199.0, 1.9, 0), None),
+        ((1501.0, 2199.0, 1.9, 0), 0),
+        ((1499.0, 2201.0, 1.9, 0), 1),
+        ((1499.0, 2199.0, 2.1, 0), 3),
+        ((1499.0, 2199.0, None, 0), 3),
+        ((1499.0, 2199.0, 1.9, 1), 4),
+        ((math.nan, 2199.0, 1.9, 0), 0),
+    ],
+)
+def test_what_is_not_reached_is_said(values: tuple[Any, ...], missed: int | None):
+    from benchmarks import wire
+
+    met = [reached for _, _, reached in wire.verdicts(figures(*values))]
+    assert [i for i, reached in enumerate(met) if not reached] == ([] if missed is None else [missed])

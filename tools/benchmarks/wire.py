@@ -1,0 +1,116 @@
+"""``tools/bench wire``: from a frame handed over to its transform in another process's callback."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+_DESCRIPTION = """\
+Runs the daemon's own loop on frames of the demo's scene, rendered beforehand, at 60 frames/s, and times
+each from handed over until its transform is in the callback of a subscriber in another process: alone,
+with a subscriber whose process is stopped, with one whose callback blocks (both with the connection filled
+to the brim), with ten subscribers, and through a router; in turns, in one run, beside what the monitor needed
+for the same frames. Then the router is killed and started again under the running loop. Takes some
+six minutes; --quick, less exact, two. Exit code 1 if a figure is not reached."""
+
+RATIO, TAIL, RECOVERY_S = 1.5, 1.10, 2.0
+_TITLES = {
+    "alone": "one subscriber",
+    "stopped": "and one that is stopped (SIGSTOP)",
+    "blocked": "and one whose callback blocks",
+    "ten": "ten subscribers",
+    "router": "through a router",
+}
+
+
+def add_parser(commands: Any) -> None:
+    """Add the benchmark to ``tools/bench``."""
+    parser = commands.add_parser(
+        "wire",
+        help="time from frame to another process's callback; stalled subscribers, a router, its restart",
+        description=_DESCRIPTION,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--quick", action="store_true", help="a shorter run")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
+    parser.set_defaults(handler=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``tools/bench wire``."""
+    from benchmarks.wire_runs import QUICK, Plan
+
+    results = measure(QUICK if arguments.quick else Plan())
+    print(as_text(results))
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+    return 0 if all(met for _, _, met in verdicts(results)) else 1
+
+
+def measure(plan: Any) -> dict[str, Any]:
+    """Everything, in a new process each; plain values."""
+    from benchmarks import latency, machine, wire_runs
+
+    results: dict[str, Any] = {"machine": machine.description()}
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch:
+        path = Path(scratch) / "ring.npz"
+        latency.render(plan.size, plan.ring, path)
+        for name, function in (("conditions", wire_runs.conditions), ("restarts", wire_runs.restarts)):
+            print(f"{name} …", file=sys.stderr)
+            results[name] = latency.in_new_process(function, path, plan)
+    results["machine"]["load_after"] = machine.load()
+    return results
+
+
+def verdicts(results: dict[str, Any]) -> list[tuple[str, str, bool]]:
+    """What is to be reached, what was, and whether."""
+    measured, restarts = results["conditions"], results["restarts"]
+    alone = measured["alone"]
+    ratio = alone["received_us"]["median"] / alone["judged_us"]["median"]
+    lines = [(f"median at most {RATIO} times the monitor's own", f"{ratio:.2f}", ratio <= RATIO)]
+    for condition in ("stopped", "blocked"):
+        tail = measured[condition]["loop_us"]["p99"] / alone["loop_us"]["p99"]
+        lines.append(
+            (f"{condition} subscriber: loop's 99 % at most {TAIL:.2f} of that alone", f"{tail:.2f}", tail <= TAIL)
+        )
+    recoveries = [turn["recovery_s"] for turn in restarts["runs"]]
+    seen = all(recovery is not None for recovery in recoveries)
+    worst_s = max(recoveries) if seen else float("inf")
+    lines.append(
+        (f"recovery within {RECOVERY_S:g} s of the router's return", f"{worst_s:.2f} s", worst_s <= RECOVERY_S)
+    )
+    exceptions = measured["exceptions"] + restarts["exceptions"]
+    lines.append(("no exception", str(exceptions), exceptions == 0))
+    return lines
+
+
+def as_text(results: dict[str, Any]) -> str:
+    """The whole report."""
+    from benchmarks.report import machine_lines
+
+    measured, restarts = results["conditions"], results["restarts"]
+    lines = [*machine_lines(results["machine"]), ""]
+    lines += ["ms, median / 99 %              handed over -> callback    monitor alone     whole loop       lost"]
+    for condition, title in _TITLES.items():
+        row = measured[condition]
+        times = [f"{1e-3 * row[k]['median']:7.3f} / {1e-3 * row[k]['p99']:7.3f}" for k in _COLUMNS]
+        lines.append(f"{title:34s} {times[0]} {times[1]} {times[2]}   {row['lost']} of {row['frames']}")
+    by_round = ", ".join(f"{1e-3 * p99:.3f}" for p99 in measured["alone"]["loop_p99_by_round_us"])
+    lines += [f"whole loop alone, 99 % of each round: {by_round}", "", "router killed and started again"]
+    for turn in restarts["runs"]:
+        back = "never" if turn["recovery_s"] is None else f"{turn['recovery_s']:.2f} s"
+        lines.append(
+            f"  away for {turn['router_away_s']:.2f} s; first transform {back} after it listened again; "
+            f"lost {turn['lost']}, of them {turn['lost_while_away']} while it was away"
+        )
+    lines.append("  (before 0: processes that found it before it said so)")
+    lines += ["", "to be reached"]
+    lines += [f"  {what:70s} {value:>8s}  {'met' if met else 'NOT MET'}" for what, value, met in verdicts(results)]
+    return "\n".join(lines)
+
+
+_COLUMNS = ("received_us", "judged_us", "loop_us")

@@ -1,0 +1,219 @@
+"""The daemon's loop with its subscribers elsewhere: each condition for some seconds at a time, in turns."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks import harness, scene
+from benchmarks.wire_others import Crowd, RouterProcess, Staller, free_endpoint
+from gripmon.publish import Publisher, ZenohPublisher
+from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.wire import Link, PublishSettings
+
+CONDITIONS = ("alone", "stopped", "blocked", "ten", "router")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is measured: frames of each condition at a time, how often, and restarts of the router."""
+
+    size: tuple[int, int] = (768, 576)
+    ring: int = 60
+    block: int = 270
+    settle: int = 30
+    rounds: int = 10
+    more_subscribers: int = 9
+    restarts: int = 6
+    before_s: float = 2.0
+    down_s: float = 1.0
+    after_s: float = 5.0
+
+
+QUICK = Plan(ring=30, block=210, rounds=3, restarts=2)
+
+
+class _Switched:
+    """The publisher of the moment; notes what the monitor needed for each frame, and counts exceptions."""
+
+    def __init__(self, publishers: list[ZenohPublisher], count: int) -> None:
+        self.publishers, self.current = publishers, 0
+        self.judged_us = np.full(count, np.nan)
+        self.exceptions = 0
+
+    def transform(self, record: FrameRecord) -> None:
+        self.judged_us[record.seq] = 1e-3 * record.latency_ns
+        self._say(lambda to: to.transform(record))
+
+    def state(self, record: StateRecord) -> None:
+        self._say(lambda to: to.state(record))
+
+    def alert(self, record: AlertRecord) -> None:
+        self._say(lambda to: to.alert(record))
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self._say(lambda to: to.reference(record))
+
+    def close(self) -> None: ...
+
+    def _say(self, what: Callable[[Publisher], None]) -> None:
+        try:
+            what(self.publishers[self.current])
+        except Exception:
+            self.exceptions += 1
+            raise
+
+
+def conditions(path: Path, plan: Plan) -> dict[str, Any]:
+    """Every condition in turns; plain values by condition."""
+    config, ring = scene.config_for(plan.size), scene.Ring.load(path)
+    order = [CONDITIONS[(i + shift) % len(CONDITIONS)] for shift in range(plan.rounds) for i in range(len(CONDITIONS))]
+    count = plan.block * len(order)
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch, _wires(config, Path(scratch)) as wires:
+        direct, routed = wires.subscribers
+        switched = _Switched(wires.publishers, count)
+        guest = contextlib.ExitStack()
+
+        def change(seq: int) -> None:
+            if seq % plan.block == 0:
+                guest.close()
+                condition = order[seq // plan.block]
+                switched.current = int(condition == "router")
+                if (somebody := wires.guest(condition, plan)) is not None:
+                    guest.callback(somebody.close)
+
+        source = harness.RingSource(ring, count, paced=True, between=change)
+        with guest:
+            harness.run_loop(config, source, switched)
+        for subscriber in wires.subscribers:
+            subscriber.finish()
+    seqs = np.arange(count)
+    settled = seqs % plan.block >= plan.settle
+    which = np.array([CONDITIONS.index(order[seq // plan.block]) for seq in seqs])
+    results: dict[str, Any] = {"exceptions": switched.exceptions, "loop_alone_us": []}
+    for i, condition in enumerate(CONDITIONS):
+        mine = settled & (which == i)
+        receiver = routed if condition == "router" else direct
+        arrived_us = _arrived_us(receiver, source, count)[mine]
+        results[condition] = {
+            "frames": int(mine.sum()),
+            "lost": int(np.isnan(arrived_us).sum()),
+            "judged_us": summary(switched.judged_us[mine]),
+            "received_us": summary(arrived_us),
+            "loop_us": summary(source.loop_us()[mine]),
+        }
+    alone = which == CONDITIONS.index("alone")
+    results["alone"]["loop_p99_by_round_us"] = [
+        float(np.percentile(source.loop_us()[settled & alone & (seqs // (plan.block * len(CONDITIONS)) == i)], 99))
+        for i in range(plan.rounds)
+    ]
+    del results["loop_alone_us"]
+    return results
+
+
+def restarts(path: Path, plan: Plan) -> dict[str, Any]:
+    """The router killed and started again under the running loop, some times; loss and recovery of each."""
+    config, ring = scene.config_for(plan.size), scene.Ring.load(path)
+    steps = [round(scene.FPS * seconds) for seconds in (plan.before_s, plan.down_s, plan.after_s)]
+    count = plan.restarts * sum(steps)
+    killed_ns, up_ns = np.zeros(plan.restarts, np.int64), np.zeros(plan.restarts, np.int64)
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as scratch, _wires(config, Path(scratch)) as wires:
+        switched = _Switched(wires.publishers, count)
+        switched.current = 1
+
+        def disturb(seq: int) -> None:
+            turn, place = divmod(seq, sum(steps))
+            if place == 0 and turn:
+                up_ns[turn - 1] = wires.router.up_ns
+            if place == steps[0]:
+                killed_ns[turn] = time.monotonic_ns()
+                wires.router.kill()
+            elif place == steps[0] + steps[1]:
+                wires.router.start()
+
+        source = harness.RingSource(ring, count, paced=True, between=disturb)
+        harness.run_loop(config, source, switched)
+        up_ns[-1] = wires.router.up_ns
+        for subscriber in wires.subscribers:
+            subscriber.finish()
+        routed = wires.subscribers[1]
+    runs = []
+    for turn in range(plan.restarts):
+        seqs = np.arange(turn * sum(steps), (turn + 1) * sum(steps))
+        came = np.isin(seqs, routed.seqs)
+        after = routed.arrivals_ns[routed.arrivals_ns > killed_ns[turn] + round(1e9 * plan.down_s)]
+        first_ns = int(after[0]) if len(after) else 0
+        away = (source.handed_ns[seqs] >= killed_ns[turn]) & (source.handed_ns[seqs] < up_ns[turn])
+        runs.append(
+            {
+                "router_away_s": 1e-9 * float(up_ns[turn] - killed_ns[turn]),
+                "recovery_s": 1e-9 * (first_ns - float(up_ns[turn])) if first_ns else None,
+                "lost": int((~came).sum()),
+                "lost_while_away": int((~came & away).sum()),
+            }
+        )
+    return {"runs": runs, "exceptions": switched.exceptions, "loop_us": summary(source.loop_us())}
+
+
+@dataclass
+class _Wires:
+    """A publisher that listens and one that is a router's client, with a subscriber each."""
+
+    links: list[Link]
+    publishers: list[ZenohPublisher]
+    subscribers: list[harness.Subscriber]
+    router: RouterProcess
+    endpoint: str
+
+    def guest(self, condition: str, plan: Plan) -> Staller | Crowd | None:
+        key = self.publishers[0].keys["transform"]
+        if condition in ("stopped", "blocked"):
+            sessions: list[Any] = []
+            self.links[0].attach(sessions.append)
+            return Staller(sessions[0], self.endpoint, key, stop=condition == "stopped")
+        return Crowd(self.endpoint, key, plan.more_subscribers) if condition == "ten" else None
+
+
+@contextlib.contextmanager
+def _wires(config: Any, scratch: Path) -> Iterator[_Wires]:
+    with contextlib.ExitStack() as opened:
+        endpoint, router = free_endpoint(), RouterProcess(scratch)
+        opened.callback(router.close)
+        settings = (PublishSettings(listen=(endpoint,)), PublishSettings(mode="client", connect=(router.endpoint,)))
+        links = [Link(each) for each in settings]
+        names = config.settings.robot, config.settings.camera_name
+        publishers = [ZenohPublisher(link, *names) for link in links]
+        for publisher in publishers:
+            opened.callback(publisher.close)
+        end_s = time.monotonic() + 30.0
+        while not links[1].connected:
+            if time.monotonic() > end_s:
+                raise RuntimeError("the router was not reached")
+            time.sleep(0.01)
+        key = publishers[0].keys["transform"]
+        subscribers = [harness.Subscriber(place, key) for place in (endpoint, router.endpoint)]
+        yield _Wires(links, publishers, subscribers, router, endpoint)
+
+
+def _arrived_us(subscriber: harness.Subscriber, source: harness.RingSource, count: int) -> NDArray[np.float64]:
+    """From handed over to in the other process's callback, per frame; NaN for one that never came."""
+    arrived_us = np.full(count, np.nan)
+    arrived_us[subscriber.seqs] = 1e-3 * (subscriber.arrivals_ns - source.handed_ns[subscriber.seqs])
+    return arrived_us
+
+
+def summary(values_us: NDArray[np.float64]) -> dict[str, float]:
+    """Median, 99th percentile and maximum of those that are there."""
+    there = values_us[np.isfinite(values_us)]
+    if not len(there):
+        return {"median": float("nan"), "p99": float("nan"), "max": float("nan")}
+    median, high = np.percentile(there, [50.0, 99.0])
+    return {"median": float(median), "p99": float(high), "max": float(there.max())}
