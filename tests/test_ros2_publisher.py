@@ -257,7 +257,7 @@ def test_a_client_whose_router_comes_late():
     publisher.transform(frame_record())
     with plain_session(listen=endpoint, mode="router") as session:
         samples: list[zenoh.Sample] = []
-        subscriber = session.declare_subscriber("0/**", samples.append)
+        subscriber = session.declare_subscriber(TF_KEY, samples.append)
         wait_until(lambda: len(tokens(session)) == 4, "the node")
 
         def arrives() -> bool:
