@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
 
-from gripmon.publish.commands import _command
+from gripmon.publish.commands import _name, _request
 from gripmon.publish.jaw import JawError, opening_of_joints, opening_of_json
-from gripmon.records import Command, CommandError, CommandFault
+from gripmon.records import CommandError, CommandFault, CommandRequest
 from gripmon.ros2 import JointOpening
 from gripmon.ros2.types import typestore
 from gripmon.sources.network import PayloadDecoder
@@ -149,16 +149,17 @@ def test_5000_joint_states():
 
 def test_6000_commands():
     keys, rng = Keys("arm", "wrist"), random.Random(6)
+    refused = 0
     for _ in range(6_000):
-        name = rng.choice(["undo", "reset", "*", "", "explode", "accept/x"])
-        payload = broken_json(rng, {"argument": "plate-2"})
-        asked = _command(keys, f"gripmon/arm/wrist/cmd/{name}", zenoh.ZBytes(payload))
-        if isinstance(asked, Command):
-            assert isinstance(asked.argument, str)
-            continue
-        assert isinstance(asked, CommandError) and "\n" not in asked.text
-        assert asked.error is not CommandFault.INTERNAL
-    assert isinstance(_command(keys, "gripmon/arm/wrist/cmd/undo", zenoh.ZBytes(b'{"argument": "x"}')), Command)
+        request = _request(zenoh.ZBytes(broken_json(rng, {"argument": "plate-2"})))
+        assert isinstance(_name(keys, f"gripmon/arm/wrist/cmd/{rng.choice(['*', '', 'explode', 'a/b'])}"), CommandError)
+        if isinstance(request, CommandError):
+            refused += 1
+            assert request.error is CommandFault.MALFORMED and "\n" not in request.text
+        else:
+            assert isinstance(request.argument, str) and len(request.argument) < 4096
+    assert refused > 4_000
+    assert _request(zenoh.ZBytes(b'{"argument": "x"}')) == CommandRequest(argument="x")
 
 
 @given(st.binary(max_size=300), st.text(max_size=20), st.none() | st.binary(max_size=100))

@@ -75,7 +75,8 @@ def test_files_are_what_another_decoder_makes_of_them(image: np.ndarray, said: s
         pytest.skip("JPEG has 8 bits")
     data = cv2.imencode(suffix, image)[1].tobytes()
     out = decoded(data, None, said)
-    np.testing.assert_array_equal(out, cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+    flag = cv2.IMREAD_GRAYSCALE if suffix == ".jpg" else cv2.IMREAD_UNCHANGED
+    np.testing.assert_array_equal(out, cv2.imdecode(np.frombuffer(data, np.uint8), flag))
     assert out.dtype == image.dtype
 
 
@@ -163,3 +164,10 @@ def test_what_is_malformed_is_said_in_one_line(
         decoded(payload, attachment, encoding, frame_format)
     assert said in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_jpegs_brightness_is_that_of_its_colours():
+    """What is measured of an image in BGR: 0.299 R + 0.587 G + 0.114 B."""
+    smooth = cv2.GaussianBlur(colour(), (0, 0), 3.0)
+    out = decoded(cv2.imencode(".jpg", smooth, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes())
+    np.testing.assert_allclose(out, smooth @ [0.114, 0.587, 0.299], atol=3.0)

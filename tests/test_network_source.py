@@ -195,7 +195,7 @@ def test_without_a_router_the_reason_names_the_network():
 @pytest.mark.parametrize("frame_format", ["raw", "jpeg", "png"])
 def test_what_our_own_driver_sends_is_understood(driver: Driver, frame_format: str):
     publisher = FramePublisher(driver.session, KEY, frame_format)  # type: ignore[arg-type]
-    image = cv2.GaussianBlur(colour(), (0, 0), 3.0)
+    image = cv2.GaussianBlur(grey() if frame_format == "jpeg" else colour(), (0, 0), 3.0)
     before = driver.camera._last_arrival_s
     publisher.put(image, stamp_ns=12, jaw_opening_m=0.025)
     wait_until(lambda: driver.camera._last_arrival_s != before, "the frame")

@@ -120,7 +120,7 @@ def _converted(image: NDArray[Any], pixels: Pixels) -> Image:
 
 
 def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
-    """A JPEG or PNG file -> H x W, or H x W x 3 (BGR), uint8, or uint16 for grey PNGs of 16 bits.
+    """A JPEG -> H x W, its brightness; a PNG -> H x W, or H x W x 3 (BGR); uint8, or uint16 for grey PNGs of 16 bits.
 
     Its header is held against ``expected_px``, (width, height), before memory is taken or a pixel is decoded.  Pillow
     does both: OpenCV has no way to the header alone, and writes what it thinks of a damaged file to stderr.  Raises
@@ -171,11 +171,16 @@ def _check_png(payload: bytes) -> None:
 
 
 def _array_of(file: ImageFile) -> Image:
+    # Brightness alone is measured, and a JPEG holds it by itself: a fifth of the time of its colours.
+    file.draft("L", file.size)
     if file.mode in ("L", "I;16"):
         return np.asarray(file, dtype=np.uint8 if file.mode == "L" else np.uint16)
     if file.mode in ("1", "LA"):
         return np.asarray(file.convert("L"))
     if file.mode in ("RGB", "RGBA", "P"):
+        import cv2
+
         rgb = np.asarray(file if file.mode != "P" else file.convert("RGB"))
-        return np.ascontiguousarray(rgb[:, :, 2::-1])
+        bgr: Image = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR if rgb.shape[2] == 3 else cv2.COLOR_RGBA2BGR)
+        return bgr
     raise PayloadError(f"a file of colour mode {file.mode}; grey or RGB")
