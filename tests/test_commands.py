@@ -109,6 +109,8 @@ def test_an_argument_may_be_left_out(session: zenoh.Session, loop: Loop, payload
         (f"{CMD}/undo", b'{"argument": 3}', "malformed", "Expected `str`, got `int`"),
         (f"{CMD}/undo", b'{"dry_run": true}', "malformed", "unknown field `dry_run`"),
         (f"{CMD}/undo", b'{"id": "%s"}' % (b"x" * 65), "malformed", "Expected `str` of length <= 64 - at `$.id`"),
+        (f"{CMD}/undo", b'{"id": "a\\n"}', "malformed", "Expected `str` matching regex"),
+        (f"{CMD}/undo", b'{"argument": "\\u001b[31m"}', "malformed", "matching regex"),
         (f"{CMD}/undo", b'{"argument": "%s"}' % (b"x" * 5000), "malformed", "5016 bytes; at most 4096"),
         (f"{CMD}/undo", b'{"schema": "gripmon.command/2"}', "malformed", "its schema is 'gripmon.command/2'"),
         (f"{CMD}/undo", b"\xff\x00", "malformed", "JSON is malformed"),

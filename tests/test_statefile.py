@@ -167,6 +167,14 @@ def test_a_right_checksum_over_what_can_not_be_is_damage_too(path: Path, changes
     assert beside(path) == ["arm.json.damaged-1"]
 
 
+def test_a_state_of_before_messages_said_their_schema_still_counts(path: Path):
+    old = packed().replace(b'"schema": "gripmon.reference/1", ', b"")
+    assert b"schema" not in old
+    content = old[old.index(b'"content":') + len(b'"content":') : -2]
+    digest = hashlib.sha256(content).hexdigest().encode()
+    assert unpack(b'{"sha256":"%s","content":%s}\n' % (digest, content)).state == STATE
+
+
 def test_what_is_packed_here_is_sound_unless_changed():
     assert unpack(packed()).state == STATE
 
@@ -243,6 +251,9 @@ def test_the_calibration_is_that_of_the_values():
     assert calibration_of(lens, model, moved).reference != first.reference
     renamed = msgspec.structs.replace(model, faces=())
     assert calibration_of(lens, renamed, configured()).gripper != first.gripper
+    plain = msgspec.json.encode(msgspec.structs.asdict(configured()) | {"revision": 0, "stamp_ns": 0})
+    assert b"schema" not in plain
+    assert first.reference == hashlib.sha256(plain).hexdigest()[:16], "whatever the version of the message"
 
 
 def test_two_monitors_can_not_use_one_file(path: Path):

@@ -35,6 +35,9 @@ class Command(msgspec.Struct, frozen=True):
     argument: str = ""
 
 
+_PRINTED = r"^[^\x00-\x1f\x7f]*(?![\s\S])"  # it appears in logs and on terminals: no control characters
+
+
 class CommandRequest(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="schema", tag="gripmon.command/1"
 ):
@@ -45,12 +48,18 @@ class CommandRequest(
     """
 
     argument: Annotated[
-        str, Meta(max_length=256, description="the reference, proposal or alert that is meant; empty: see the command")
+        str,
+        Meta(
+            max_length=256,
+            pattern=_PRINTED,
+            description="the reference, proposal or alert that is meant; empty: see the command",
+        ),
     ] = ""
     id: Annotated[
         str,
         Meta(
             max_length=64,
+            pattern=_PRINTED,
             description="of this request: sent again, it gets the same answer and isn't carried out again; empty: none",
         ),
     ] = ""
