@@ -132,3 +132,9 @@ def targets(every: Sequence[Figures]) -> list[Target]:
     unsure = sum(c.begun_unsure + c.closed_unsure for c in conducts)
     out.append(Target("no motion begun, no finger closed by what is not valid", f"{unsure}", unsure == 0))
     return out
+
+
+def renewed_on_the_way(run: Run) -> bool:
+    """Did the reference change while an arm that follows the monitor was still at it?"""
+    open_frames = [not all(closed) for closed in zip(*(run.tracks[s].grasped for s in MONITORED), strict=True)]
+    return len({revision for revision, still in zip(run.revision, open_frames, strict=True) if still}) > 1

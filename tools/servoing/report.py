@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from servoing import controller, eye, stage
-from servoing.figures import LABELS, Figures, Target
+from servoing.figures import LABELS, Figures, Target, renewed_on_the_way
 from servoing.runs import TRUTH, Run
 
 _LABEL, _COLUMN = 26, 12
@@ -25,6 +25,7 @@ def as_text(machine: dict[str, Any], runs: Sequence[Run], every: Sequence[Figure
         f"gripmon {machine['commit']}, {machine['date']}, {machine['cpu']}, {machine['cpus']} cores",
         f"{approach}, {knocked}; object seen to {eye.SIGMA_PX:g} px; gain {controller.GAIN_PER_S:g} /s",
         f"frames of which nothing came: {missed} of {missed + seen}",
+        f"runs with a new reference before the fingers closed: {sum(map(renewed_on_the_way, runs))} of {len(runs)}",
     ]
     row = ""
     for each in every:
