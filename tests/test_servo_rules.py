@@ -123,3 +123,66 @@ def test_wrong_usage_is_one_line(options: list[str], said: str, monkeypatch, cap
         code = ended.code
     assert code == 2
     assert said in capsys.readouterr().err.splitlines()[-1]
+
+
+def _whole_run(row, number: int, *, off_mm: float, verdicts: str, places: list[float]):
+    """Four arms of which those by the monitor end ``off_mm`` away, and turn a joint as ``places`` says."""
+    from dataclasses import replace
+
+    from servoing.runs import SOURCES
+
+    run, track = _run(verdicts, places, closed=len(verdicts) - 1)
+    tracks = {}
+    for source in SOURCES:
+        end_m = {"without": 4.5e-3, "truth": 1e-5}.get(source, 1e-3 * off_mm)
+        tracks[source] = replace(track, off_m=np.full((len(verdicts), 3), [0.0, 0.0, end_m]))
+    return replace(run, row=row, number=number, tracks=tracks)
+
+
+MOVES = [0.0, 1.0, 2.0, 3.0, 4.0]
+PAUSES = [0.0, 1.0, 2.0, 2.0, 3.0]
+
+
+@pytest.mark.parametrize(
+    ("off_mm", "verdicts", "places", "code", "said"),
+    [
+        (0.059, "vvuvv", PAUSES, 0, "no move on unknown: 0 in 8 frames   met"),
+        (0.061, "vvuvv", PAUSES, 1, "worse than with truth, in every run: 0.051 mm   NOT MET"),
+        (0.02, "vvuvv", MOVES, 1, "no move on unknown: 8 in 8 frames   NOT MET"),
+        (0.02, "vvvvv", MOVES, 1, "no move on unknown: 0 in 0 frames   NOT MET"),  # the rule wasn't tried
+        (0.02, "vvuvs", PAUSES, 1, "closed by what is not valid: 8   NOT MET"),
+    ],
+)
+def test_the_exit_code_says_whether_all_was_reached(
+    off_mm, verdicts, places, code, said, monkeypatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    pytest.importorskip("pinocchio")
+    import json
+
+    from servoing import __main__ as command
+    from servoing import runs
+
+    def run(row, number, *_args, **_named):
+        return _whole_run(row, number, off_mm=off_mm, verdicts=verdicts, places=places)
+
+    monkeypatch.setattr(runs, "run", run)
+    monkeypatch.setattr(sys, "argv", ["servo", "--runs", "1", "--json", str(tmp_path / "servo.json")])
+    assert command.main() == code
+    assert said in capsys.readouterr().out
+    rows = json.loads((tmp_path / "servo.json").read_text())["rows"]
+    assert len(rows) == 16 and rows[0]["final_m"] == [4.5e-3]
+
+
+def test_a_failed_monitor_is_exit_code_3(monkeypatch, capsys: pytest.CaptureFixture[str]):
+    pytest.importorskip("pinocchio")
+    from servoing import __main__ as command
+    from servoing import runs
+    from servoing.feed import FeedError
+
+    def run(*_args, **_named):
+        raise FeedError("the monitor has said nothing for 90 s")
+
+    monkeypatch.setattr(runs, "run", run)
+    monkeypatch.setattr(sys, "argv", ["servo", "--runs", "1"])
+    assert command.main() == 3
+    assert capsys.readouterr().err.splitlines()[-1] == "servo: the monitor has said nothing for 90 s"
