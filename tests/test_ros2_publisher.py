@@ -271,6 +271,28 @@ def test_a_client_whose_router_comes_late():
         link.close()
 
 
+def test_the_node_is_back_after_a_restart_of_the_router():
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(mode="client", connect=(endpoint,), retry_longest_s=0.25))
+    publisher = Ros2Publisher(link, ON, layout())
+    seen = []
+    for _ in range(2):
+        with plain_session(listen=endpoint, mode="router") as session:
+            wait_until(lambda session=session: len(tokens(session)) == 4, "the node", 60.0)
+            samples: list[zenoh.Sample] = []
+            subscriber = session.declare_subscriber(TF_KEY, samples.append)
+
+            def arrives(samples: list[zenoh.Sample] = samples) -> bool:
+                publisher.transform(frame_record())
+                return bool(samples)
+
+            wait_until(arrives, "a transform")
+            seen.append(set(tokens(session)))
+            subscriber.undeclare()
+    assert seen[0] == seen[1]
+    link.close()
+
+
 def test_subscriptions_are_shown_in_the_graph():
     endpoint = free_endpoint()
     link = Link(PublishSettings(listen=(endpoint,)))
