@@ -35,7 +35,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = tmp_path_factory.mktemp("zenoh")
     for file in SHIPPED:
         (made / file.name).write_bytes(file.read_bytes())
-    assert main(["certificates", "--out", str(made / "certificates")]) == 0
+    for names in ([], ["central", "--host", "127.0.0.1"]):
+        assert main(["certificates", *names, "--out", str(made / "certificates")]) == 0
     return made
 
 

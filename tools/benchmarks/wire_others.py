@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import socket
@@ -15,6 +14,8 @@ from pathlib import Path
 import zenoh
 
 from benchmarks.harness import Subscriber
+from benchmarks.machine import ROOT
+from gripmon.wire import DEFAULT_ENDPOINT
 
 _STALLER = Path(__file__).parent / "staller.py"
 _MATCH_S = 0.3
@@ -67,15 +68,24 @@ class Crowd:
 class RouterProcess:
     """``gripmon router``; ``up_ns`` is when it last said that it listens, by the clock that all processes share."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *, shared_memory: bool = True) -> None:
+        """The shipped configuration for one machine; without ``shared_memory`` it talks as to other machines."""
         self.endpoint = free_endpoint()
         self.up_ns = 0
         self._file = folder / f"router-{self.endpoint.rpartition(':')[2]}.json5"
-        self._file.write_text(json.dumps({"mode": "router", "listen": {"endpoints": [self.endpoint]}}))
+        text = (ROOT / "configs" / "zenoh" / "local.json5").read_text().replace(DEFAULT_ENDPOINT, self.endpoint)
+        if not shared_memory:
+            text = text.replace("shared_memory: {", "shared_memory: { enabled: false,", 1)
+        self._file.write_text(text)
         self._process: subprocess.Popen[str] | None = None
         self._reader: threading.Thread | None = None
         self.start()
         self.wait()
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
 
     def start(self) -> None:
         """Returns before it listens."""
