@@ -44,7 +44,7 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         "scouting/multicast/enabled": settings.multicast_scouting,
         # Somebody's endless message must not fill the memory; an image of 20 megapixels passes.
         "transport/link/rx/max_message_size": 64 << 20,
-        # Images gain by shared memory; transforms, 3 KiB, don't, and each who sends them costs a reader a pool of 16 MiB.
+        # Images gain by shared memory; transforms, 3 KiB, don't, and each sender costs its reader a pool of 16 MiB.
         "transport/shared_memory/transport_optimization/message_size_threshold": 64 << 10,
         # An express message takes a whole place in the queue, of which there are two: 33 ms without a slice of the
         # processor would lose a frame.
