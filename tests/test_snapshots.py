@@ -11,10 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import router_process
 from daemon_bench import NEVER
 from loopback import WAIT_S, free_endpoint, wait_until
 from published import Published
 from stand_ins import Listener, ScriptedMonitor, ScriptedSource
+from test_security import own_files
 
 import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
@@ -41,8 +43,8 @@ class Monitor(ScriptedMonitor):
 class Running:
     """A daemon in a thread, with a real publisher; ``frames`` gives what its source gives."""
 
-    def __init__(self, endpoint: str, frames: Callable[[int], object]) -> None:
-        self.publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    def __init__(self, settings: PublishSettings, frames: Callable[[int], object]) -> None:
+        self.publisher = Published(settings, "arm", "wrist")
         self.ended = threading.Event()
         self.recording = Listener()
         self._stop = threading.Event()
@@ -69,8 +71,8 @@ class Running:
 
 
 @contextmanager
-def running(endpoint: str, frames: Callable[[int], object]) -> Iterator[Running]:
-    made = Running(endpoint, frames)
+def running(where: str | PublishSettings, frames: Callable[[int], object]) -> Iterator[Running]:
+    made = Running(PublishSettings(listen=(where,)) if isinstance(where, str) else where, frames)
     try:
         yield made
     finally:
@@ -245,6 +247,22 @@ def test_an_image_of_an_earlier_snapshot_does_not_stay(endpoint: str, tmp_path: 
         wait_until(lambda: daemon.frames, "a frame")
         assert main(["send", "snapshot", "--robot", "arm", "--connect", endpoint, "--out", str(tmp_path)]) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["snapshot.json"]
+
+
+def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: Path):
+    """Five megabytes, with the files that are shipped: no limit on the way is smaller than what is sent."""
+    router = free_endpoint()
+    own_files(tmp_path, router)
+    noise = np.random.default_rng(1).integers(0, 256, (1200, 1500, 3), dtype=np.uint8)  # a PNG of it is no smaller
+    with (
+        router_process.running(tmp_path / "router.json5", router),
+        running(PublishSettings(zenoh_config=str(tmp_path / "monitor.json5")), lambda i: Frame(i, i, noise)) as daemon,
+    ):
+        wait_until(lambda: daemon.publisher.connected and daemon.frames, "a frame of a monitor on the network")
+        with Client("arm", "wrist", zenoh_config_file=str(tmp_path / "operator.json5")) as operator:
+            reply, data = operator.snapshot(WAIT_S)
+    assert reply.snapshot is not None and data is not None and len(data) > 5_000_000
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), noise)
 
 
 @pytest.mark.parametrize(
