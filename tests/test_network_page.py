@@ -1,0 +1,74 @@
+"""docs/network_camera.md: what it tells a driver to send is understood."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import yaml
+from loopback import WAIT_S, free_endpoint, wait_until
+
+from gripmon.config.settings import JawSettings
+from gripmon.config.typed import to_settings
+from gripmon.records import Frame, FrameNote, from_json
+from gripmon.sources import NetworkCamera, NetworkSettings, SourceSettings
+from gripmon.sources.payload import ENCODINGS, raw_image
+from gripmon.wire import DEFAULT_ENDPOINT, Link, PublishSettings
+
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "network_camera.md").read_text()
+
+
+def block(language: str) -> str:
+    found = re.search(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_the_driver_in_python_is_heard():
+    endpoint = free_endpoint()
+    link = Link(PublishSettings(listen=(endpoint,)))
+    camera = NetworkCamera(NetworkSettings(), link, "gripmon/arm1/wrist/image", (768, 576))
+    code = block("python").replace(DEFAULT_ENDPOINT, endpoint)
+    assert endpoint in code
+    driver = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
+    frames: list[Frame] = []
+    try:
+        wait_until(lambda: _read(camera, frames) or len(frames) >= 3 or driver.poll() is not None, "frames", WAIT_S)
+        assert len(frames) >= 3, driver.communicate()
+        assert all(frame.image is not None and frame.image.shape == (576, 768) for frame in frames)
+        assert frames[0].stamp_ns < frames[1].stamp_ns < frames[2].stamp_ns
+        assert camera.malformed == 0
+    finally:
+        driver.kill()
+        driver.communicate()
+        camera.close()
+        link.close()
+
+
+def _read(camera: NetworkCamera, frames: list[Frame]) -> None:
+    if isinstance(item := camera.read(), Frame):
+        frames.append(item)
+
+
+def test_the_attachment_is_one():
+    note = from_json(block("json").encode(), FrameNote)
+    image = raw_image(bytes(768 * 576), note, (768, 576))
+    np.testing.assert_array_equal(image, np.zeros((576, 768)))
+    assert note == FrameNote(**{k: v for k, v in json.loads(block("json")).items() if k != "schema"})
+
+
+def test_the_settings_for_ros_2_are_some():
+    sections = yaml.safe_load(block("yaml"))
+    to_settings(sections["source"], SourceSettings)  # type: ignore[type-var]
+    to_settings(sections["jaw"], JawSettings)
+    to_settings(sections["publish"], PublishSettings)
+
+
+def test_every_encoding_is_named():
+    named = set(re.findall(r"`(\w+)`", PAGE))
+    missing = {name for name in ENCODINGS if name not in named and not re.fullmatch(r"bayer_....16", name)}
+    assert not missing
