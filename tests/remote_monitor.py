@@ -7,8 +7,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,21 +39,19 @@ with zenoh.open(config):
 @contextmanager
 def _process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     """Killed at the end if it still runs."""
-    process = subprocess.Popen(
-        [sys.executable, *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={"PYTHONPATH": f"{_HERE}:{_HERE.parent}"},
-    )
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "open\n", process.stdout.read()
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
+    environment = os.environ | {"PYTHONPATH": f"{_HERE}:{_HERE.parent}"}
+    with tempfile.TemporaryFile("w+") as errors:
+        command = [sys.executable, *arguments]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True, env=environment)
+        try:
+            assert process.stdout is not None
+            if process.stdout.readline() != "open\n":
+                errors.seek(0)
+                raise AssertionError(errors.read())
+            yield process
+        finally:
+            process.kill()
+            process.communicate()
 
 
 @contextmanager

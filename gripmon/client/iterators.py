@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import threading
 from collections import deque
 from typing import Protocol, Self
@@ -97,7 +98,7 @@ class AsyncReadings(_Queue):
         self.wake()
 
     def wake(self) -> None:
-        if not self._loop.is_closed():
+        with contextlib.suppress(RuntimeError):  # its loop has ended, and nobody waits any more
             self._loop.call_soon_threadsafe(self._news.set)
 
     def __aiter__(self) -> Self:
@@ -109,9 +110,7 @@ class AsyncReadings(_Queue):
             if (reading := self._take()) is not None:
                 return reading
             if not self._judge.closed:
-                try:
+                with contextlib.suppress(TimeoutError):  # then it is time to look again
                     async with asyncio.timeout(self._patience_s()):
                         await self._news.wait()
-                except TimeoutError:
-                    pass  # that was the time to look again
         raise StopAsyncIteration
