@@ -227,11 +227,11 @@ SAMPLES: dict[str, msgspec.Struct] = {
     "reply_snapshot": CommandReply(
         CommandName.SNAPSHOT,
         True,
-        "frame 4711, drifting, transform valid: 768 x 576 px, png, 301234 bytes",
+        "frame 4711, 0.01 s old, drifting, transform valid: 768 x 576 px, png, 301234 bytes",
         "recalibration-3-1f0c9a2b",
         3,
         MONITOR,
-        Snapshot(MEASURED, 0.034, SnapshotImage("png", 768, 576, "mono8", 301234)),
+        Snapshot(MEASURED, 0.0125, 0.034, SnapshotImage("png", 768, 576, "mono8", 301234)),
     ),
     "error": CommandError(
         CommandFault.TIMEOUT, "the monitor has not answered within 2 s; it may still be carried out, ask for the state"

@@ -222,6 +222,19 @@ def test_faults_and_counts_of_those_around_the_loop_are_said_in_the_state():
     assert [(said.transforms_unsent, said.malformed) for said in bench.network.states[1:3]] == [(0, 0), (4, 3)]
 
 
+def test_a_report_that_fails_stops_nothing(caplog: pytest.LogCaptureFixture):
+    def fails() -> int:
+        raise RuntimeError("the session is\nclosed")
+
+    with caplog.at_level(logging.ERROR, logger="gripmon"):
+        bench = Bench(range(4), state_period_s=1e-6)
+        reports = Reports(faults=(fails, lambda: "the line is cut"), unsent=fails, malformed=fails)  # type: ignore[arg-type]
+        assert bench.run(reports=reports) == 0
+    assert [record.seq for record in bench.network.transforms] == [0, 1, 2, 3]
+    assert bench.states[1] == (State.TRACKING, "the line is cut")
+    assert caplog.messages == ["a report for the state message fails: RuntimeError: the session is closed"]
+
+
 def test_without_a_feed_the_frames_opening_stays():
     bench = Bench([Frame(0, 1, None, jaw_opening_m=0.03)])
     bench.run()

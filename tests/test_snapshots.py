@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -102,7 +103,9 @@ def test_the_image_is_that_of_the_frame_that_the_record_is_of(endpoint: str):
             cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), picture(record.seq)
         )
         assert reply.monitor == MonitorState((Monitor().reference,))
-        assert reply.text.startswith(f"frame {record.seq}, tracking, transform valid: 64 x 48 px, png, ")
+        assert reply.snapshot.age_s >= 0.0
+        said = f"frame {record.seq}, {reply.snapshot.age_s:.2f} s old, tracking, transform valid: 64 x 48 px, png, "
+        assert reply.text.startswith(said)
     assert seqs == sorted(set(seqs)), "each time a newer one"
 
 
@@ -176,6 +179,21 @@ def test_a_frame_without_an_image_has_a_snapshot_too(endpoint: str, image: objec
         reply, data = client.snapshot(WAIT_S)
     assert reply.done and reply.snapshot is not None and reply.snapshot.image is None and data is None
     assert reply.text.endswith(said)
+
+
+def test_a_camera_that_is_gone_is_told_by_the_age(endpoint: str):
+    with (
+        running(endpoint, lambda i: Frame(0, 5, picture(0)) if i == 0 else Waiting("gone")) as daemon,
+        Client("arm", connect=[endpoint]) as client,
+    ):
+        wait_until(lambda: daemon.frames, "the frame")
+        ages_s = []
+        for _ in range(2):
+            reply, _ = client.snapshot(WAIT_S)
+            assert reply.snapshot is not None and reply.snapshot.record.seq == 0
+            ages_s.append(reply.snapshot.age_s)
+            time.sleep(0.05)
+    assert ages_s[1] > ages_s[0] + 0.05
 
 
 def test_before_the_first_frame_it_is_refused(endpoint: str):

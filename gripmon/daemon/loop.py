@@ -8,7 +8,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import ParamSpec
+from typing import ParamSpec, TypeVar
 
 import msgspec
 
@@ -17,7 +17,7 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
-from gripmon.daemon.snapshots import Snapshots
+from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
@@ -43,6 +43,7 @@ from gripmon.sources import Source, Waiting
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
 KEEP_LAST_EVERY_S = 60.0
@@ -99,7 +100,7 @@ class Daemon:
         self._open_alerts: tuple[OpenAlert, ...] = ()  # the monitor's
         self._commands = commands
         self._snapshots = snapshots or Snapshots()
-        self._newest: tuple[Frame, FrameRecord] | None = None
+        self._newest: Newest | None = None
         self._reports = reports or Reports()
         self._notices = notices
         self._reference, self._reference_due = monitor.reference, True
@@ -171,7 +172,7 @@ class Daemon:
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
         self._deliver("transform", self._publisher.transform, record)
-        self._newest = frame, record
+        self._newest = Newest(frame, record, time.monotonic())
         # The rest is less urgent.
         self._deliver("state's keeping", self._keep_changes)
         for alert in record.alerts:
@@ -298,7 +299,7 @@ class Daemon:
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
         watch, said, reports = self._watch, self._said, self._reports
-        faults = (watch.message, watch.undelivered, *(ask() for ask in reports.faults))
+        faults = (watch.message, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
         message = "; ".join(fault for fault in faults if fault)
         now = (watch.state, watch.verdict, self._source.connected, message, self._reference.revision)
         due = now_s >= self._next_state_s
@@ -327,13 +328,21 @@ class Daemon:
             tcp_shift_m=watch.tcp_shift_m,
             sigma_m=watch.sigma_m,
             open_alerts=watch.standing(self._open_alerts),
-            transforms_unsent=reports.unsent(),
-            malformed=reports.malformed(),
+            transforms_unsent=self._ask(reports.unsent, 0),
+            malformed=self._ask(reports.malformed, 0),
         )
         self._deliver("state", self._publisher.state, self._said)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
             self._keep_house()
+
+    def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
+        """What somebody reports; one who fails at that is no reason to stop."""
+        try:
+            return report()
+        except Exception as error:  # noqa: BLE001  said
+            self._log_once("report", "", f"a report for the state message fails: {_in_short(error)}", error)
+            return otherwise
 
     def _keep_house(self) -> None:
         """Once a state period, right after a frame, when there is time until the next."""

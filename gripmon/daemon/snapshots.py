@@ -7,6 +7,7 @@ import logging
 import os
 import queue
 import threading
+import time
 from typing import NamedTuple
 
 import cv2
@@ -30,11 +31,19 @@ _CLOSE_WITHIN_S = 1.0
 _PIXELS = {("uint8", 2): "mono8", ("uint16", 2): "mono16", ("uint8", 3): "bgr8", ("uint16", 3): "bgr16"}
 
 
+class Newest(NamedTuple):
+    """The newest frame, what was made of it, and when (monotonic)."""
+
+    frame: Frame
+    record: FrameRecord
+    judged_s: float
+
+
 class _Job(NamedTuple):
     asked: Asked
     reply: CommandReply
-    frame: Frame
-    record: FrameRecord
+    newest: Newest
+    asked_s: float
 
 
 class Snapshots:
@@ -44,13 +53,13 @@ class Snapshots:
         self._jobs: queue.Queue[_Job | None] = queue.Queue(_WAITING_MOST)
         self._thread: threading.Thread | None = None
 
-    def answer(self, asked: Asked, reply: CommandReply, newest: tuple[Frame, FrameRecord] | None) -> None:
+    def answer(self, asked: Asked, reply: CommandReply, newest: Newest | None) -> None:
         """Send the reply with the newest frame and its record, soon; without one it is refused."""
         if newest is None:
             asked.answer(msgspec.structs.replace(reply, done=False, text="no frame has come yet", monitor=None))
             return
         try:
-            self._jobs.put_nowait(_Job(asked, reply, *newest))
+            self._jobs.put_nowait(_Job(asked, reply, newest, time.monotonic()))
         except queue.Full:
             text = f"{_WAITING_MOST} snapshots are being made; try again later"
             asked.answer(CommandError(CommandFault.BUSY, text))
@@ -78,13 +87,14 @@ class Snapshots:
 
 
 def _complete(job: _Job) -> None:
-    frame = job.frame
+    frame, record, judged_s = job.newest
     image, data, said = None, None, f"no image ({frame.fault or 'not one that can be kept'})"
     if (encoded := encode(frame.image)) is not None:
         image, data = encoded
         said = f"{image.width_px} x {image.height_px} px, {image.encoding}, {image.size_bytes} bytes"
-    snapshot = Snapshot(job.record, frame.jaw_opening_m, image)
-    text = f"frame {frame.seq}, {job.record.state}, transform {job.record.verdict}: {said}"
+    age_s = job.asked_s - judged_s
+    snapshot = Snapshot(record, age_s, frame.jaw_opening_m, image)
+    text = f"frame {frame.seq}, {age_s:.2f} s old, {record.state}, transform {record.verdict}: {said}"
     job.asked.answer(msgspec.structs.replace(job.reply, text=text, snapshot=snapshot), data)
 
 

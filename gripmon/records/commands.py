@@ -79,6 +79,7 @@ class Snapshot(msgspec.Struct, frozen=True):
     """The newest frame: what the monitor made of it, and its image."""
 
     record: Annotated[FrameRecord, Meta(description="the transform message of that frame")]
+    age_s: Annotated[float, Meta(description="from when it was judged to when it was asked for, s")]
     jaw_reported_m: Annotated[
         float | None, Meta(description="the opening that the robot had reported, m; null if none")
     ]
