@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from loopback import WAIT_S, alert_record, free_endpoint, wait_until
+from loopback import WAIT_S, alert_record, free_endpoint, plain_session, wait_until
 from published import Published
 from remote_monitor import remote_monitor, router
 
@@ -174,6 +174,19 @@ def said_by(robot: str, text: str) -> object:
     import msgspec
 
     return msgspec.structs.replace(alert_record(text), robot=robot)
+
+
+def test_what_is_no_state_is_counted_and_harms_nobody(endpoints: tuple[str, str]):
+    with (
+        remote_monitor(listen=[endpoints[0]]),
+        watching("--json", "--period", "0.1", "--connect", endpoints[0]) as (_, lines),
+        plain_session(connect=endpoints[0]) as session,
+    ):
+        wait_until(lambda: lines and conditions(lines[-1]) == [("arm", "valid")], "the monitor")
+        session.put("gripmon/arm/wrist/state", '{"schema": "gripmon.state/2"}')
+        session.put("gripmon/arm/wrist/state", b"\xff\x00")
+        wait_until(lambda: json.loads(lines[-1])["unreadable"] == 2, "both to be counted")
+        assert conditions(lines[-1]) == [("arm", "valid")]
 
 
 def test_a_monitor_that_hangs_is_silent_and_not_forgotten(endpoints: tuple[str, str]):

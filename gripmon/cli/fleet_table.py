@@ -47,7 +47,7 @@ def row(status: MonitorStatus) -> Row:
 
 
 def summary(statuses: Sequence[MonitorStatus], fault: str) -> str:
-    """How many there are of each condition, and what is wrong with the network."""
+    """How many there are of each condition, and what is wrong beside that."""
     counts = Counter(status.condition for status in statuses)
     parts = [f"{count} {condition}" for condition, count in sorted(counts.items(), key=lambda item: _order(item[0]))]
     text = f"{len(statuses)} monitor{'s' * (len(statuses) != 1)}" + (f": {', '.join(parts)}" if parts else "")

@@ -146,12 +146,17 @@ def _sorted(fleet: Fleet) -> list[MonitorStatus]:
     return sorted(fleet.monitors(), key=trouble)
 
 
+def _fault(fleet: Fleet) -> str:
+    unreadable = f"{fleet.unreadable} messages can't be read" if fleet.unreadable else ""
+    return "; ".join(filter(None, (fleet.fault(), unreadable)))
+
+
 def _show_once(fleet: Fleet, *, as_json: bool) -> int:
     statuses = _sorted(fleet)
     if as_json:
         _print_json(fleet)
     elif statuses:
-        print(fleet_table.plain(statuses, fleet.fault()))
+        print(fleet_table.plain(statuses, _fault(fleet)))
     if not statuses:
         raise common.CommandFailedError(
             f"watch: no monitor is on the network; {fleet.fault() or 'is --connect right?'}"
@@ -178,7 +183,7 @@ def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
     console = Console()
     with Live(console=console, auto_refresh=False, screen=True) as live:
         _repeat(
-            lambda: live.update(fleet_table.table(_sorted(fleet), fleet.fault(), console.size.height), refresh=True),
+            lambda: live.update(fleet_table.table(_sorted(fleet), _fault(fleet), console.size.height), refresh=True),
             period_s,
             end_s,
         )
