@@ -140,6 +140,9 @@ def test_the_matrix_is_scipys(quaternion: list[float]):
     matrix = reading(heard(cam_T_grip=transform)).matrix()
     np.testing.assert_allclose(matrix[:3, :3], rotation.as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(matrix[:, 3], (0.1, -0.2, 0.3, 1.0))
+    averaged = reading(heard(cam_T_grip=transform)).matrix(smoothed=True)
+    np.testing.assert_array_equal(averaged[:3, 3], frame_record().smoothed.translation_m)
+    np.testing.assert_array_equal(reading(heard(cam_T_grip=transform, smoothed=None)).matrix(smoothed=True), matrix)
     with pytest.raises(NotUsable, match=r"^no transform came yet"):
         reading(Inbox()).matrix()
 

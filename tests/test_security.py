@@ -19,7 +19,7 @@ from published import Published
 from router_process import ROOT, running
 
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
+from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient
 from gripmon.records import CommandName, CommandReply
 from gripmon.wire import PublishSettings
 from gripmon.wire.files import load_file
@@ -89,6 +89,17 @@ def test_readers_read_everything(site: Site, name: str):
         assert client.latest() == frame_record()
         assert client.state().seq == 3 and client.reference().revision == 4
         assert client.alive() == (("arm", "wrist"),)
+
+
+@pytest.mark.parametrize("name", ["controller", "operator"])
+def test_controllers_and_tables_of_monitors_work_through_the_rules(site: Site, name: str):
+    file = str(site.file(name))
+    with TransformClient("arm", "wrist", zenoh_config_file=file) as client, Fleet(zenoh_config_file=file) as fleet:
+        wait_until(lambda: site.monitor.transform(frame_record()) or client.latest().usable, "a transform")
+        wait_until(
+            lambda: site.monitor.state(state_record(3)) or [s.condition for s in fleet.monitors()] == [Condition.VALID],
+            "the state",
+        )
 
 
 def test_late_joiners_history_works_through_the_rules(site: Site):

@@ -100,20 +100,24 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         """Standard deviation of the TCP's position, m: the largest along a camera axis; infinite without one."""
         return largest_sigma_m(self.covariance)
 
-    def matrix(self) -> Array:
-        """``cam_T_grip`` as a NumPy array (4, 4), m; raises :class:`NotUsable` without a transform.  Loads NumPy."""
-        if self.transform is None:
+    def matrix(self, *, smoothed: bool = False) -> Array:
+        """``cam_T_grip`` as a NumPy array (4, 4), m; raises :class:`NotUsable` without a transform.  Loads NumPy.
+
+        ``smoothed``: averaged over time, where there is an average; else this frame's.
+        """
+        pose = self.smoothed if smoothed and self.smoothed is not None else self.transform
+        if pose is None:
             raise NotUsable(self)
         import numpy as np
 
-        x, y, z, w = self.transform.rotation_xyzw
+        x, y, z, w = pose.rotation_xyzw
         matrix = np.eye(4)
         matrix[:3, :3] = (
             (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
             (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
             (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
         )
-        matrix[:3, 3] = self.transform.translation_m
+        matrix[:3, 3] = pose.translation_m
         return matrix
 
     def _rests_on(self) -> tuple[MonitorName | None, str, int]:
