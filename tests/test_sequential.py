@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from drift_noise import COVARIANCE, SIGMA, autocorrelated, claimed, feed, vibrating, white
@@ -67,6 +69,63 @@ def test_noise_louder_than_frames_claim_is_learnt(streams: int):
     assert alarms[2000:].sum() <= 2000 * streams / 864
     usual = np.linalg.solve(COVARIANCE, test.usual_covariance() - COVARIANCE)
     assert 0.3 * 9.0 < np.trace(usual) / 6.0 < 3.0 * 9.0
+
+
+def bursting(rng: np.random.Generator, frames: int, streams: int) -> np.ndarray:
+    """Normal errors whose size wanders by half of itself, as long as half a second at 60 frames/s."""
+    log, memory = np.empty((frames, streams)), np.exp(-1.0 / 32.0)
+    now = rng.normal(size=streams)
+    for index in range(frames):
+        now = memory * now + np.sqrt(1.0 - memory**2) * rng.normal(size=streams)
+        log[index] = now
+    return white(rng, frames, streams) * np.exp(0.5 * log)[..., None]
+
+
+# --- limits that the stream's own extremes have taught ---
+
+LEARNT_FRAMES = 13_000
+"""The longest window, and 32 blocks of 256 frames after it."""
+
+
+@pytest.mark.parametrize("noise", [autocorrelated, bursting])
+def test_learnt_limits_keep_the_contract_where_alarms_can_be_counted(noise):
+    settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, tolerated_m=0.0, tolerated_rad=0.0)
+    test, rng = SequentialTest(settings, 32), np.random.default_rng(31)
+    shifts = noise(rng, LEARNT_FRAMES + 5000, 32)
+    feed(test, shifts[:LEARNT_FRAMES])
+    last, alarms = np.full(32, -100), 0
+    for number, finding in enumerate(feed(test, shifts[LEARNT_FRAMES:])):
+        alarms += int((finding.moved & (number - last > 60)).sum())  # within a second: one alert
+        last[finding.moved] = number
+    assert 0 < alarms <= 32 * 5000 / 864
+
+
+def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_one():
+    """The same step in the same streams: excess after it, before and after enough of the noise has been seen."""
+    rng, excess = np.random.default_rng(32), {}
+    for name, noise in (("calm", white), ("bursting", bursting)):
+        test, shifts = SequentialTest(PLAIN, 16), noise(np.random.default_rng(33), LEARNT_FRAMES, 16)
+        step = 30.0 * np.linalg.cholesky(COVARIANCE) @ (rng.normal(size=6) / np.sqrt(6.0))
+        for frames in (6000, LEARNT_FRAMES):
+            feed(test, shifts[:frames] if frames == 6000 else shifts[6000:])
+            found = feed(copy.deepcopy(test), noise(np.random.default_rng(34), 8, 16) + step)
+            excess[name, frames] = float(np.median([f.excess for f in found[4:]]))
+    assert excess["calm", LEARNT_FRAMES] > 1.3 * excess["calm", 6000]
+    assert excess["calm", LEARNT_FRAMES] > 1.5 * excess["bursting", LEARNT_FRAMES]
+
+
+def test_a_motion_is_no_noise_to_learn_limits_from():
+    """Two streams with the same noise, of which one has made a step of a thousand standard deviations."""
+    rng = np.random.default_rng(35)
+    shifts = np.repeat(white(rng, LEARNT_FRAMES, 1), 2, axis=1)
+    test = SequentialTest(PLAIN, 2)
+    feed(test, shifts[:10_000])
+    feed(test, shifts[10_000:10_040] + np.array([[0.0], [1000.0]]) * SIGMA)
+    test.restart(np.array([False, True]))
+    feed(test, shifts[10_040:])
+    small = white(rng, 8, 1) + 30.0 * SIGMA
+    unmoved, moved = np.median([f.excess for f in feed(test, np.repeat(small, 2, axis=1))[4:]], axis=0)
+    assert moved == pytest.approx(unmoved, rel=0.3)
 
 
 # --- delay ---

@@ -5,6 +5,9 @@ finds creeps, and any shift in the end), and it differs from the mean of the win
 errors that last cancel in the difference).  Unknown shifts are estimated, so that each statistic is Hotelling's T² with
 the covariances that the stream itself has shown.  Lai 1995 gives the scheme for independent frames; that frames err
 together enters through the covariances alone.
+
+How far out a statistic may lie by chance is assumed at first, from what errors before clutter are like, and for long
+windows for good.  As soon as the stream has shown enough extremes of its own, these tell it for short windows.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from gripmon.drift.extremes import BLOCK_FRAMES, Extremes
 from gripmon.drift.scatter import Scatter
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.tolerance import square, square_beyond, times, whitening
@@ -45,6 +49,21 @@ MARGIN = 1.55
 """Factor on the threshold: biases have heavier tails than normal ones, too, and change by more than theory has it (on
 streams simulated after images the contract needed 1.2 to 1.5).
 """
+
+SHORT = 9
+"""Lengths, 1 to 256 frames, whose limits are learnt: of longer windows a stream shows too few."""
+
+ALIKE_FRAMES = 512.0
+"""Frames over which a background stays, at least, and bursts come and go: their extremes count as one together."""
+
+FAR = 2.0
+"""Times its limit beyond which a difference is no noise, and raises no limit.  What is nearer may be either."""
+
+EXTREME_FRAMES = 2
+"""Frames after which extremes are looked for: of three frames' medians neighbours are nearly the same."""
+
+BIAS_FREEDOM = 10.0
+"""Student's degrees of freedom of the bias that a background makes, on simulated images."""
 
 REPORTED_MEMORY = 1.0 / 64.0
 
@@ -88,6 +107,10 @@ class SequentialTest:
         self._stale = True
         self._threshold = 1.0
         self._inflation: Array | None = None
+        self._extremes = Extremes(np.tile(np.maximum(2.0 * _COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
+        self._limit = np.full((2, len(LENGTHS), streams), np.inf)
+        self._known = np.zeros(self._limit.shape, dtype=bool)
+        self._middle: Array = np.zeros((streams, 6))
 
     def set_frames_per_s(self, frames_per_s: float) -> None:
         """The stream's own rate: the contract is in days, the thresholds are in frames."""
@@ -120,11 +143,15 @@ class SequentialTest:
         squares = np.stack([square(self._whitening[0], mean), square(self._whitening[1], difference)])
         full = np.stack([mean_full, both_full])
         # What is tolerated can only matter between these two.
-        surely = np.sqrt(self._threshold) + self._most_tolerated
-        worth = mean_full & (squares[0] > WORTH * self._threshold) & (squares[0] <= surely * surely)
+        limit = self._limit
+        surely = np.sqrt(limit[0]) + self._most_tolerated
+        worth = mean_full & (squares[0] > WORTH * limit[0]) & (squares[0] <= surely * surely)
         if worth.any():
             squares[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
-        beyond = np.where(full, squares / self._threshold, 0.0)  # (2, k, s)
+        beyond = np.where(full, squares / limit, 0.0)  # (2, k, s)
+        if self._frames % EXTREME_FRAMES == 0:
+            usable = full & (beyond[1] <= FAR).all(axis=0)
+            self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
         if self._frames % LEARNING_FRAMES == 0:
             # An offset that stays says nothing against what differences show.
             usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
@@ -200,8 +227,19 @@ class SequentialTest:
         beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 
+    def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
+        """Means about that of the longest window: an offset that stays is no noise, and a creep is hardly any."""
+        values = np.stack([mean[:SHORT] - self._middle, difference[:SHORT]])
+        most = np.where(self._known[:, :SHORT], FAR * self._limit[:, :SHORT], np.inf)
+        squares = np.minimum(square(self._plain, values), most)
+        usable = usable[:, :SHORT].copy()
+        usable[0] &= self.windows.frames >= LENGTHS[-1]
+        kinds = (2 * SHORT, self._streams)
+        if self._extremes.add(squares.reshape(kinds), usable.reshape(kinds), EXTREME_FRAMES):
+            self._stale = True
+
     def _refresh(self) -> None:
-        self._stale = False
+        fitted, self._stale = self._stale, False
         self._from_reported = np.linalg.cholesky(self._reported)
         self._to_reported = np.linalg.inv(self._from_reported)
         # Slow to compute, slow to change.
@@ -212,13 +250,38 @@ class SequentialTest:
         heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
         inflation = self._inflation**heavy * np.maximum(self._surge, 1.0)
         # What is told of a mean is its standard deviation, not what would be too rare.
-        both = np.stack([inflation, np.ones_like(inflation)])
-        of_mean, of_difference = self.scatter.covariances(self._reported, both)
+        surge = np.maximum(self._surge, 1.0)
+        each = np.stack([inflation, np.ones_like(inflation), surge])
+        of_mean, of_difference = self.scatter.covariances(self._reported, each)
+        self._plain = whitening(np.stack([of_mean[2, :SHORT], of_difference[2, :SHORT]]))
         of_mean += self._reference
         self._mean_covariance = of_mean[1]
-        self._whitening = whitening(np.stack([of_mean[0], of_difference[0]]))
+        self._middle = self.windows.mean_of_last(LENGTHS[-1])
+        if fitted:
+            self._limit, self._known = self._limits()
+        known = self._known[..., None, None]
+        of_both = np.stack([of_mean[::2], of_difference[::2]])  # (2 statistics, assumed and learnt, k, s, 6, 6)
+        self._whitening = whitening(np.where(known, of_both[:, 1], of_both[:, 0]))
         self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
         self._learnt_whitening = whitening(self.scatter.of_differences)
+
+    def _limits(self) -> tuple[Array, np.ndarray]:
+        """Squares (2, k, s) beyond which the camera has moved, and which of them are learnt.
+
+        None is below what normal errors ask for.  A bias that a stream has never been seen to change within so many
+        frames may do so for the first time, but once in as many frames at most.
+        """
+        chance = self._settings.false_alarms_per_day / (86_400.0 * self._frames_per_s)
+        learnt = self._extremes.limits(min(chance * BLOCK_FRAMES / (2 * SHORT), 0.1)).reshape(2, SHORT, -1)
+        blocks = self._extremes.blocks.reshape(2, SHORT, -1)
+        normal = stats.chi2.isf(min(chance / (2 * SHORT), 0.1), 6)
+        changes = 6.0 * stats.f.isf(np.clip(chance * BLOCK_FRAMES * blocks[1], 1e-12, 0.5), 6.0, BIAS_FREEDOM)
+        limit = np.full((2, len(LENGTHS), self._streams), self._threshold)
+        known = np.zeros(limit.shape, dtype=bool)
+        known[:, :SHORT] = np.isfinite(learnt)
+        least = np.stack([np.full(changes.shape, normal), changes])
+        limit[:, :SHORT] = np.where(known[:, :SHORT], np.maximum(learnt, least), self._threshold)
+        return limit, known
 
 
 def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> tuple[float, Array]:
