@@ -83,8 +83,8 @@ def bursting(rng: np.random.Generator, frames: int, streams: int) -> np.ndarray:
 
 # --- limits that the stream's own extremes have taught ---
 
-LEARNT_FRAMES = 13_000
-"""The longest window, and 32 blocks of 256 frames after it."""
+LEARNT_FRAMES = 21_000
+"""The longest window, and 64 blocks of 256 frames after it."""
 
 
 @pytest.mark.parametrize("noise", [autocorrelated, bursting])
