@@ -115,9 +115,12 @@ def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_o
 
 
 def test_a_motion_is_no_noise_to_learn_limits_from():
-    """Two streams with the same noise, of which one has made a step of a thousand standard deviations."""
+    """Two streams with the same noise, of which one has made a step of a thousand standard deviations.
+
+    After it the longest window has to be full once more before means are learnt from.
+    """
     rng = np.random.default_rng(35)
-    shifts = np.repeat(white(rng, LEARNT_FRAMES, 1), 2, axis=1)
+    shifts = np.repeat(white(rng, LEARNT_FRAMES + 5000, 1), 2, axis=1)
     test = SequentialTest(PLAIN, 2)
     feed(test, shifts[:10_000])
     feed(test, shifts[10_000:10_040] + np.array([[0.0], [1000.0]]) * SIGMA)

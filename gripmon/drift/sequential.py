@@ -233,7 +233,8 @@ class SequentialTest:
         most = np.where(self._known[:, :SHORT], FAR * self._limit[:, :SHORT], np.inf)
         squares = np.minimum(square(self._plain, values), most)
         usable = usable[:, :SHORT].copy()
-        usable[0] &= self.windows.frames >= LENGTHS[-1]
+        # The longest window was full already when its mean was taken last.
+        usable[0] &= self.windows.frames >= LENGTHS[-1] + REFRESH_FRAMES
         kinds = (2 * SHORT, self._streams)
         if self._extremes.add(squares.reshape(kinds), usable.reshape(kinds), EXTREME_FRAMES):
             self._stale = True
