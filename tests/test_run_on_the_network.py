@@ -14,7 +14,9 @@ import pytest
 import zenoh
 from loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
 
+from gripmon.cli import main
 from gripmon.config import builtin_config
+from gripmon.records import CommandReply, FrameRecord, from_json
 
 ROOT = Path(__file__).resolve().parent.parent
 PREFIX = "gripmon/demo/wrist"
@@ -116,6 +118,33 @@ def test_malformed_messages_are_counted_in_the_state(tmp_path: Path, endpoint: s
             assert reply.err is not None
             assert json.loads(reply.err.payload.to_bytes())["schema"] == "gripmon.error/1"
         wait_until(lambda: ask(session, f"{PREFIX}/state")[0]["malformed"] == 1, "the count")
+
+
+def test_a_snapshot_of_the_real_monitor_can_be_replayed(tmp_path: Path, endpoint: str):
+    """The image that came measures as the record beside it says."""
+    config, out = configured(tmp_path, f"{{listen: [{endpoint}]}}"), tmp_path / "now"
+    with running(config) as process, opened_when_it_listens(process, endpoint) as session:
+
+        def valid() -> bool:
+            return any(record["verdict"] == "valid" for record in ask(session, f"{PREFIX}/transform"))
+
+        wait_until(valid, "a valid transform", 60.0)
+        assert main(["send", "snapshot", "--robot", "demo", "--connect", endpoint, "--out", str(out)]) == 0
+    reply = from_json((out / "snapshot.json").read_bytes(), CommandReply)
+    assert reply.snapshot is not None and reply.snapshot.image is not None and reply.monitor is not None
+    then, about = reply.snapshot.record, reply.snapshot.image
+    assert (about.width_px, about.height_px) == (768, 576)
+    assert then.reference_id == reply.monitor.references[-1].reference_id == reply.reference_id
+    lines, jaw_m = tmp_path / "again.jsonl", reply.snapshot.jaw_reported_m
+    (out / "timestamps.csv").write_text(f"file,stamp_ns,jaw_opening_m\nsnapshot.png,{then.stamp_ns},{jaw_m!r}\n")
+    assert main(["replay", str(out), "--config", str(config), "--out", str(lines)]) == 0
+    (again,) = (from_json(line, FrameRecord) for line in lines.read_bytes().splitlines())
+    assert again.stamp_ns == then.stamp_ns
+    measured = {corner.id: corner.uv_px for corner in again.corners if corner.uv_px is not None}
+    both = [corner for corner in then.corners if corner.uv_px is not None and corner.id in measured]
+    assert len(both) >= 4
+    for corner in both:
+        assert corner.uv_px == pytest.approx(measured[corner.id], abs=0.3), "px, from two starting points"
 
 
 def test_a_killed_monitor_is_missed(tmp_path: Path, endpoint: str):
