@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from loopback import WAIT_S, free_endpoint, wait_until
 
+from gripmon.config import builtin_config, load_config
 from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
 from gripmon.records import Frame, FrameNote, from_json
@@ -19,7 +20,9 @@ from gripmon.sources import NetworkCamera, NetworkSettings, SourceSettings
 from gripmon.sources.payload import ENCODINGS, raw_image
 from gripmon.wire import DEFAULT_ENDPOINT, Link, PublishSettings
 
-PAGE = (Path(__file__).resolve().parent.parent / "docs" / "network_camera.md").read_text()
+ROOT = Path(__file__).resolve().parent.parent
+CONFIGS = ROOT / "configs"
+PAGE = (ROOT / "docs" / "network_camera.md").read_text()
 
 
 def block(language: str) -> str:
@@ -66,6 +69,29 @@ def test_the_settings_for_ros_2_are_some():
     to_settings(sections["source"], SourceSettings)  # type: ignore[type-var]
     to_settings(sections["jaw"], JawSettings)
     to_settings(sections["publish"], PublishSettings)
+
+
+def test_the_configurations_alternatives_are_some(tmp_path: Path):
+    """The lines of configs/network.yaml that are commented out, each in place of those that it replaces."""
+    text = builtin_config("network.yaml").read_text().replace("gripper: ", f"gripper: {CONFIGS}/")
+    alternatives = [
+        (("# key: cell7",), ()),
+        (("# topic: /wrist", "# domain_id: 0       #"), (("format: auto", "format: ros2_image"),)),
+        (
+            ("# topic: /joint", "# domain_id: 0          #", "# opening: "),
+            (("source: zenoh", "source: ros2_joint_state"),),
+        ),
+    ]
+    for commented, replaced in alternatives:
+        changed = text
+        for line in commented:
+            assert changed.count(line) == 1, line
+            changed = changed.replace(line, line.removeprefix("# "))
+        for old, new in replaced:
+            changed = changed.replace(old, new, 1)
+        path = tmp_path / "network.yaml"
+        path.write_text(changed)
+        load_config(path)
 
 
 def test_every_encoding_is_named():

@@ -28,6 +28,7 @@ from gripmon.sources import (
     Waiting,
     open_source,
 )
+from gripmon.sources.network import clock_fault
 from gripmon.wire import Keys, Link, PublishSettings
 
 KEY = "cell/camera"
@@ -136,6 +137,7 @@ def test_malformed_payloads_are_passed_over_as_long_as_good_ones_come(driver: Dr
     assert camera.malformed == 3 and camera.dropped == 0
     assert seqs == sorted(seqs)
     assert camera.fault().startswith(f"some malformed frames on {KEY}: ")
+    assert camera.fault().endswith(f"; stamps on {KEY} are a day or more behind this machine's clock")
     assert len([r for r in caplog.records if "malformed frame" in r.message]) == 1, "said once"
 
 
@@ -150,6 +152,42 @@ def test_rubbish_alone_is_a_camera_that_delivers_rubbish(driver: Driver):
     assert bad.image is None and bad.fault == "7 bytes; 1200 (30 rows of 40)"
     assert bad.seq > good.seq
     assert 0.4e9 < bad.stamp_ns - good.stamp_ns < 60e9, "on the camera's clock, which isn't ours"
+
+
+def test_a_decoder_that_breaks_does_not_end_the_monitor(driver: Driver, monkeypatch: pytest.MonkeyPatch):
+    def broken(*_: object) -> None:
+        raise RuntimeError("out of order")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(driver.camera._decoder, "decode", broken)
+        driver.put(grey())
+        assert frame_of(driver.camera).fault == "out of order"
+    driver.put(grey())
+    assert frame_of(driver.camera).fault is None
+
+
+def test_an_attachment_beyond_its_bounds_is_not_looked_at(driver: Driver):
+    driver.put(grey(), raw_note() + b" " * 100_000)
+    fault = frame_of(driver.camera).fault
+    assert fault is not None and fault.startswith("an attachment of 100")
+
+
+@pytest.mark.parametrize(
+    ("late_s", "said"),
+    [
+        (0.0, ""),
+        (2.9, ""),
+        (-2.9, ""),
+        (3.1, "some seconds or more behind"),
+        (-600.0, "a minute or more ahead of"),
+        (4_000.0, "an hour or more behind"),
+        (1.7e9, "a day or more behind"),
+    ],
+)
+def test_a_clock_that_is_not_ours_is_said(late_s: float, said: str):
+    unix_ns = 1_700_000_000_000_000_000
+    text = clock_fault(KEY, unix_ns - round(1e9 * late_s), unix_ns)
+    assert text == (f"stamps on {KEY} are {said} this machine's clock" if said else "")
 
 
 def test_silence_is_said_with_its_reason(driver: Driver):

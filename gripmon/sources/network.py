@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from typing import Annotated, Literal, NamedTuple
@@ -9,16 +10,20 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.records import Frame, FrameNote, Image
+from gripmon.records import Frame, FrameNote, Image, largest_bytes
 from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.sources.payload import JPEG, PNG, PayloadError, check_size, file_image, raw_image, read_note
 from gripmon.wire import Link
 from gripmon.wire.malformed import Malformed
 
+_log = logging.getLogger(__name__)
+
 FILES = {"jpeg": JPEG, "png": PNG}
 ROS_FORMATS = ("ros2_image", "ros2_compressed")
 _PADDING_BYTES = 1 << 20
 _MOST_PIXEL_BYTES = 8  # no encoding has more
+_MOST_LATE_S = 3.0
+LARGEST_ATTACHMENT_BYTES = largest_bytes(FrameNote)
 
 Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
 
@@ -65,17 +70,17 @@ class Content(NamedTuple):
 class PayloadDecoder:
     """Payloads of one camera -> images.  A pure function of what it gets: no clock, no state."""
 
-    def __init__(self, format: Format, size_px: tuple[int, int]) -> None:
+    def __init__(self, frame_format: Format, size_px: tuple[int, int]) -> None:
         """``size_px`` is (width, height) of every image.  Raises SourceError where ROS 2 isn't installed."""
-        self._format, self._size_px = format, size_px
+        self._format, self._size_px = frame_format, size_px
         self.largest_bytes = _MOST_PIXEL_BYTES * size_px[0] * size_px[1] + _PADDING_BYTES
-        if format in ROS_FORMATS:
+        if frame_format in ROS_FORMATS:
             from gripmon.ros2.types import Ros2Missing, typestore
 
             try:
                 typestore()  # now, not with the first frame: it takes a while
             except Ros2Missing as error:
-                raise SourceError(f"format: {format} can't be read; {error}") from None
+                raise SourceError(f"format: {frame_format} can't be read; {error}") from None
 
     def decode(self, payload: bytes, encoding: str, attachment: bytes | None) -> Content:
         """``encoding`` is Zenoh's.  Raises :class:`PayloadError` for everything that is wrong."""
@@ -153,6 +158,7 @@ class NetworkCamera:
         self._dropped = self._dropped_before = self._handed_over = 0
         self._newest: tuple[float, int] | None = None  # of the good ones: monotonic time of arrival, stamp
         self._last_arrival_s: float | None = None
+        self._clock_fault = ""
         self._subscriber: zenoh.Subscriber[None] | None = None
         link.attach(self._attach)
 
@@ -171,8 +177,8 @@ class NetworkCamera:
         return self._malformed.count
 
     def fault(self) -> str:
-        """What is wrong with some of the payloads, in a few words for a person; empty if nothing is."""
-        return self._malformed.fault()
+        """What is wrong with payloads or stamps, in a few words for a person; empty if nothing is."""
+        return "; ".join(fault for fault in (self._malformed.fault(), self._clock_fault) if fault)
 
     def read(self) -> Frame | Waiting | None:
         deadline_s = time.monotonic() + READ_TIMEOUT_S
@@ -180,8 +186,10 @@ class NetworkCamera:
         while (arrival := self._take(deadline_s)) is not None:
             try:
                 content = self._content(arrival.sample)
-            except PayloadError as error:
-                fault = str(error)
+            except Exception as error:  # noqa: BLE001  whatever a stranger sends, it must not end the monitor
+                if not isinstance(error, PayloadError):
+                    _log.debug("a payload on %s", self.key, exc_info=error)
+                fault = str(error) or type(error).__name__
                 self._malformed.add(fault)
                 continue
             return self._frame(arrival, content)
@@ -236,6 +244,8 @@ class NetworkCamera:
         if size > self._decoder.largest_bytes:
             raise PayloadError(f"{size} bytes; at most {self._decoder.largest_bytes} for an image of this camera")
         attachment = sample.attachment
+        if attachment is not None and len(attachment) > LARGEST_ATTACHMENT_BYTES:
+            raise PayloadError(f"an attachment of {len(attachment)} bytes; at most {LARGEST_ATTACHMENT_BYTES}")
         return self._decoder.decode(
             sample.payload.to_bytes(), str(sample.encoding), None if attachment is None else attachment.to_bytes()
         )
@@ -246,6 +256,7 @@ class NetworkCamera:
             stamped = arrival.sample.timestamp
             stamp_ns = arrival.unix_ns if stamped is None else stamped.get_time_as_ntp64().as_nanos()
         self._newest = arrival.monotonic_s, stamp_ns
+        self._clock_fault = clock_fault(self.key, stamp_ns, arrival.unix_ns)
         return Frame(self._next_seq(), stamp_ns, content.image, content.jaw_opening_m, self.key)
 
     def _next_seq(self) -> int:
@@ -264,6 +275,25 @@ class NetworkCamera:
         network = self._link.fault()
         said = f"{self.key} is silent" if self._last_arrival_s is not None else f"nothing on {self.key} yet"
         return f"{said} ({network})" if network else said
+
+
+def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:
+    """By how much a driver's stamp is off, in words that hardly ever change; empty if it may be right.
+
+    Controllers reckon a transform's age from it.
+    """
+    late_s = 1e-9 * (unix_ns - stamp_ns)
+    for limit_s, words in (
+        (86_400.0, "a day"),
+        (3_600.0, "an hour"),
+        (60.0, "a minute"),
+        (_MOST_LATE_S, "some seconds"),
+    ):
+        if abs(late_s) >= limit_s:
+            return (
+                f"stamps on {key} are {words} or more {'behind' if late_s > 0.0 else 'ahead of'} this machine's clock"
+            )
+    return ""
 
 
 def network_key(settings: NetworkSettings, image_key: str) -> str:
