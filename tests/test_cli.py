@@ -82,7 +82,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_alone_it_prints_its_help(capsys: pytest.CaptureFixture[str]):
     assert main([]) == 0
     text = capsys.readouterr().out
-    assert all(re.search(rf"^\s+{command} ", text, re.MULTILINE) for command in COMMANDS)
+    assert all(re.search(rf"^\s+{command}(?: |$)", text, re.MULTILINE) for command in COMMANDS)
     assert "exit codes" in text
 
 
