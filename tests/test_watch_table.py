@@ -14,7 +14,7 @@ from loopback import alert_record, state_record
 from gripmon.cli import fleet_table
 from gripmon.cli.alert_log import AlertLog
 from gripmon.client import Condition, MonitorName, MonitorStatus, trouble
-from gripmon.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, to_json
+from gripmon.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
 GONE_NS = 1_700_000_000_000_000_000
 
@@ -156,6 +156,20 @@ def test_the_alert_log_has_every_alert_once_over_restarts(tmp_path: Path, capsys
     assert [json.loads(line) for line in path.read_text().splitlines()] == [json.loads(p) for p in payloads]
     said = capsys.readouterr().out.splitlines()
     assert len(said) == 3 and "arm/wrist  warning  drift, revision 3: moved 0 mm" in said[0]
+
+
+@pytest.mark.parametrize("number", [-1, 2**63, -(10**30), 10**400])
+def test_no_number_from_the_network_stops_the_table_or_the_log(number: int, capsys: pytest.CaptureFixture[str]):
+    odd = from_json(to_json(state(seq=number, stamp_ns=number, revision=number)), StateRecord)
+    strange = MonitorStatus(name=ARM, state=odd, state_age_s=0.0, gone_since_ns=number)
+    for shown in (fleet_table.plain([strange], ""), fleet_table.line(strange)):
+        assert str(number) in shown
+    assert json.loads(msgspec.json.encode(fleet_table.as_data(strange)))["state"]["seq"] == number
+    log = AlertLog(None, as_json=False)
+    record = msgspec.structs.replace(alert_record(), stamp_ns=number)
+    log.alert(ARM, record, to_json(record))
+    log.write()
+    assert "arm/wrist" in capsys.readouterr().out
 
 
 def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

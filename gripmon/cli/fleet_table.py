@@ -111,8 +111,11 @@ def as_data(status: MonitorStatus) -> dict[str, Any]:
 
 
 def clock(stamp_ns: int) -> str:
-    """Local time of day with the date if that isn't today's."""
-    when = datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
+    """Local time of day with the date if that isn't today's; a stamp from the network may also be none."""
+    try:
+        when = datetime.datetime.fromtimestamp(1e-9 * stamp_ns).astimezone()
+    except (OverflowError, ValueError, OSError):
+        return "at no time"
     today = when.date() == datetime.datetime.now().astimezone().date()
     return when.strftime("%H:%M:%S" if today else "%Y-%m-%d %H:%M:%S")
 
