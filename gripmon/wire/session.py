@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -37,8 +38,8 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         "connect/endpoints": settings.connect,
         # Also when a router restarts: Zenoh's own pauses, up to 4 s, would be several seconds without a transform.
         "connect/retry": {
-            "period_init_ms": round(1e3 * settings.retry_first_s),
-            "period_max_ms": round(1e3 * settings.retry_longest_s),
+            "period_init_ms": math.ceil(1e3 * settings.retry_first_s),
+            "period_max_ms": math.ceil(1e3 * settings.retry_longest_s),
             "period_increase_factor": 2,
         },
         "scouting/multicast/enabled": settings.multicast_scouting,

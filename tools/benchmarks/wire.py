@@ -73,10 +73,11 @@ def verdicts(results: dict[str, Any]) -> list[tuple[str, str, bool]]:
     ratio = alone["received_us"]["median"] / alone["judged_us"]["median"]
     lines = [(f"median at most {RATIO} times the monitor's own", f"{ratio:.2f}", ratio <= RATIO)]
     for condition in ("stopped", "blocked"):
-        tail = measured[condition]["loop_us"]["p99"] / alone["loop_us"]["p99"]
-        lines.append(
-            (f"{condition} subscriber: loop's 99 % at most {TAIL:.2f} of that alone", f"{tail:.2f}", tail <= TAIL)
-        )
+        # The loop tidies up once a second, which would hide a shorter stall: so also until the transform has left.
+        for what, title in (("published_us", "until it has left"), ("loop_us", "whole loop")):
+            tail = measured[condition][what]["p99"] / alone[what]["p99"]
+            text = f"{condition} subscriber: 99 % {title} at most {TAIL:.2f} of that alone"
+            lines.append((text, f"{tail:.2f}", tail <= TAIL))
     recoveries = [turn["recovery_s"] for turn in restarts["runs"]]
     seen = all(recovery is not None for recovery in recoveries)
     worst_s = max(recoveries) if seen else float("inf")
@@ -94,13 +95,18 @@ def as_text(results: dict[str, Any]) -> str:
 
     measured, restarts = results["conditions"], results["restarts"]
     lines = [*machine_lines(results["machine"]), ""]
-    lines += ["ms, median / 99 %              handed over -> callback    monitor alone     whole loop       lost"]
+    lines.append(
+        f"{'ms, median / 99 %':34s} {'monitor alone':>17s} {'it has left':>17s} {'in a callback':>17s} whole loop"
+    )
     for condition, title in _TITLES.items():
         row = measured[condition]
         times = [f"{1e-3 * row[k]['median']:7.3f} / {1e-3 * row[k]['p99']:7.3f}" for k in _COLUMNS]
-        lines.append(f"{title:34s} {times[0]} {times[1]} {times[2]}   {row['lost']} of {row['frames']}")
-    by_round = ", ".join(f"{1e-3 * p99:.3f}" for p99 in measured["alone"]["loop_p99_by_round_us"])
-    lines += [f"whole loop alone, 99 % of each round: {by_round}", "", "router killed and started again"]
+        lines.append(f"{title:34s} {' '.join(times)}   lost {row['lost']} of {row['frames']}")
+    lines += ["", "until it has left, 99 % of each round: how much the machine itself does to it"]
+    for condition in ("alone", "stopped", "blocked"):
+        by_round = measured[condition]["published_p99_by_round_us"]
+        lines.append(f"  {condition:10s} {' '.join(f'{1e-3 * p99:7.2f}' for p99 in by_round)}")
+    lines += ["", "router killed and started again"]
     for turn in restarts["runs"]:
         back = "never" if turn["recovery_s"] is None else f"{turn['recovery_s']:.2f} s"
         lines.append(
@@ -113,4 +119,4 @@ def as_text(results: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-_COLUMNS = ("received_us", "judged_us", "loop_us")
+_COLUMNS = ("judged_us", "published_us", "received_us", "loop_us")

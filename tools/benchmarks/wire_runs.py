@@ -98,7 +98,7 @@ def conditions(path: Path, plan: Plan) -> dict[str, Any]:
     seqs = np.arange(count)
     settled = seqs % plan.block >= plan.settle
     which = np.array([CONDITIONS.index(order[seq // plan.block]) for seq in seqs])
-    results: dict[str, Any] = {"exceptions": switched.exceptions, "loop_alone_us": []}
+    results: dict[str, Any] = {"exceptions": switched.exceptions}
     for i, condition in enumerate(CONDITIONS):
         mine = settled & (which == i)
         receiver = routed if condition == "router" else direct
@@ -108,14 +108,13 @@ def conditions(path: Path, plan: Plan) -> dict[str, Any]:
             "lost": int(np.isnan(arrived_us).sum()),
             "judged_us": summary(switched.judged_us[mine]),
             "received_us": summary(arrived_us),
+            "published_us": summary(source.latency_us()[mine]),
             "loop_us": summary(source.loop_us()[mine]),
         }
-    alone = which == CONDITIONS.index("alone")
-    results["alone"]["loop_p99_by_round_us"] = [
-        float(np.percentile(source.loop_us()[settled & alone & (seqs // (plan.block * len(CONDITIONS)) == i)], 99))
-        for i in range(plan.rounds)
-    ]
-    del results["loop_alone_us"]
+        in_round = [mine & (seqs // (plan.block * len(CONDITIONS)) == i) for i in range(plan.rounds)]
+        results[condition]["published_p99_by_round_us"] = [
+            summary(source.latency_us()[frames])["p99"] for frames in in_round
+        ]
     return results
 
 
