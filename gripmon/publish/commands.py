@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import zenoh
 
+from gripmon.publish.answers import Answers, send_now
 from gripmon.records import (
     Command,
     CommandError,
@@ -43,8 +44,9 @@ class PendingCommand:
     It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
     """
 
-    def __init__(self, command: Command, timeout_s: float) -> None:
+    def __init__(self, command: Command, timeout_s: float, answers: Answers) -> None:
         self.command = command
+        self._answers = answers
         self._timeout_s = timeout_s
         self._lock = threading.Lock()  # guards what follows
         self._askers: list[_Asker] = []
@@ -58,9 +60,9 @@ class PendingCommand:
                 return False
             answer = self._answer
             if answer is None:
-                self._askers.append(asker := _Asker(query, key))
+                self._askers.append(asker := _Asker(query, key, self._answers))
         if answer is not None:
-            _reply(query, key, answer)
+            self._answers.send(query, _reply(key, answer))
         else:
             asker.wait(self._timeout_s, lambda: self._time_is_over(asker))
         return True
@@ -73,7 +75,7 @@ class PendingCommand:
             return self._taken
 
     def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
-        """Tell those who still wait, and whoever asks again."""
+        """Tell those who still wait, and whoever asks again; at once, but with an attachment it may take seconds."""
         with self._lock:
             self._answer = answer
             askers, self._askers = self._askers, []
@@ -107,6 +109,7 @@ class ZenohCommands:
         self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
+        self._answers = Answers("commands")
         link.attach(self._attach, self.close)
 
     @property
@@ -127,6 +130,7 @@ class ZenohCommands:
         self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(_STOPPING)
+        self._answers.close()
 
     def _attach(self, session: zenoh.Session) -> None:
         # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
@@ -142,7 +146,7 @@ class ZenohCommands:
             _log.debug("command on %s", key, exc_info=fault)
             error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
         if error is not None:
-            _reply(query, key, error)
+            self._answers.send(query, _reply(key, error))
 
     def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
         """Let the loop answer; an error if it won't."""
@@ -165,7 +169,7 @@ class ZenohCommands:
                 return None
             if len(self._waiting) >= _WAITING_MOST:
                 return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
-            pending = PendingCommand(command, self._timeout_s)
+            pending = PendingCommand(command, self._timeout_s, self._answers)
             pending.join(query, key)
             self._remember(request.id, pending)
             self._waiting.append(pending)
@@ -182,8 +186,8 @@ class ZenohCommands:
 class _Asker:
     """One query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str) -> None:
-        self._query, self._key = query, key
+    def __init__(self, query: zenoh.Query, key: str, answers: Answers) -> None:
+        self._query, self._key, self._answers = query, key, answers
         self._timer: threading.Timer | None = None
 
     def wait(self, timeout_s: float, is_over: Callable[[], None]) -> None:
@@ -194,7 +198,11 @@ class _Asker:
     def tell(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        _reply(self._query, self._key, answer, attachment)
+        reply = _reply(self._key, answer, attachment)
+        if attachment is None:
+            self._answers.send(self._query, reply)
+        else:  # large: whoever made it has a thread for that, and makes no more of them meanwhile
+            send_now(self._query, reply)
 
 
 def _name(keys: Keys, key: str) -> CommandName | CommandError:
@@ -224,13 +232,15 @@ def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
         return CommandError(CommandFault.MALFORMED, text)
 
 
-def _reply(query: zenoh.Query, key: str, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
-    try:
+def _reply(
+    key: str, answer: CommandReply | CommandError, attachment: bytes | None = None
+) -> Callable[[zenoh.Query], None]:
+    """What sends an answer to a query."""
+
+    def send(query: zenoh.Query) -> None:
         if isinstance(answer, CommandReply):
             query.reply(key, to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON, attachment=attachment)
         else:
             query.reply_err(to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON)
-    except zenoh.ZError as error:  # the asker, or the session, is gone
-        _log.debug("no answer on %s: %s", key, error)
-    finally:
-        query.drop()
+
+    return send

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import zenoh
 
+from gripmon.publish.answers import Answers
 from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord, to_json
 from gripmon.wire import Keys, Link, check_name
 
@@ -129,9 +130,14 @@ class _LastValue:
     """A key whose last value is there for whoever asks."""
 
     def __init__(
-        self, session: zenoh.Session, key: str, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher
+        self,
+        session: zenoh.Session,
+        key: str,
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        answers: Answers,
     ) -> None:
         self._key = key
+        self._answers = answers
         self._last: bytes | None = None
         self._publisher = publisher
         # Answered in Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
@@ -143,7 +149,9 @@ class _LastValue:
         self._publisher.put(payload)
 
     def _answer(self, query: zenoh.Query) -> None:
-        # Zenoh swallows an exception here and the asker would see an empty result: always answer in words.
+        self._answers.send(query, self._reply)
+
+    def _reply(self, query: zenoh.Query) -> None:
         last = self._last
         if last is None:
             query.reply_err(b"nothing published on this key yet", encoding=zenoh.Encoding.TEXT_PLAIN)
@@ -163,13 +171,15 @@ class _Wire:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self.transform = _LastValue(session, keys["transform"], transforms)
+        self._answers = Answers("latest")
+        self.transform = _LastValue(session, keys["transform"], transforms, self._answers)
         self.alert = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.state, self.reference = (
-            _LastValue(session, key, _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1))
+            _LastValue(session, key, _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1), self._answers)
             for key in (keys["state"], keys["reference"])
         )
         self._alive = session.liveliness().declare_token(keys["alive"])
 
     def close(self) -> None:
         self._alive.undeclare()
+        self._answers.close()

@@ -96,7 +96,10 @@ class Link:
         for last_word in reversed(leave):
             last_word()
         if session is not None:
-            session.close()
+            try:
+                session.close()
+            except zenoh.ZError as error:  # somebody who was stopped holds up what is being sent
+                _log.warning("the Zenoh session could not be closed in order: %s", in_short(error))
 
     def _look(self, session: zenoh.Session) -> None:
         places = missing(session, self._endpoints, one_is_enough=self._is_client)

@@ -1,0 +1,113 @@
+"""Replies to an asker that doesn't read hold up nobody: neither the loop, nor Zenoh's threads, nor other replies."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import threading
+from collections.abc import Iterator
+
+import pytest
+import zenoh
+from loopback import WAIT_S, ask, frame_record, free_endpoint, plain_session, wait_until
+from published import Published
+
+from gripmon.publish.answers import _WAITING_MOST, Answers
+from gripmon.publish.commands import PendingCommand
+from gripmon.records import Command, CommandName, CommandReply
+from gripmon.wire import PublishSettings
+
+
+class StalledQuery:
+    """A query whose asker was stopped: a reply to it comes back only when the link is given up."""
+
+    key_expr = "gripmon/arm/wrist/cmd/undo"
+
+    def __init__(self) -> None:
+        self.begun, self.given_up = threading.Event(), threading.Event()
+        self.dropped = False
+        self.payloads: list[bytes] = []
+
+    def reply(self, key: str, payload: bytes, **how: object) -> None:
+        self.begun.set()
+        assert self.given_up.wait(WAIT_S)
+        self.payloads.append(payload)
+
+    reply_err = reply
+
+    def drop(self) -> None:
+        self.dropped = True
+
+
+@pytest.fixture
+def stalled() -> Iterator[StalledQuery]:
+    made = StalledQuery()
+    yield made
+    made.given_up.set()
+
+
+REPLY = CommandReply(CommandName.UNDO, True, "so be it", "plate-2", 4)
+
+
+def test_the_loop_does_not_wait_for_an_asker_that_does_not_read(stalled: StalledQuery):
+    """If it did, this test would end only with the link: the reply comes back when the test lets it."""
+    answers = Answers("test")
+    pending = PendingCommand(Command(CommandName.UNDO), 1000.0, answers)
+    assert pending.join(stalled, stalled.key_expr) and pending.take()  # type: ignore[arg-type]
+    pending.answer(REPLY)
+    assert stalled.begun.wait(WAIT_S) and not stalled.given_up.is_set() and not stalled.payloads
+    stalled.given_up.set()
+    wait_until(lambda: stalled.dropped, "the end of the query")
+    assert [json.loads(payload)["text"] for payload in stalled.payloads] == ["so be it"]
+    answers.close()
+
+
+def test_zenohs_thread_does_not_wait_for_a_late_joiner_that_does_not_read(stalled: StalledQuery):
+    endpoint = free_endpoint()
+    publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    try:
+        publisher.transform(frame_record(5))
+        publisher._wire.transform._answer(stalled)  # type: ignore[union-attr, arg-type]
+        assert stalled.begun.wait(WAIT_S) and not stalled.payloads
+        with plain_session(connect=endpoint) as session:
+            assert [record["seq"] for record in ask(session, "gripmon/arm/wrist/transform")] == [5]
+    finally:
+        stalled.given_up.set()
+        publisher.close()
+
+
+def test_when_too_many_wait_a_query_ends_unanswered(stalled: StalledQuery):
+    answers = Answers("test")
+    for _ in range(_WAITING_MOST):
+        answers.send(stalled, lambda query: query.reply("", b""))  # type: ignore[arg-type]
+    one_more = StalledQuery()
+    answers.send(one_more, lambda query: query.reply("", b""))  # type: ignore[arg-type]
+    assert one_more.dropped and not one_more.begun.is_set()
+    stalled.given_up.set()
+    wait_until(lambda: len(stalled.payloads) == _WAITING_MOST, "all others")
+    answers.close()
+
+
+def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery):
+    before = set(threading.enumerate())
+    answers = Answers("test")
+    answers.send(stalled, lambda query: query.reply("", b"in time"))  # type: ignore[arg-type]
+    assert stalled.begun.wait(WAIT_S)
+    threading.Timer(0.1, stalled.given_up.set).start()
+    answers.close()
+    later = StalledQuery()
+    later.given_up.set()
+    answers.send(later, lambda query: query.reply("", b"after all"))  # type: ignore[arg-type]
+    assert (stalled.payloads, later.payloads, later.dropped) == ([b"in time"], [b"after all"], True)
+    wait_until(lambda: set(threading.enumerate()) <= before, "the threads to end")
+
+
+def test_an_asker_that_is_gone_is_no_error():
+    answers, query = Answers("test"), StalledQuery()
+
+    def gone(_: object) -> None:
+        raise zenoh.ZError("session closed")
+
+    with contextlib.closing(answers):
+        answers.send(query, gone)  # type: ignore[arg-type]
+        wait_until(lambda: query.dropped, "the end of the query")
