@@ -1,0 +1,141 @@
+"""What a configuration says of the network, opened: one session, and everybody on it."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.daemon import JawFeed, Reports
+    from gripmon.publish import Publisher, ZenohCommands
+    from gripmon.sources import Source
+    from gripmon.wire import Keys, Link
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    """The session (None: nothing is published), the publisher, where the jaw opening comes from (None: with the
+    frames), where commands come from, and what the state message says of all this.
+    """
+
+    link: Link | None
+    publisher: Publisher
+    jaw: JawFeed | None
+    commands: ZenohCommands | None
+    reports: Reports
+
+
+def open_network(config: Config) -> Network:
+    """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
+    from gripmon.daemon import Reports
+    from gripmon.publish import NullPublisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+
+    settings, link = config.settings, _open_link(config)
+    jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
+    if link is None:
+        return Network(None, NullPublisher(), jaw, None, Reports())
+    publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
+    if settings.jaw.source in ("zenoh", "ros2_joint_state"):
+        jaw = _network_jaw(config, link, publisher.keys)
+    commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
+    ros2 = _ros2_node(config, link)
+    _show_listeners(config, link)
+    publishers = Publishers(publisher, {} if ros2 is None else {"ROS 2": ros2})
+    faults = (link.fault, publishers.fault)
+    reports = Reports(faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard))
+    return Network(link, publishers, jaw, commands, reports)
+
+
+def with_source(reports: Reports, source: Source) -> Reports:
+    """The reports, and what a camera on the network says beside them."""
+    from gripmon.sources import NetworkCamera
+
+    if not isinstance(source, NetworkCamera):
+        return reports
+    return dataclasses.replace(
+        reports,
+        faults=(*reports.faults, source.fault),
+        malformed=lambda: reports.malformed() + source.malformed,
+    )
+
+
+def _open_link(config: Config) -> Link | None:
+    """The session; None if nothing is published."""
+    from gripmon.ros2 import network_of
+    from gripmon.wire import Link, PublishError
+
+    if not config.settings.publish.enabled:
+        return None
+    try:
+        return Link(network_of(config.settings.publish, config.settings.ros2), config.directory)
+    except PublishError as error:
+        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+
+
+def _ros2_node(config: Config, link: Link) -> Publisher | None:
+    """The monitor as a ROS 2 node, where the configuration wants one."""
+    from gripmon.ros2 import Ros2Missing, Ros2Publisher, layout_of
+
+    settings = config.settings
+    if not settings.ros2.enabled:
+        return None
+    try:
+        return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
+    except Ros2Missing as error:
+        link.close()
+        raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None
+
+
+def _show_listeners(config: Config, link: Link) -> None:
+    """Let ROS 2 know of the topics that frames and jaw opening come from."""
+    from gripmon.ros2 import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners, NodeName, as_token
+    from gripmon.sources import NetworkSettings
+
+    settings = config.settings
+    jaw, source = settings.jaw, settings.source
+    topics = []
+    if jaw.source == "ros2_joint_state" and jaw.topic is not None:
+        topics.append(HeardTopic(jaw.domain_id, jaw.topic, JOINT_STATE))
+    if isinstance(source, NetworkSettings) and source.topic is not None:
+        type_name = IMAGE if source.format == "ros2_image" else COMPRESSED_IMAGE
+        topics.append(HeardTopic(source.domain_id, source.topic, type_name))
+    if topics:
+        namespace = f"/{as_token(settings.robot)}/{as_token(settings.camera_name)}"
+        Listeners(link, NodeName("gripmon_input", namespace), topics)
+
+
+def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
+    """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
+    from gripmon.publish import ZenohJaw
+    from gripmon.publish.jaw import opening_of_joints
+    from gripmon.ros2 import JOINT_STATE, Ros2Missing, subscription_key
+    from gripmon.ros2.types import typestore
+
+    jaw = config.settings.jaw
+    travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
+    if jaw.source == "zenoh":
+        return ZenohJaw(link, keys["jaw"], travel_m=travel_m)
+    assert jaw.topic is not None and jaw.opening is not None, "checked with the configuration"
+    try:
+        typestore()
+    except Ros2Missing as error:
+        raise common.CommandFailedError(f"{config.path}: jaw.source: {error}", common.EXIT_USAGE) from None
+    key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
+    return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)
+
+
+@dataclasses.dataclass(frozen=True)
+class _FixedJaw:
+    """A jaw that never moves, in the form that the daemon asks for; None for a gripper without jaw."""
+
+    fixed_m: float | None
+
+    def opening_m(self) -> float | None:
+        return self.fixed_m
+
+    def fault(self) -> str:
+        return ""
