@@ -209,7 +209,9 @@ def test_a_router_of_another_authority_is_refused(stranger: Path):
 def test_no_certificate_is_refused(site: Site, stranger: Path):
     shutil.copy(site.folder / "certificates" / "ca.pem", stranger / "certificates")
     text = (stranger / "controller.json5").read_text()
-    (stranger / "bare.json5").write_text(re.sub(r"(connect_certificate|connect_private_key|enable_mtls): .*\n", "", text))
+    (stranger / "bare.json5").write_text(
+        re.sub(r"(connect_certificate|connect_private_key|enable_mtls): .*\n", "", text)
+    )
     refused(stranger / "bare.json5")
 
 

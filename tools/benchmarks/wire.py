@@ -7,6 +7,7 @@ import json
 import sys
 import tempfile
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 _DESCRIPTION = """\
@@ -15,7 +16,7 @@ each from handed over until its transform is in the callback of a subscriber in 
 with a subscriber whose process is stopped, with one whose callback blocks (both with the connection filled
 to the brim), with ten subscribers, and through a router; in turns, in one run, beside what the monitor needed
 for the same frames. Then the router is killed and started again under the running loop. Takes some
-six minutes; --quick, less exact, two. Exit code 1 if a figure is not reached."""
+seven minutes; --quick, less exact, two. Exit code 1 if a figure is not reached."""
 
 RATIO, TAIL, RECOVERY_S = 1.5, 1.10, 2.0
 _TITLES = {
@@ -74,10 +75,11 @@ def verdicts(results: dict[str, Any]) -> list[tuple[str, str, bool]]:
     lines = [(f"median at most {RATIO} times the monitor's own", f"{ratio:.2f}", ratio <= RATIO)]
     for condition in ("stopped", "blocked"):
         # The loop tidies up once a second, which would hide a shorter stall: so also until the transform has left.
-        for what, title in (("published_us", "until it has left"), ("loop_us", "whole loop")):
-            tail = measured[condition][what]["p99"] / alone[what]["p99"]
+        for what, title in (("published", "until it has left"), ("loop", "whole loop")):
+            # The middle one of the rounds: whatever else the machine does comes in bursts.
+            tails = [median(measured[who][f"{what}_p99_by_round_us"]) for who in (condition, "alone")]
             text = f"{condition} subscriber: 99 % {title} at most {TAIL:.2f} of that alone"
-            lines.append((text, f"{tail:.2f}", tail <= TAIL))
+            lines.append((text, f"{tails[0] / tails[1]:.2f}", tails[0] <= TAIL * tails[1]))
     recoveries = [turn["recovery_s"] for turn in restarts["runs"]]
     seen = all(recovery is not None for recovery in recoveries)
     worst_s = max(recoveries) if seen else float("inf")
@@ -102,10 +104,11 @@ def as_text(results: dict[str, Any]) -> str:
         row = measured[condition]
         times = [f"{1e-3 * row[k]['median']:7.3f} / {1e-3 * row[k]['p99']:7.3f}" for k in _COLUMNS]
         lines.append(f"{title:34s} {' '.join(times)}   lost {row['lost']} of {row['frames']}")
-    lines += ["", "until it has left, 99 % of each round: how much the machine itself does to it"]
-    for condition in ("alone", "stopped", "blocked"):
-        by_round = measured[condition]["published_p99_by_round_us"]
-        lines.append(f"  {condition:10s} {' '.join(f'{1e-3 * p99:7.2f}' for p99 in by_round)}")
+    for what, title in (("published", "until it has left"), ("loop", "whole loop")):
+        lines += ["", f"{title}, 99 % of each round, ms"]
+        for condition in ("alone", "stopped", "blocked"):
+            by_round = measured[condition][f"{what}_p99_by_round_us"]
+            lines.append(f"  {condition:10s} {' '.join(f'{1e-3 * p99:6.2f}' for p99 in by_round)}")
     lines += ["", "router killed and started again"]
     for turn in restarts["runs"]:
         back = "never" if turn["recovery_s"] is None else f"{turn['recovery_s']:.2f} s"

@@ -30,7 +30,7 @@ class Plan:
     ring: int = 60
     block: int = 270
     settle: int = 30
-    rounds: int = 10
+    rounds: int = 12
     more_subscribers: int = 9
     restarts: int = 6
     before_s: float = 2.0
@@ -112,9 +112,8 @@ def conditions(path: Path, plan: Plan) -> dict[str, Any]:
             "loop_us": summary(source.loop_us()[mine]),
         }
         in_round = [mine & (seqs // (plan.block * len(CONDITIONS)) == i) for i in range(plan.rounds)]
-        results[condition]["published_p99_by_round_us"] = [
-            summary(source.latency_us()[frames])["p99"] for frames in in_round
-        ]
+        for what, values_us in (("published", source.latency_us()), ("loop", source.loop_us())):
+            results[condition][f"{what}_p99_by_round_us"] = [summary(values_us[frames])["p99"] for frames in in_round]
     return results
 
 
@@ -173,11 +172,15 @@ class _Wires:
     endpoint: str
 
     def guest(self, condition: str, plan: Plan) -> Staller | Crowd | None:
+        """Whoever belongs to a condition.  Before "alone" one comes and goes, so that all begin after the same stir."""
         key = self.publishers[0].keys["transform"]
-        if condition in ("stopped", "blocked"):
+        if condition in ("alone", "stopped", "blocked"):
             sessions: list[Any] = []
             self.links[0].attach(sessions.append)
-            return Staller(sessions[0], self.endpoint, key, stop=condition == "stopped")
+            staller = Staller(sessions[0], self.endpoint, key, stop=condition == "stopped")
+            if condition != "alone":
+                return staller
+            staller.close()
         return Crowd(self.endpoint, key, plan.more_subscribers) if condition == "ten" else None
 
 
