@@ -1,4 +1,7 @@
-"""What the drift test will notice with a given camera and gripper, and how soon, before there is any stream."""
+"""What the drift test will notice with a given camera and gripper, and how soon, before there is any stream.
+
+By the limits that are assumed: what a stream's own extremes teach the test after some minutes mostly makes it sooner.
+"""
 
 from __future__ import annotations
 

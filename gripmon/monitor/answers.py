@@ -7,8 +7,24 @@ from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
 from gripmon.geometry import invert, rotation_angle, to_record
-from gripmon.records import Array, CornerFault, CornerRecord, Drift, Smoothed
+from gripmon.policy import Evidence
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    CauseWeight,
+    CornerFault,
+    CornerRecord,
+    Drift,
+    Explanation,
+    ReferenceRecord,
+    Refusal,
+    Severity,
+    Smoothed,
+)
 from gripmon.smoothing import PoseAverage
+from gripmon.stream import StreamFault
 
 
 def flat(covariance: Array) -> tuple[float, ...]:
@@ -49,3 +65,27 @@ def corner_records(
 def unmeasured_corners(names: tuple[str, ...], fault: CornerFault) -> tuple[CornerRecord, ...]:
     """None of them was measured, for one reason."""
     return tuple(CornerRecord(name, None, None, False, fault) for name in names)
+
+
+def after_restart(reference: ReferenceRecord, evidence: Evidence) -> Alert:
+    """Whether the picture fits the reference from which the monitor went on."""
+    fits = not evidence.motion.present
+    text = f"restarted from {reference.reference_id}, revision {reference.revision}; the picture " + (
+        "fits it" if fits else "does not fit it: the camera has moved"
+    )
+    text += f" ({1e3 * evidence.d_m:.2f} mm, {np.degrees(evidence.delta_rad):.2f} degrees)"
+    return Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.INFO if fits else Severity.WARNING, text)
+
+
+def frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
+    """An image that repeats an earlier one shows what was, not what is."""
+    return next(((Refusal.FROZEN, fault.text) for fault in faults if fault.kind == "frozen"), None)
+
+
+def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
+    """What the stream says of images that are refused: that they come from another camera, or are no new ones."""
+    for fault in faults:
+        if fault.kind in ("replaced", "frozen"):
+            known = CauseWeight(fault.cause, 1.0)
+            return Explanation((known,), known, fault.text)
+    return Explanation()

@@ -17,8 +17,18 @@ from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
 from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
-from gripmon.monitor.answers import corner_records, drift_between, flat, smoothed_record, unmeasured_corners
+from gripmon.monitor.answers import (
+    after_restart,
+    corner_records,
+    drift_between,
+    flat,
+    frozen,
+    of_stream,
+    smoothed_record,
+    unmeasured_corners,
+)
 from gripmon.monitor.asking import Inquiry
+from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -27,10 +37,7 @@ from gripmon.recalibrate import Proposal
 from gripmon.recalibrate import Refusal as Refused
 from gripmon.records import (
     Alert,
-    AlertKind,
     Array,
-    Cause,
-    CauseWeight,
     Command,
     CommandName,
     CommandReply,
@@ -44,7 +51,6 @@ from gripmon.records import (
     Origin,
     ReferenceRecord,
     Refusal,
-    Severity,
     State,
     Verdict,
     unmeasured_record,
@@ -151,7 +157,7 @@ class Monitor:
         self.ponder()
         self._tick(frame)
         faults = self._look_at_stream(frame)
-        refusal = inspect(frame, self._camera, self._gripper) or _frozen(faults)
+        refusal = inspect(frame, self._camera, self._gripper) or frozen(faults)
         if refusal is not None:
             self._newest = None
             return self._unmeasured(
@@ -159,7 +165,7 @@ class Monitor:
                 f"{refusal[0]}: {refusal[1]}",
                 CornerFault.FRAME_REFUSED,
                 refusal=refusal[0],
-                explanation=_of_stream(faults),
+                explanation=of_stream(faults),
             )
         measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip)
         if not measurement.trusted:
@@ -186,7 +192,7 @@ class Monitor:
                 judgement = replace(judgement, verdict=Verdict.SUSPECT)  # too few frames to say whether it fits
             else:
                 self._restarted = False
-                alerts = (self._after_restart(evidence), *alerts)
+                alerts = (after_restart(self.reference, evidence), *alerts)
         before = self.reference
         alerts += self._renew(frame, measurement, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
@@ -295,7 +301,9 @@ class Monitor:
         """Do what an operator asks, between two frames; what can't be done is refused and changes nothing."""
         before, done = self.reference, True
         try:
-            text, alerts = self._obey(command, stamp_ns)
+            measurable = self._newest is not None and self._newest.trusted
+            moment = Moment(self._cam_T_grip, measurable, self._now_s, stamp_ns)
+            text, alerts = obey(command, self._policy, self._renewal, moment)
             self._due += alerts
         except CommandRefused as refusal:
             done, text = False, str(refusal)
@@ -303,22 +311,6 @@ class Monitor:
             self._begin()
         state = self.state() if command.name in (CommandName.STATE, CommandName.SNAPSHOT) else None
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
-
-    def _obey(self, command: Command, stamp_ns: int) -> tuple[str, tuple[Alert, ...]]:
-        name, reference = command.name, self.reference
-        if name in (CommandName.STATE, CommandName.SNAPSHOT):
-            return f"{self._policy.state}, {reference.reference_id} in force, revision {reference.revision}", ()
-        if name is CommandName.ACKNOWLEDGE:
-            seen = self._policy.alerts.acknowledge(command.argument)
-            if not seen:
-                which = f"no open alert {command.argument}" if command.argument else "no open alert"
-                raise CommandRefused(f"{which} that isn't acknowledged")
-            return "acknowledged: " + ", ".join(alert.alert_id for alert in seen), seen
-        if name is not CommandName.RECALIBRATE:
-            return self._renewal.obey(command, self._cam_T_grip, self._now_s, stamp_ns)
-        if self._newest is None or not self._newest.trusted:
-            raise CommandRefused("nothing was measured in the newest frame")
-        return self._renewal.want(), ()
 
     def _begin(self) -> None:
         """Drift is reckoned from the reference in force."""
@@ -335,15 +327,6 @@ class Monitor:
         if self.reference.restores is None:
             # How edges look from where the camera is now; an undo doesn't move it.
             self._watches = Watches(len(self._gripper.finger_ids))
-
-    def _after_restart(self, evidence: Evidence) -> Alert:
-        """Whether the picture fits the reference from which the monitor went on."""
-        fits = not evidence.motion.present
-        text = f"restarted from {self.reference.reference_id}, revision {self.reference.revision}; the picture " + (
-            "fits it" if fits else "does not fit it: the camera has moved"
-        )
-        text += f" ({1e3 * evidence.d_m:.2f} mm, {np.degrees(evidence.delta_rad):.2f} degrees)"
-        return Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.INFO if fits else Severity.WARNING, text)
 
     def _unmeasured(
         self,
@@ -417,17 +400,3 @@ def _gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
     if abs(measurement.jaw_surprise) > JAW_SURPRISE:
         return True
     return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY
-
-
-def _frozen(faults: tuple[StreamFault, ...]) -> tuple[Refusal, str] | None:
-    """An image that repeats an earlier one shows what was, not what is."""
-    return next(((Refusal.FROZEN, fault.text) for fault in faults if fault.kind == "frozen"), None)
-
-
-def _of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
-    """What the stream says of images that are refused: that they come from another camera, or are no new ones."""
-    for fault in faults:
-        if fault.kind in ("replaced", "frozen"):
-            known = CauseWeight(fault.cause, 1.0)
-            return Explanation((known,), known, fault.text)
-    return Explanation()
