@@ -234,6 +234,15 @@ def test_one_finger_alone_does_not_tell_of_the_opening(share: float, cause: Caus
     assert judge.explanation(shown.reference).probable.cause is cause
 
 
+@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.LENS), (0.4, Cause.UNKNOWN)])
+def test_one_finger_alone_does_not_tell_of_the_lens(share: float, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(blur_px=1.8), 0.8, share))
+    assert judge.explanation(shown.reference).probable.cause is cause
+
+
 @pytest.mark.parametrize("place", [0, FRAMES // 2, FRAMES - 1])
 def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
     """A fit in which too little agreed may have ended anywhere; its edge points lie where they lie."""

@@ -190,6 +190,11 @@ TABLES: dict[str, list[Row]] = {
         *START,
         (seen(4.5, explanation=WRONG_JAW), DRIFTING, SUSPECT, [(K.GRIPPER, RAISED)], False),
     ],
+    "the jaw is blamed until the edges are seen well, then the mount: what was wrong is taken back at once": [
+        *START,
+        (seen(1.0, explanation=WRONG_JAW), DRIFTING, SUSPECT, [(K.GRIPPER, RAISED)], False),
+        (seen(1.0, explanation=KNOCKED), DRIFTING, VALID, [(K.STEP, RAISED), (K.GRIPPER, CLEARED)], False),
+    ],
     "another focus: suspect": [
         *START,
         (seen(4.5, explanation=REFOCUSED), DRIFTING, SUSPECT, [(K.LENS, RAISED)], False),

@@ -185,14 +185,14 @@ def _spoilt(pooled: Pooled, baseline: Baseline | None) -> str | None:
 def _ill_founded(key: Key, pooled: Pooled) -> bool:
     """Whether a cause is told from fingers that most of their own profiles contradict.
 
-    A finger that isn't seen at all is weighed as such.  Of an opening two fingers have to tell: what one does may as
-    well be its own.
+    A finger that isn't seen at all is weighed as such.  Of an opening and of the lens two fingers have to tell: what
+    one does may as well be its own.
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
         return part not in pooled.absent and not pooled.share[part] >= MOST
     several = min(len(pooled.share), 2)
-    return cause is Cause.JAW_OPENING and int((pooled.share >= MOST).sum()) < several
+    return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= MOST).sum()) < several
 
 
 def _explained(shares: Mapping[Key, float], gripper: Gripper, probable: float, text: str) -> Explanation:

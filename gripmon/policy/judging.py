@@ -270,6 +270,9 @@ class Policy:
                 alerts += book.absent(RENEWAL, "no longer past the limit", now_s)
         if not_the_camera:
             alerts += book.present(GRIPPER, _gripper_alert(evidence.explanation), now_s, stamp_ns)
+        elif probable.cause is Cause.CAMERA_MOUNT:
+            # The same edges explained better: what was said before they were seen well was wrong.
+            alerts += book.absent(GRIPPER, "the camera moved, not the gripper or the lens", now_s, at_once=True)
         else:
             alerts += book.absent(GRIPPER, "fingers, jaw and lens are as they should be", now_s)
         return alerts
