@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 _DESCRIPTION = """\
-Lets many monitors talk through one router (gripmon router) into one reader of everything and one alert log, all on this
-machine, and prints what arrives, what is lost, how late, and what each monitor costs router and readers.
-Then the same with a reader that leaves transforms alone, as gripmon watch and a central router do.
+Lets many monitors talk through one router (gripmon router) into one reader of everything and one alert log
+(gripmon watch --alerts), all on this machine, and prints what arrives, what is lost, how late, and what each
+monitor costs router and readers. Then the same with gripmon watch in place of the reader: a table needs no
+transforms, and where nobody wants them they aren't even sent.
 
 The monitors are real where this is about the network: each has a session, a publisher and messages as
 gripmon run has. They process no images: one record, measured on a picture of the demo, is said again with
@@ -23,6 +24,7 @@ other numbers and stamps; fifty whole monitors would need the processors of fift
 shared memory, as robots elsewhere can't."""
 
 _HERE = Path(__file__).parent
+_WATCH = ("-m", "gripmon", "watch")
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Plan:
 class Child:
     """A process that says ``ready``, and what it has seen in the end."""
 
-    def __init__(self, *command: str) -> None:
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    def __init__(self, *command: str, output: Any = subprocess.PIPE) -> None:
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=output, text=True)
 
     def line(self, expected: str) -> None:
         assert self.process.stdout is not None
@@ -118,36 +120,49 @@ def measure(plan: Plan) -> dict[str, Any]:
 
 
 def _run(plan: Plan, folder: Path, router: Any, children: list[Child], results: dict[str, Any]) -> None:
-    log = folder / "alerts.jsonl"
-    everything = _reader(children, router.endpoint, "transform,state,reference,alive")
-    alerts = _reader(children, router.endpoint, "alert", str(log))
+    log, table = folder / "alerts.jsonl", folder / "table.jsonl"
+    everything = _child(children, str(_HERE / "reader.py"), router.endpoint, "transform,state,reference,alive")
+    everything.line("ready")
+    alerts = _child(children, *_WATCH, "--alerts", "--out", str(log), "--connect", router.endpoint)
     time.sleep(plan.settle_s)
-    before = {"router": _rss(router.pid), "reader": _rss(everything.process.pid)}
+    results["rss_before_bytes"] = {"router": _rss(router.pid), "reader": _rss(everything.process.pid)}
     talkers = _talkers(plan, folder, router.endpoint, children)
-    for name, reader in (("everything", everything), ("table", None)):
-        print(f"{name} …", file=sys.stderr)
-        reader = reader or _reader(children, router.endpoint, "state,reference,alive")
+    always = {"router": [router.pid], "alert log": [alerts.process.pid]}
+    always["monitors"] = [talker.process.pid for talker in talkers]
+    print("everything …", file=sys.stderr)
+    time.sleep(plan.settle_s)
+    everything.mark()
+    costs = _costs({"reader": [everything.process.pid]} | always, plan.seconds)
+    results["everything"] = costs | everything.finish()
+    print("table …", file=sys.stderr)
+    with table.open("w") as output:
+        watch = _child(children, *_WATCH, "--json", "--connect", router.endpoint, output=output)
         time.sleep(plan.settle_s)
-        reader.mark()
-        pids = {"router": [router.pid], "reader": [reader.process.pid], "alert log": [alerts.process.pid]}
-        pids["monitors"] = [talker.process.pid for talker in talkers]
-        cpu_s, start_s = {who: _cpu_s(of) for who, of in pids.items()}, time.monotonic()
-        time.sleep(plan.seconds)
-        span_s = time.monotonic() - start_s
-        used = {who: (_cpu_s(of) - cpu_s[who]) / span_s for who, of in pids.items()}
-        rss = {who: sum(_rss(pid) for pid in of) for who, of in pids.items()}
-        results[name] = {"span_s": span_s, "cores": used, "rss_bytes": rss} | reader.finish()
-    results["rss_before_bytes"] = before
+        results["table"] = _costs({"watch": [watch.process.pid]} | always, plan.seconds)
+    newest = json.loads(table.read_text().splitlines()[-1])
+    results["table"]["listed"] = len(newest["monitors"])
+    results["table"]["unreadable"] = newest["unreadable"]
     sent = [sums for talker in talkers for sums in talker.finish().values()]
     time.sleep(1.0)
-    alerts.finish()
+    logged = [json.loads(line) for line in log.read_text().splitlines()]
     results["alerts_sent"] = sum(each["alert"] for each in sent)
-    results["alerts_logged"] = len(log.read_text().splitlines())
+    results["alerts_logged"] = sum("alert_id" in each for each in logged)
 
 
-def _reader(children: list[Child], endpoint: str, leaves: str, *file: str) -> Child:
-    children.append(Child(sys.executable, str(_HERE / "reader.py"), endpoint, leaves, *file))
-    children[-1].line("ready")
+def _costs(pids: dict[str, list[int]], seconds: float) -> dict[str, Any]:
+    """Cores in use meanwhile and memory at the end, of each group of processes."""
+    before_s, start_s = {who: _cpu_s(of) for who, of in pids.items()}, time.monotonic()
+    time.sleep(seconds)
+    span_s = time.monotonic() - start_s
+    return {
+        "span_s": span_s,
+        "cores": {who: (_cpu_s(of) - before_s[who]) / span_s for who, of in pids.items()},
+        "rss_bytes": {who: sum(_rss(pid) for pid in of) for who, of in pids.items()},
+    }
+
+
+def _child(children: list[Child], *arguments: str, output: Any = subprocess.PIPE) -> Child:
+    children.append(Child(sys.executable, *arguments, output=output))
     return children[-1]
 
 
@@ -156,8 +171,7 @@ def _talkers(plan: Plan, folder: Path, endpoint: str, children: list[Child]) -> 
     for i in range(plan.processes):
         count = (plan.monitors - first) // (plan.processes - i)
         command = (str(_HERE / "monitors.py"), endpoint, str(first), str(count), str(plan.rate_hz))
-        talkers.append(Child(sys.executable, *command, str(folder / "record.json")))
-        children.append(talkers[-1])
+        talkers.append(_child(children, *command, str(folder / "record.json")))
         first += count
     for talker in talkers:
         talker.line("ready")
@@ -202,27 +216,18 @@ def as_text(results: dict[str, Any]) -> str:
         f"{monitors} monitors in {plan['processes']} processes; each says {plan['rate_hz']:g} transforms a second",
         f"of {results['transform_bytes']} bytes, its state every second, an alert every ten seconds",
     ]
-    for name, title in (
-        ("everything", "one router, one reader of everything, one alert log"),
-        ("table", "the same, but the reader leaves transforms alone"),
-    ):
-        part = results[name]
-        lines += ["", f"{title} ({part['span_s']:.0f} s)"]
-        for leaf, count in sorted(part["count"].items()):
-            lost, (median_us, high_us) = part["lost"].get(leaf, 0), part["latency_us"].get(leaf, (0.0, 0.0))
-            if leaf == "reference":
-                continue
-            lines.append(
-                f"  {leaf:10s} {count / part['span_s']:8.1f} /s   lost {lost} of {count + lost}   "
-                f"until read {1e-3 * median_us:.2f} ms median, {1e-3 * high_us:.2f} ms 99 %"
-            )
-        lines.append(f"  monitors there: {part['alive']}")
-        lines.append("                     a core       of it for each monitor      memory")
-        for who, cores in part["cores"].items():
-            rss = part["rss_bytes"][who]
-            lines.append(
-                f"  {who:12s} {1e2 * cores:10.1f} %   {1e2 * cores / monitors:14.3f} %   {rss / 2**20:16.1f} MiB"
-            )
+    everything, table = results["everything"], results["table"]
+    lines += ["", f"one router, one reader of everything, one alert log ({everything['span_s']:.0f} s)"]
+    for leaf in ("transform", "state"):
+        count, lost = everything["count"].get(leaf, 0), everything["lost"].get(leaf, 0)
+        median_us, high_us = everything["latency_us"].get(leaf, (float("nan"),) * 2)
+        lines.append(
+            f"  {leaf:10s} {count / everything['span_s']:8.1f} /s   lost {lost} of {count + lost}   "
+            f"until read {1e-3 * median_us:.2f} ms median, {1e-3 * high_us:.2f} ms 99 %"
+        )
+    lines += [f"  monitors there: {everything['alive']}", *_cost_lines(everything, monitors)]
+    lines += ["", f"the same, with gripmon watch in place of the reader ({table['span_s']:.0f} s)"]
+    lines += [f"  monitors in the table: {table['listed']}", *_cost_lines(table, monitors)]
     grown = {
         who: (results["everything"]["rss_bytes"][who] - before) / monitors
         for who, before in results["rss_before_bytes"].items()
@@ -230,6 +235,14 @@ def as_text(results: dict[str, Any]) -> str:
     lines += ["", "memory for each monitor: " + ", ".join(f"{who} {v / 1024:.0f} KiB" for who, v in grown.items())]
     lines.append(f"alerts: {results['alerts_logged']} in the log of {results['alerts_sent']} that were sent")
     return "\n".join(lines)
+
+
+def _cost_lines(part: dict[str, Any], monitors: int) -> list[str]:
+    lines = ["                     a core       of it for each monitor      memory"]
+    for who, cores in part["cores"].items():
+        rss = part["rss_bytes"][who] / 2**20
+        lines.append(f"  {who:12s} {1e2 * cores:10.1f} %   {1e2 * cores / monitors:14.3f} %   {rss:16.1f} MiB")
+    return lines
 
 
 if __name__ == "__main__":
