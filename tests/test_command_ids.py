@@ -6,6 +6,7 @@ import contextlib
 import json
 import re
 import threading
+from collections import Counter
 from collections.abc import Iterator
 
 import pytest
@@ -99,6 +100,15 @@ def test_who_asks_again_while_it_is_under_way_waits_for_the_same_answer(publishe
     loop.end()
     assert texts == ["heard ''"] * 3
     assert loop.heard == [Command(CommandName.UNDO)]
+
+
+def test_those_who_ask_again_while_nobody_answers_are_bounded(publisher: Published, session: zenoh.Session):
+    """Each of them costs a thread until its time is over."""
+    before = threading.active_count()
+    replies = [session.get(f"{CMD}/undo", payload=asked_with("a"), timeout=20.0) for _ in range(60)]
+    errors = [json.loads(reply.err.payload.to_bytes()) for waiting in replies for reply in waiting]
+    assert threading.active_count() < before + 30
+    assert Counter(error["error"] for error in errors) == {"timeout": 16, "busy": 44}
 
 
 def test_after_a_time_out_the_answer_can_still_be_had(endpoint: str):

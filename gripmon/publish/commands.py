@@ -53,6 +53,11 @@ class PendingCommand:
         self._answer: CommandReply | CommandError | None = None
         self._taken = self._dropped = False
 
+    @property
+    def askers(self) -> int:
+        """How many wait for the answer."""
+        return len(self._askers)
+
     def join(self, query: zenoh.Query, key: str) -> bool:
         """Add somebody who waits, or tell the answer that is there; False if it was given up and never carried out."""
         with self._lock:
@@ -127,7 +132,8 @@ class ZenohCommands:
 
     def close(self) -> None:
         """Tell those who still wait that the monitor stops."""
-        self._closed = True
+        with self._lock:  # what is being taken in just now is told below, too
+            self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(_STOPPING)
         self._answers.close()
@@ -157,14 +163,16 @@ class ZenohCommands:
         if isinstance(request, CommandError):
             self._malformed.add(request.text)
             return request
-        if self._closed:
-            return _STOPPING
         command = Command(name, request.argument)
         with self._lock:
+            if self._closed:
+                return _STOPPING
             known = self._known.get(request.id)
             if known is not None and known.command != command:
                 text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
                 return CommandError(CommandFault.ID_REUSED, text)
+            if known is not None and known.askers >= _WAITING_MOST:  # each costs a thread until its time is over
+                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} wait for this answer already; try again later")
             if known is not None and known.join(query, key):
                 return None
             if len(self._waiting) >= _WAITING_MOST:
