@@ -130,6 +130,9 @@ def test_nothing_to_send_is_a_failure(heard: Heard, folder: Path, capsys: pytest
         (["{folder}", "--robot", "a/b"], "robot name 'a/b' can't be part of a Zenoh key"),
         (["{folder}", "--robot", "arm", "--connect", "localhost"], "feed: "),
         (["{empty}", "--robot", "arm"], "no image in"),
+        (["{folder}", "--robot", "arm", "--key", "cell//camera"], "feed: key 'cell//camera' is none"),
+        (["{folder}", "--robot", "arm", "--key", "gripmon/**"], "feed: key 'gripmon/**' is none"),
+        (["{folder}", "--robot", "arm", "--key", ""], "feed: key '' is none"),
     ],
 )
 def test_what_cant_be_sent_is_said_in_one_line(

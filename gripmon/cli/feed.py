@@ -66,21 +66,25 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon feed``."""
     from gripmon.wire import Keys, Link, PublishError, PublishSettings
+    from gripmon.wire.settings import check_key
 
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     source = _open(arguments)
     try:
-        key = arguments.key or Keys(arguments.robot, arguments.camera)["image"]
+        own = Keys(arguments.robot, arguments.camera)["image"]
+        key = own if arguments.key is None else check_key(arguments.key)
         link = Link(PublishSettings(mode="client", connect=tuple(arguments.connect or (_DEFAULT_ENDPOINT,))))
     except (ValueError, PublishError) as error:
         source.close()
         raise common.CommandFailedError(f"feed: {error}", common.EXIT_USAGE) from None
     feeder = _Feeder(arguments, link, key)
     try:
+        feeder.wait()
         for frame, due_s in _paced(arguments, source):
             feeder.send(frame, due_s)
         time.sleep(_LAST_WORD_S)  # what was put last is still on its way
     finally:
+        source.close()
         link.close()
         print(f"feed: {feeder.sent} frames sent on {key}{feeder.trouble()}", file=sys.stderr)
     return common.EXIT_DONE if feeder.sent else common.EXIT_FAILED
@@ -100,8 +104,12 @@ class _Feeder:
         def declare(session: Any) -> None:
             self._publisher = FramePublisher(session, key, arguments.format, jpeg_quality=arguments.quality)
 
+        self._link = link
         link.attach(declare)
-        while not link.connected:  # nothing is lost while the monitor starts
+
+    def wait(self) -> None:
+        """Until there is a monitor or a router: nothing is lost while it starts."""
+        while not self._link.connected:
             time.sleep(_LOOK_AGAIN_S)
 
     def send(self, frame: Frame, due_s: float) -> None:

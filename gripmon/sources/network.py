@@ -15,6 +15,7 @@ from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.sources.payload import JPEG, PNG, PayloadError, check_size, file_image, raw_image, read_note
 from gripmon.wire import Link
 from gripmon.wire.malformed import Malformed
+from gripmon.wire.settings import KEY_PATTERN
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +38,7 @@ class NetworkSettings(
         Annotated[
             str,
             msgspec.Meta(
-                pattern=r"^[^/*$#?\s]+(/[^/*$#?\s]+)*$",
+                pattern=KEY_PATTERN,
                 description="Zenoh key of the frames, without wildcards; absent: gripmon/<robot>/<camera_name>/image",
             ),
         ]

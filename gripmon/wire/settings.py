@@ -11,6 +11,8 @@ import msgspec
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
 _NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
+KEY_PATTERN = r"^[^/*$#?\s]+(/[^/*$#?\s]+)*(?![\s\S])"
+"""A key as one may put on it: no wildcards, no blanks."""
 
 Endpoint = Annotated[
     str, msgspec.Meta(pattern=_ENDPOINT_PATTERN, description="a Zenoh endpoint, e.g. tcp/127.0.0.1:7447")
@@ -73,3 +75,10 @@ def check_name(role: str, name: str) -> str:
             "one of / * $ # ?, and no @ in front"
         )
     return name
+
+
+def check_key(key: str) -> str:
+    """The key; raises ValueError unless it is one that can be put on: a pattern might be many monitors' keys."""
+    if not re.match(KEY_PATTERN, key):
+        raise ValueError(f"key {key!r} is none; names with / between them, none empty, without * $ # ? or blanks")
+    return key
