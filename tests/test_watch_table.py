@@ -55,6 +55,12 @@ THE_WORST_FIRST = [
 ]
 
 
+def test_a_monitor_that_stopped_with_something_wrong_has_stopped_nevertheless():
+    said = "stopped; no jaw opening for 1 s or longer"
+    assert status("arm", gone=True, message=said, state=State.STALE, **UNKNOWN).condition is Condition.STOPPED
+    assert status("arm", gone=True, message="stopped short", state=State.LOST).condition is Condition.GONE
+
+
 def test_the_worst_come_first_whatever_the_order_they_came_in():
     shuffled = random.Random(5).sample(THE_WORST_FIRST, len(THE_WORST_FIRST))
     assert [s.name.robot for s in sorted(shuffled, key=trouble)] == [s.name.robot for s in THE_WORST_FIRST]
@@ -182,6 +188,17 @@ def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest
     assert (came["event"], went["event"], went["stamp_ns"]) == ("appeared", "vanished", GONE_NS)
     assert {came["schema"], went["schema"]} == {"gripmon.presence/1"}
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [came, went]
+
+
+def test_while_nobody_reads_what_is_printed_the_oldest_are_lost(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr("gripmon.cli.alert_log._WAITING_MOST", 3)
+    log = AlertLog(None, as_json=True)
+    for i in range(5):
+        log.alert(ARM, alert_record(str(i)), to_json(alert_record(str(i))))
+    log.write()
+    assert [json.loads(line)["text"] for line in capsys.readouterr().out.splitlines()] == ["2", "3", "4"]
 
 
 def test_a_log_that_can_not_be_written_is_said_once_and_complete_in_the_end(

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gripmon.client import MonitorName, MonitorStatus
     from gripmon.records import AlertRecord
 
-_WAITING_MOST = 100_000  # lines for a file that can't be written for a while; beyond it the oldest are lost
+_WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost
 _LOOK_BACK_BYTES = 16 << 20
 
 
@@ -32,8 +32,8 @@ class AlertLog:
         """Raises OSError if the file is there and can't be read."""
         self._path, self._as_json = path, as_json
         self._lock = threading.Lock()  # guards the next two against the threads that bring events
-        self._new_texts: list[str] = []
-        self._new_lines: list[bytes] = []
+        self._new_texts: deque[str] = deque(maxlen=_WAITING_MOST)
+        self._new_lines: deque[bytes] = deque(maxlen=_WAITING_MOST)
         self._waiting: deque[bytes] = deque(maxlen=_WAITING_MOST)
         self._failure = ""
         self._written = set() if path is None or not path.is_file() else set(_last_lines(path))
@@ -61,8 +61,8 @@ class AlertLog:
     def write(self) -> None:
         """Everything that has come since; a fault of the file is said once and tried again with the next call."""
         with self._lock:
-            texts, self._new_texts = self._new_texts, []
-            lines, self._new_lines = self._new_lines, []
+            texts, self._new_texts = self._new_texts, deque(maxlen=_WAITING_MOST)
+            lines, self._new_lines = self._new_lines, deque(maxlen=_WAITING_MOST)
         for text in texts:
             print(text, flush=True)
         self._waiting.extend(lines)

@@ -49,7 +49,8 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
     def condition(self) -> Condition:
         """By its token, its silence, and the verdict on its last transform."""
         if self.gone_since_ns is not None:
-            said_so = self.state is not None and self.state.message == "stopped"
+            # What else was wrong may follow.
+            said_so = self.state is not None and self.state.message.partition(";")[0] == "stopped"
             return Condition.STOPPED if said_so else Condition.GONE
         if self.state_age_s > SILENT_AFTER_S:
             return Condition.SILENT
