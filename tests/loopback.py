@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -28,14 +29,17 @@ from gripmon.records import (
     Verdict,
 )
 
-WAIT_S = 20.0
+WAIT_S = 60.0
 
 
 def free_endpoint() -> str:
-    """A Zenoh endpoint on a loopback port that is free now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """A Zenoh endpoint on a loopback port that is free now, and that no connection of others is given meanwhile: those
+    come from a range above it.
+    """
+    while True:
+        endpoint = f"tcp/127.0.0.1:{random.SystemRandom().randrange(10_000, 32_000)}"
+        if can_bind(endpoint):
+            return endpoint
 
 
 def can_bind(endpoint: str) -> bool:

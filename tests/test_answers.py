@@ -88,7 +88,8 @@ def test_when_too_many_wait_a_query_ends_unanswered(stalled: StalledQuery):
     answers.close()
 
 
-def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery):
+def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("gripmon.publish.answers._CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
     before = set(threading.enumerate())
     answers = Answers("test")
     answers.send(stalled, lambda query: query.reply("", b"in time"))  # type: ignore[arg-type]

@@ -40,7 +40,7 @@ class Driver:
     def __init__(self, session: zenoh.Session, link: Link) -> None:
         self.session = session
         self._link = link
-        self.camera = self.opened(NetworkSettings(key=KEY, silent_after_s=0.3))
+        self.camera = self.opened(NetworkSettings(key=KEY, silent_after_s=1.0))
         self._publisher = session.declare_publisher(KEY, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: self._publisher.matching_status.matching, "the source to listen")
 
