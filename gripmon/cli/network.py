@@ -123,6 +123,7 @@ def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
     try:
         typestore()
     except Ros2Missing as error:
+        link.close()
         raise common.CommandFailedError(f"{config.path}: jaw.source: {error}", common.EXIT_USAGE) from None
     key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
     return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)
