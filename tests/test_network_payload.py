@@ -123,6 +123,12 @@ def progressive_bomb() -> bytes:
     return data[:last] + data[last:-2] * 1000 + data[-2:]
 
 
+@pytest.mark.parametrize("opening_m", [-0.0005, 0.0, 1.0])
+def test_closed_jaws_that_are_said_to_be_open_by_less_than_nothing_spoil_no_image(opening_m: float):
+    content = PayloadDecoder("auto", (WIDTH, HEIGHT)).decode(grey().tobytes(), "", raw_note(jaw_opening_m=opening_m))
+    assert content.jaw_opening_m == opening_m
+
+
 MALFORMED: list[tuple[bytes, bytes | None, str, str, str]] = [
     # payload, attachment, Zenoh's encoding, format, what is said
     (b"", None, "", "auto", "raw pixels without width, height, encoding; all three in the attachment"),
@@ -136,6 +142,7 @@ MALFORMED: list[tuple[bytes, bytes | None, str, str, str]] = [
     (grey().tobytes(), b"[1]", "", "auto", "attachment: no message gripmon.frame/1: Expected `object`"),
     (grey().tobytes(), raw_note(schema="gripmon.frame/2"), "", "auto", "its schema is 'gripmon.frame/2'"),
     (grey().tobytes(), raw_note(jaw_opening_m=1.5), "", "auto", "<= 1.0 - at `$.jaw_opening_m`"),
+    (grey().tobytes(), raw_note(jaw_opening_m=-0.002), "", "auto", ">= -0.001 - at `$.jaw_opening_m`"),
     (grey().tobytes(), raw_note(stamp_ns=-1), "", "auto", ">= 0 - at `$.stamp_ns`"),
     (grey().tobytes(), raw_note(stamp_ns=1.5), "", "auto", "at `$.stamp_ns`"),
     (grey().tobytes(), raw_note(more="x" * 5000), "", "auto", "at most 4096"),

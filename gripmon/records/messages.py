@@ -86,8 +86,9 @@ class FrameNote(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", t
         ]
         | None
     ) = None
+    # A little below 0, too: an encoder says so of closed jaws, and the image beside it is sound.
     jaw_opening_m: (
-        Annotated[float, Meta(ge=0.0, le=1.0, description="opening of the jaws at that time, m; absent: not known")]
+        Annotated[float, Meta(ge=-1e-3, le=1.0, description="opening of the jaws at that time, m; absent: not known")]
         | None
     ) = None
     width: Annotated[Side, Meta(description="pixels in a row")] | None = None
