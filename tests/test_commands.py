@@ -7,15 +7,17 @@ import json
 import threading
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 import zenoh
 from commanded import CMD, Loop, answers, reply_to
-from loopback import WAIT_S, free_endpoint, plain_session, wait_until
+from loopback import WAIT_S, free_endpoint, plain_session, reference_record, wait_until
 from published import Published
 
+from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.publish.commands import ZenohCommands
-from gripmon.records import Command, CommandFault, CommandName, CommandReply
+from gripmon.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
 from gripmon.wire import Keys, Link, PublishSettings
 
 
@@ -225,3 +227,22 @@ def test_the_client_refuses_an_answer_of_another_major_version(endpoint: str, an
         queryable.undeclare()
         token.undeclare()
     assert "arm/wrist has answered, but that can't be read: its schema is 'gripmon.reply/2'" in str(caught.value)
+
+
+@pytest.mark.parametrize("stamp_ns", [10**30, -(10**30)])
+def test_what_a_stranger_answers_does_nothing_to_the_terminal(
+    endpoint: str, stamp_ns: int, capsys: pytest.CaptureFixture[str]
+):
+    hostile = msgspec.structs.replace(reference_record(), reference_id="\x1b[2Jplate", stamp_ns=stamp_ns)
+    answer = CommandReply(CommandName.STATE, True, "so be it\x1b]0;mine\x07", "plate", 1, MonitorState((hostile,)))
+    with plain_session(listen=endpoint, mode="peer") as session:
+        token = session.liveliness().declare_token("gripmon/arm/wrist/alive")
+        queryable = session.declare_queryable(
+            f"{CMD}/state", lambda query: query.reply(f"{CMD}/state", to_json(answer))
+        )
+        assert main(["send", "state", "--robot", "arm", "--connect", endpoint]) == 0
+        queryable.undeclare()
+        token.undeclare()
+    said = capsys.readouterr().out
+    assert "so be it" in said and "at no time" in said and "plate" in said
+    assert said.replace("\n", "").isprintable()

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.cli.fleet_table import printable
 
 if TYPE_CHECKING:
     from gripmon.records import CommandReply, MonitorState, ReferenceRecord
@@ -79,11 +80,11 @@ def send(arguments: argparse.Namespace) -> int:
 
         print(to_json(reply).decode())
     elif not reply.done:
-        print(f"refused: {reply.text}", file=sys.stderr)
+        print(f"refused: {printable(reply.text)}", file=sys.stderr)
     else:
-        print("\n".join([reply.text, *map(str, written)]))
+        print("\n".join([printable(reply.text), *map(str, written)]))
         if reply.monitor is not None and reply.snapshot is None:
-            print(_table(reply.monitor))
+            print("\n".join(map(printable, _table(reply.monitor))))
     return common.EXIT_DONE if reply.done else common.EXIT_FAILED
 
 
@@ -130,7 +131,7 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
             raise common.CommandFailedError(f"send: {error.args[0]} (--camera)", common.EXIT_USAGE) from None
         except NotCarriedOut as error:
             again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
-            raise common.CommandFailedError(f"send: {error}{again}", common.EXIT_FAILED) from None
+            raise common.CommandFailedError(f"send: {printable(str(error))}{again}", common.EXIT_FAILED) from None
 
 
 def _write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
@@ -153,7 +154,7 @@ def _write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     return list(files)
 
 
-def _table(state: MonitorState) -> str:
+def _table(state: MonitorState) -> list[str]:
     """References, the newest last, a proposal, and the open alerts, a line each."""
     lines = ["references, the last one in force:", *(f"  {_line(reference)}" for reference in state.references)]
     lines += ["proposed:", f"  {_line(state.proposal)}"] if state.proposal is not None else []
@@ -161,11 +162,14 @@ def _table(state: MonitorState) -> str:
     for kept in state.alerts:
         taken = ", acknowledged" if kept.alert.acknowledged else ""
         lines.append(f"  {kept.alert.alert_id}  {kept.alert.severity.value}{taken}: {kept.alert.text}")
-    return "\n".join(lines)
+    return lines
 
 
 def _line(reference: ReferenceRecord) -> str:
-    when = datetime.datetime.fromtimestamp(1e-9 * reference.stamp_ns).astimezone().isoformat(" ", "seconds")
+    try:
+        when = datetime.datetime.fromtimestamp(1e-9 * reference.stamp_ns).astimezone().isoformat(" ", "seconds")
+    except (OverflowError, ValueError, OSError):  # it came from the network
+        when = "at no time"
     origin = f"restores {reference.restores}" if reference.restores else f"by {reference.accepted_by}"
     step = ""
     if reference.inputs is not None:
