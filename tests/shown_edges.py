@@ -46,6 +46,8 @@ class Shown:
         hidden: tuple[str, ...] = (),
         noise: float = 0.004,
         brightest: float = 0.7,
+        steepest: float = 0.3,
+        grey: float = 0.4,
     ) -> EdgeEvidence:
         """``bent``: 4x4 motion of a finger's points in the gripper frame; ``camera``: the one that really looks;
         ``outliers``: so many pieces are off by up to 5 px.
@@ -91,6 +93,8 @@ class Shown:
             finger_share=np.array([0.05 if name in hidden else 0.8 for name in gripper.finger_ids]),
             noise=noise,
             brightest=brightest,
+            steepest=steepest,
+            cells=np.full((12, 16), grey),
             reach_px=7.0,
         )
 

@@ -191,6 +191,18 @@ def test_nothing_seen_at_all_is_a_blocked_view_or_a_noisy_image():
     assert "dark" in text
 
 
+@pytest.mark.parametrize(
+    ("steepest", "grey", "cause"),
+    [(0.25, 0.4, Cause.VIEW_BLOCKED), (0.1, 0.7, Cause.VIEW_BLOCKED), (0.1, 0.4, Cause.UNKNOWN)],
+)
+def test_a_view_that_only_lost_its_edges_is_not_said_to_be_blocked(steepest: float, grey: float, cause: Cause):
+    shown = Shown(sharp_gripper())
+    everything = ("left", "right")
+    told_cause, _, text = told(shown, shown.judge(), hidden=everything, steepest=steepest, grey=grey)
+    assert told_cause is cause
+    assert ("out of focus" in text) == (cause is Cause.UNKNOWN)
+
+
 def test_noise_that_hides_the_fingers_is_the_cause_of_where_they_seem_to_be():
     shown = Shown(sharp_gripper())
     bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}

@@ -20,8 +20,8 @@ from gripmon.records import Array
 @dataclass(frozen=True, slots=True)
 class Baseline:
     """``motion`` (m,) of the unknowns from the reference; ``bias_px`` of each piece of an edge beyond that, and
-    ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then; blur and
-    noise as in :class:`Pooled`.
+    ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then; blur,
+    noise, ``steepest``, ``cells`` and ``wander`` as in :class:`Pooled`.
     """
 
     motion: Array
@@ -31,13 +31,17 @@ class Baseline:
     jaw_opening_m: float
     blur_px2: float | None
     noise: float
+    steepest: float
+    cells: Array
+    wander: Array
 
     @classmethod
     def of(cls, pooled: Pooled, motion: Array, residual_px: Array, edges: int) -> Baseline:
         bias_px, sigma_px = np.full(edges * PIECES, np.nan), np.full(edges * PIECES, np.nan)
         bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
         then = pooled.evidence
-        return cls(motion, bias_px, sigma_px, then.jaw_reported_m, then.jaw_opening_m, pooled.blur_px2, pooled.noise)
+        image = pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
+        return cls(motion, bias_px, sigma_px, then.jaw_reported_m, then.jaw_opening_m, *image)
 
     def start(self, state: State, reported: bool, gripper: Gripper) -> State:
         """Where everything stands if nothing has moved; ``state``: if the reference and the report are right."""

@@ -37,6 +37,13 @@ BAD_IMAGE = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.0
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
 MUCH_NOISE, LEAST_NOISE, DARK = 4.0, 0.02, 0.08
 
+FLATTENED = 0.5
+STEADY, ALIKE, MOSTLY = 0.02, 0.05, 0.7
+"""Part of the usual steepness to which the steepest edges of an image must have sunk for its focus to be in doubt; and
+by how much its cells may have wandered before, and may differ now, parts of the full scale, so that so many of those
+that were steady show what they showed: a blur leaves grey levels as they were, a thing before the lens doesn't.
+"""
+
 MOST = 0.5
 """Share of a finger's profiles that must agree with where it is said to be.  What fewer show may be anything that has
 an edge or two: a shadow, a finger's other side, what lies behind.
@@ -121,6 +128,9 @@ class CauseJudge:
             spoilt = _spoilt(pooled, baseline)
             if spoilt is not None:
                 return self._told(BAD_IMAGE, spoilt)
+        if blind and baseline is not None and _unsharp(pooled, baseline):
+            text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
+            return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind:
             return self._told(BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place")
         if scatter_px > SCATTERED_PX:
@@ -180,6 +190,14 @@ def _spoilt(pooled: Pooled, baseline: Baseline | None) -> str | None:
     if pooled.noise > max(MUCH_NOISE * (0.0 if baseline is None else baseline.noise), LEAST_NOISE):
         return f"noise of {100.0 * pooled.noise:.0f} % of the full scale hides the gripper's edges"
     return None
+
+
+def _unsharp(pooled: Pooled, baseline: Baseline) -> bool:
+    """Whether the image shows what it did, without its edges."""
+    steady = baseline.wander < STEADY
+    if not steady.any() or pooled.steepest >= FLATTENED * baseline.steepest:
+        return False
+    return bool((np.abs(pooled.cells - baseline.cells)[steady] < ALIKE).mean() >= MOSTLY)
 
 
 def _ill_founded(key: Key, pooled: Pooled) -> bool:

@@ -32,7 +32,8 @@ class Pooled:
     """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
     edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
     finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where it
-    can't be told; ``noise`` and ``brightest`` as in ``EdgeEvidence``; ``frames`` that it was made of.
+    can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
+    of the cells from frame to frame; ``frames`` that it was made of.
     """
 
     evidence: EdgeEvidence
@@ -42,6 +43,9 @@ class Pooled:
     blur_px2: float | None
     noise: float
     brightest: float
+    steepest: float
+    cells: Array
+    wander: Array
     frames: int
 
 
@@ -74,9 +78,12 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     share = _share(frames)
     noise = float(np.median([frame.noise for frame in frames]))
     brightest = float(np.median([frame.brightest for frame in frames]))
+    steepest = float(np.median([frame.steepest for frame in frames]))
+    cells = np.array([frame.cells for frame in frames])
+    image = noise, brightest, steepest, np.median(cells, axis=0), np.ptp(cells, axis=0)
     if not places:
         nothing = _only(midst, np.zeros(len(midst.edge), dtype=bool))
-        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, noise, brightest, len(frames))
+        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, *image, len(frames))
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -109,7 +116,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         across=other[:, 3:],
     )
     blur_px2 = isotropic_blur_px2(evidence)
-    return Pooled(evidence, numbers, often, share, blur_px2, noise, brightest, len(frames))
+    return Pooled(evidence, numbers, often, share, blur_px2, *image, len(frames))
 
 
 def _share(frames: Sequence[EdgeEvidence]) -> Array:

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,6 +86,8 @@ class FingerMeter(Settler):
             finger_share=np.array([np.nan if place is None else place.share for place in places]),
             noise=measurement.candidates.noise / measurement.candidates.full_scale,
             brightest=_brightest(image) / measurement.candidates.full_scale,
+            steepest=_steepest(image) / measurement.candidates.full_scale,
+            cells=_cells(image) / measurement.candidates.full_scale,
             reach_px=zoom * self._settings.sampling.reach_px,
         )
 
@@ -174,6 +177,19 @@ class FingerMeter(Settler):
 def _brightest(image: Image) -> float:
     """Grey level that one pixel in a hundred exceeds, from some 1,700 of them."""
     return float(np.percentile(image[:: max(1, image.shape[0] // 36), :: max(1, image.shape[1] // 48)], 99.0))
+
+
+def _steepest(image: Image) -> float:
+    """Difference between neighbouring pixels that one pair in a thousand exceeds, from some forty rows and columns."""
+    rows = image[:: max(1, image.shape[0] // 36)].astype(np.float32)
+    columns = image[:, :: max(1, image.shape[1] // 48)].astype(np.float32)
+    return max(float(np.percentile(np.abs(np.diff(lines, axis=a)), 99.9)) for a, lines in ((1, rows), (0, columns)))
+
+
+def _cells(image: Image) -> Array:
+    """(12, 16) mean grey levels: what a blur leaves."""
+    cells = cv2.resize(image, (16, 12), interpolation=cv2.INTER_AREA).astype(float)
+    return cells if cells.ndim == 2 else cells.mean(axis=2)
 
 
 def finger_of(meter: FingerMeter, votes: Votes) -> NDArray[np.intp]:

@@ -25,9 +25,9 @@ class EdgeEvidence:
     and ``across`` (s, 2) that direction in the image.
 
     ``finger_share`` (f,): share of each finger's profiles that agree with the finger's own best place, NaN where none
-    was sampled; ``noise``: of a pixel, and ``brightest``: what only one pixel in
-    a hundred exceeds, parts of the full scale; ``reach_px``: how far from the measured pose edges were
-    looked for at first.
+    was sampled; ``reach_px``: how far from the measured pose edges were looked for at first.  Of the image, as parts of
+    the full scale: ``noise`` of a pixel; ``brightest``: what only one pixel in a hundred exceeds; ``steepest``: what
+    only one difference of neighbours in a thousand exceeds; ``cells`` (12, 16): the grey levels of its parts.
     """
 
     cam_T_grip: Array
@@ -44,6 +44,8 @@ class EdgeEvidence:
     finger_share: Array
     noise: float
     brightest: float
+    steepest: float
+    cells: Array
     reach_px: float
 
 
