@@ -114,6 +114,21 @@ def test_a_callback_may_close_its_client(publisher: Published, join: Callable[..
     assert list(client) == []
 
 
+def test_two_callbacks_that_close_do_not_wait_for_each_other(
+    publisher: Published, join: Callable[..., TransformClient]
+):
+    client, both, closed = join(), threading.Barrier(2), []
+
+    def close(_: Reading) -> None:
+        both.wait(WAIT_S)
+        client.close()
+        closed.append(threading.current_thread())
+
+    client.on_transform(close)
+    client.on_transform(close)
+    wait_until(lambda: publisher.transform(frame_record(1)) or len(closed) == 2, "both to have closed it")
+
+
 def test_a_callback_that_fails_ends_alone(
     publisher: Published, join: Callable[..., TransformClient], monkeypatch: pytest.MonkeyPatch
 ):

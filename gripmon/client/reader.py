@@ -141,10 +141,13 @@ class Client:
         return self._ask(CommandName.SNAPSHOT, "", timeout_s, None)
 
     def close(self) -> None:
-        """Leave the network; iterations and callbacks end."""
+        """Leave the network; iterations and callbacks end.
+
+        It waits for a callback that is at work, unless it is called in one.
+        """
         self._session.close()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
+        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
+            for thread in self._threads:
                 thread.join()
 
     def _subscribe(self) -> zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]:

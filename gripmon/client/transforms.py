@@ -115,11 +115,14 @@ class TransformClient:
         return self._inbox.heard.closed
 
     def close(self) -> None:
-        """Leave the network: iterations and callbacks end, nothing is usable.  Calling it twice does nothing more."""
+        """Leave the network: iterations and callbacks end, nothing is usable.  Calling it twice does nothing more.
+
+        It waits for a callback that is at work, unless it is called in one.
+        """
         self._inbox.close()
         self._link.close()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
+        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
+            for thread in self._threads:
                 thread.join()
 
     def judge(self, entry: Entry) -> Reading:
