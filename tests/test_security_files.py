@@ -223,3 +223,18 @@ def test_nothing_unpickles():
                 continue
             faults += [f"{path.relative_to(ROOT)}:{node.lineno}: {each}" for each in used]
     assert not faults
+
+
+@pytest.mark.parametrize("lost", ["ca-key.pem", "ca.pem", "arm1-key.pem", "arm1.pem"])
+def test_half_a_pair_of_key_and_certificate_is_said_in_one_line(
+    tmp_path: Path, lost: str, capsys: pytest.CaptureFixture[str]
+):
+    """The authority's key is kept elsewhere, or the disk was full after the first of two files."""
+    assert main(["certificates", "arm1", "--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    (tmp_path / lost).unlink()
+    left = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert main(["certificates", "arm1", "arm2", "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"certificates: {tmp_path / lost} is missing, but ")
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == left

@@ -29,7 +29,7 @@ class Authority:
         """Raises OSError for a folder that can't be written to, ValueError for files that are no authority."""
         self._folder = folder
         key_path, path = folder / "ca-key.pem", folder / "ca.pem"
-        self.is_new = not key_path.exists() and not path.exists()
+        self.is_new = _is_missing(path, key_path)
         if self.is_new:
             self._key = ec.generate_private_key(ec.SECP256R1())
             self._certificate = _signed(
@@ -49,11 +49,12 @@ class Authority:
 
     def issue(self, name: str, hosts: Sequence[str] = ()) -> bool:
         """``<name>.pem`` and ``<name>-key.pem`` (mode 0600) with the common name ``name``; False if they are there.
+        Raises ValueError if one of them is.
 
         With ``hosts``, names or addresses by which it is reached, it may also be used by a server.
         """
         key_path, path = self._folder / f"{name}-key.pem", self._folder / f"{name}.pem"
-        if path.exists() or key_path.exists():
+        if not _is_missing(path, key_path):
             return False
         key = ec.generate_private_key(ec.SECP256R1())
         builder = _builder(name, key, _DAYS, ca=False, hosts=hosts)
@@ -61,6 +62,15 @@ class Authority:
         _write(key_path, _private_pem(key), secret=True)
         _write(path, certificate.public_bytes(serialization.Encoding.PEM))
         return True
+
+
+def _is_missing(certificate: Path, key: Path) -> bool:
+    """Whether neither is there.  Raises ValueError if only one of them is."""
+    there = [path for path in (certificate, key) if path.exists()]
+    if len(there) == 1:
+        missing = key if there[0] == certificate else certificate
+        raise ValueError(f"{missing} is missing, but {there[0].name} is there; both, or neither for new ones")
+    return not there
 
 
 def _builder(
