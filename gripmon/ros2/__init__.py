@@ -7,7 +7,6 @@ imported at the first message.
 from __future__ import annotations
 
 from gripmon.ros2.decode import (
-    ENCODINGS,
     JointOpening,
     MessageError,
     decode_compressed_image,
@@ -23,7 +22,6 @@ from gripmon.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, Ros2Missing
 
 __all__ = [
     "COMPRESSED_IMAGE",
-    "ENCODINGS",
     "IMAGE",
     "JOINT_STATE",
     "HeardTopic",

@@ -14,10 +14,9 @@ import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
+from gripmon.pixels import ENCODINGS, unpacked
 from gripmon.records import Image
 from gripmon.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, typestore
 
@@ -31,23 +30,6 @@ MOST_JOINT_STATE_BYTES = 1 << 18
 _NS = 1_000_000_000
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 
-# encoding -> channels, type of one, and the colour conversion of OpenCV to BGR; None: none is needed
-_ENCODINGS: dict[str, tuple[int, str, str | None]] = {
-    "mono8": (1, "u1", None),
-    "mono16": (1, "u2", None),
-    "bgr8": (3, "u1", None),
-    "rgb8": (3, "u1", "COLOR_RGB2BGR"),
-    "bgra8": (4, "u1", "COLOR_BGRA2BGR"),
-    "rgba8": (4, "u1", "COLOR_RGBA2BGR"),
-    # Both name the first two pixels of the first two rows.
-    "bayer_rggb8": (1, "u1", "COLOR_BayerRGGB2BGR"),
-    "bayer_bggr8": (1, "u1", "COLOR_BayerBGGR2BGR"),
-    "bayer_gbrg8": (1, "u1", "COLOR_BayerGBRG2BGR"),
-    "bayer_grbg8": (1, "u1", "COLOR_BayerGRBG2BGR"),
-}
-ENCODINGS = tuple(_ENCODINGS)
-"""What :func:`decode_image` takes."""
-
 
 class MessageError(ValueError):
     """A message that can't be used: ``type_name`` and ``field`` say where, ``what`` is wrong there."""
@@ -60,17 +42,19 @@ class MessageError(ValueError):
 
 
 def decode_image(payload: bytes) -> tuple[int, Image]:
-    """``sensor_msgs/msg/Image`` -> stamp and image: H x W (``mono8``, ``mono16``) or H x W x 3, BGR (all others).
+    """``sensor_msgs/msg/Image`` -> stamp and image: H x W (one channel, and the brightness of ``yuv422``) or H x W x 3,
+    BGR (colours, Bayer patterns).
 
-    uint8, or uint16 for ``mono16``, in the machine's byte order; it may be a read-only view of the payload.
+    The encodings are :data:`gripmon.pixels.ENCODINGS`; in the machine's byte order; it may be a read-only view of the
+    payload.
     """
     message = _decoded(IMAGE, payload, MOST_IMAGE_BYTES)
-    if message.encoding not in _ENCODINGS:
+    pixels = ENCODINGS.get(message.encoding)
+    if pixels is None:
         raise MessageError(IMAGE, "encoding", f"{message.encoding[:40]!r}; give one of {', '.join(ENCODINGS)}")
-    channels, dtype, conversion = _ENCODINGS[message.encoding]
-    item_bytes = int(dtype[1])
+    item_bytes = pixels.item_bytes
     height, width, step = message.height, message.width, message.step
-    row_bytes = width * channels * item_bytes
+    row_bytes = width * pixels.channels * item_bytes
     if height == 0 or width == 0:
         raise MessageError(IMAGE, "height, width", f"{width} x {height} px; give an image with pixels")
     if step < row_bytes:
@@ -81,10 +65,9 @@ def decode_image(payload: bytes) -> tuple[int, Image]:
         raise MessageError(
             IMAGE, "data", f"{message.data.size} bytes; height {height} times step {step} are {height * step}"
         )
-    rows = message.data.view(f"{'>' if message.is_bigendian else '<'}{dtype}").reshape(height, step // item_bytes)
-    pixels = rows[:, : width * channels].reshape((height, width, channels) if channels > 1 else (height, width))
-    pixels = np.ascontiguousarray(pixels, dtype=f"={dtype}")
-    return _stamp_ns(IMAGE, message.header.stamp), pixels if conversion is None else _to_bgr(pixels, conversion)
+    order = ">" if message.is_bigendian else "<"
+    rows = message.data.view(f"{order}{pixels.dtype}").reshape(height, step // item_bytes)
+    return _stamp_ns(IMAGE, message.header.stamp), unpacked(rows, width, pixels)
 
 
 def decode_compressed_image(payload: bytes) -> tuple[int, str, bytes]:
@@ -160,10 +143,3 @@ def _stamp_ns(type_name: str, stamp: Any) -> int:
     if stamp.sec < 0 or stamp.nanosec >= _NS:
         raise MessageError(type_name, "header.stamp", f"{stamp.sec} s and {stamp.nanosec} ns is no time")
     return int(stamp.sec) * _NS + int(stamp.nanosec)
-
-
-def _to_bgr(pixels: NDArray[Any], conversion: str) -> Image:
-    import cv2
-
-    converted: Image = cv2.cvtColor(pixels, getattr(cv2, conversion))
-    return converted

@@ -5,11 +5,11 @@ from __future__ import annotations
 import functools
 import io
 import warnings
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gripmon.pixels import ENCODINGS, unpacked
 from gripmon.records import FrameNote, Image, MessageRefused, from_json
 
 if TYPE_CHECKING:
@@ -24,43 +24,6 @@ MOST_SCANS = 100
 
 class PayloadError(ValueError):
     """A payload that can't be used; the text is "what is wrong; what would be right", in one line."""
-
-
-class Pixels(NamedTuple):
-    """How a pixel lies in memory.  ``only`` is the one channel that is kept, ``conversion`` OpenCV's name of the way to
-    BGR; neither where nothing is to be done.
-    """
-
-    channels: int
-    dtype: str
-    conversion: str | None = None
-    only: int | None = None
-
-
-def _bayer() -> dict[str, Pixels]:
-    # Both ROS and OpenCV name the first two pixels of the first two rows here; OpenCV's short names don't.
-    patterns = ("rggb", "bggr", "gbrg", "grbg")
-    return {f"bayer_{p}{8 * n}": Pixels(1, f"u{n}", f"COLOR_Bayer{p.upper()}2BGR") for p in patterns for n in (1, 2)}
-
-
-ENCODINGS: dict[str, Pixels] = {
-    "mono8": Pixels(1, "u1"),
-    "mono16": Pixels(1, "u2"),
-    "8UC1": Pixels(1, "u1"),
-    "16UC1": Pixels(1, "u2"),
-    "32FC1": Pixels(1, "f4"),
-    "bgr8": Pixels(3, "u1"),
-    "bgr16": Pixels(3, "u2"),
-    "rgb8": Pixels(3, "u1", "COLOR_RGB2BGR"),
-    "rgb16": Pixels(3, "u2", "COLOR_RGB2BGR"),
-    "bgra8": Pixels(4, "u1", "COLOR_BGRA2BGR"),
-    "rgba8": Pixels(4, "u1", "COLOR_RGBA2BGR"),
-    # Brightness alone: it is all that is measured.
-    "yuv422_yuy2": Pixels(2, "u1", only=0),
-    "yuv422": Pixels(2, "u1", only=1),
-    **_bayer(),
-}
-"""Pixel formats of raw frames, named as in ROS 2; more than one byte: little endian."""
 
 
 def read_note(attachment: bytes | None) -> FrameNote:
@@ -92,7 +55,7 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
     pixels = ENCODINGS.get(note.encoding)
     if pixels is None:
         raise PayloadError(f"encoding {note.encoding!r}; one of {', '.join(ENCODINGS)}")
-    item = int(pixels.dtype[1])
+    item = pixels.item_bytes
     row = note.width * pixels.channels * item
     step = row if note.step is None else note.step
     if step < row or step % item:
@@ -100,23 +63,7 @@ def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> 
     if len(payload) != step * note.height:
         raise PayloadError(f"{len(payload)} bytes; {step * note.height} ({note.height} rows of {step})")
     rows = np.frombuffer(payload, f"<{pixels.dtype}").reshape(note.height, step // item)
-    image = rows[:, : note.width * pixels.channels]
-    if pixels.channels > 1:
-        image = image.reshape(note.height, note.width, pixels.channels)
-    return _converted(image, pixels)
-
-
-def _converted(image: NDArray[Any], pixels: Pixels) -> Image:
-    if pixels.only is not None:
-        image = image[:, :, pixels.only]
-    # In the machine's own byte order, of which OpenCV knows no other.
-    image = np.ascontiguousarray(image, dtype=f"={pixels.dtype}")
-    if pixels.conversion is None:
-        return image
-    import cv2
-
-    converted: Image = cv2.cvtColor(image, getattr(cv2, pixels.conversion))
-    return converted
+    return unpacked(rows, note.width, pixels)
 
 
 def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
