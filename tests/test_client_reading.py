@@ -15,7 +15,7 @@ from loopback import frame_record
 from scipy.spatial.transform import Rotation
 
 from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
-from gripmon.client.inbox import Inbox
+from gripmon.client.inbox import MOST_PRESENT, Inbox
 from gripmon.client.judging import judge
 from gripmon.records import FrameRecord, Transform, Verdict, to_json
 
@@ -120,6 +120,16 @@ def test_two_monitors_are_told_apart_by_tokens_or_messages():
         assert reading(inbox).why is (None if second == "appeared" else Unusable.GONE)
         inbox.take(WRIST, payload(), 100.0)
         assert reading(inbox).usable
+
+
+def test_names_that_a_stranger_makes_up_fill_neither_memory_nor_log(caplog: pytest.LogCaptureFixture):
+    inbox, message = heard(), payload()
+    for number in range(100):
+        inbox.take(MonitorName("arm", f"camera-{number}"), message, 100.0)
+        inbox.appeared(MonitorName("arm", f"other-{number}"))
+    assert len(inbox.heard.present) == MOST_PRESENT and WRIST in inbox.heard.present
+    assert reading(inbox).why is Unusable.SEVERAL
+    assert len(caplog.messages) == 1 and caplog.messages[0].startswith("more than one monitor is there: ")
 
 
 def test_same_revision():

@@ -13,6 +13,9 @@ from gripmon.records import FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
 
+MOST_PRESENT = 16
+"""Of more monitors than this the names are not kept: two are too many already, and a stranger may make up any number."""
+
 
 class Entry(NamedTuple):
     """A record, who sent it, and when it arrived by the monotonic clock."""
@@ -60,14 +63,14 @@ class Inbox:
             self._refuse(monitor, str(error))
             return
         with self._lock:
-            self._set(entry=entry, present=self.heard.present | {monitor}, cut=False, unreadable="")
+            self._set(entry=entry, present=self._present_with(monitor), cut=False, unreadable="")
             for waiter in self._waiters:
                 waiter.put(entry)
 
     def appeared(self, monitor: MonitorName) -> None:
         """Its liveliness token is there."""
         with self._lock:
-            self._set(present=self.heard.present | {monitor})
+            self._set(present=self._present_with(monitor))
             self._wake()
 
     def vanished(self, monitor: MonitorName) -> None:
@@ -96,10 +99,14 @@ class Inbox:
                 _log.warning("%s: a transform message can't be read: %s", monitor, text)
                 self._set(unreadable=text)
 
+    def _present_with(self, monitor: MonitorName) -> frozenset[MonitorName]:
+        present = self.heard.present
+        return present if len(present) >= MOST_PRESENT else present | {monitor}
+
     def _set(self, **changes: object) -> None:
         before = self.heard
         self.heard = before._replace(**changes)  # type: ignore[arg-type]
-        if len(self.heard.present) > max(1, len(before.present)):
+        if len(self.heard.present) > 1 >= len(before.present):
             _log.error("%s", several(self.heard.present))
 
     def _wake(self) -> None:
