@@ -14,7 +14,7 @@ from gripmon.records import FrameRecord, MessageRefused
 _log = logging.getLogger(__name__)
 
 MOST_PRESENT = 16
-"""Of more monitors than this the names are not kept: two are too many already, and a stranger may make up any number."""
+"""Names of more monitors are not kept: two are too many already, and a stranger may make up any number."""
 
 
 class Entry(NamedTuple):
