@@ -32,8 +32,10 @@ REQUIRED = {0.1: 3, 0.05: 10}
 
 STEPS_MM = (0.02, 0.05, 0.1, 0.5, 4.5)
 CREEPS_MM_PER_MIN = (0.01, 0.1)
-STREAMS = 256
-WARM_UP = 4096
+STREAMS = 128
+WARM_UP = 40_960
+"""Eleven minutes: the test has learnt its limits by then, which takes five."""
+
 CHANGE_STREAMS, CHANGE_FRAMES = 64, 36_864
 """Of the change of regime: before it and after it, ten minutes each."""
 
