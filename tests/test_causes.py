@@ -189,6 +189,9 @@ def test_nothing_seen_at_all_is_a_blocked_view_or_a_noisy_image():
     cause, _, text = told(shown, shown.judge(), hidden=everything, brightest=0.05)
     assert cause is Cause.IMAGE_BAD
     assert "dark" in text
+    cause, _, text = told(shown, shown.judge(), hidden=everything, grey=0.98)
+    assert cause is Cause.UNKNOWN
+    assert "too much light" in text
 
 
 @pytest.mark.parametrize(

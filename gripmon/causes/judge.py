@@ -35,7 +35,7 @@ BLIND = {Cause.VIEW_BLOCKED: 0.93, Cause.UNKNOWN: 0.05, Cause.CAMERA_MOUNT: 0.02
 """Where no finger is seen at all, though the search has looked for them, in an image with the usual noise."""
 BAD_IMAGE = {Cause.IMAGE_BAD: 0.93, Cause.UNKNOWN: 0.05, Cause.VIEW_BLOCKED: 0.02}
 """And in one that is noisier than that (so many times, at least by a part of the full scale), or dark."""
-MUCH_NOISE, LEAST_NOISE, DARK = 4.0, 0.02, 0.08
+MUCH_NOISE, LEAST_NOISE, DARK, BRIGHT = 4.0, 0.02, 0.08, 0.95
 
 FLATTENED = 0.5
 STEADY, ALIKE, MOSTLY = 0.02, 0.05, 0.7
@@ -131,6 +131,9 @@ class CauseJudge:
         if blind and baseline is not None and _unsharp(pooled, baseline):
             text = "no finger is seen, and the image is as it was, but nothing in it as sharp: out of focus, or shaken"
             return self._told({Cause.LENS: 0.7, Cause.UNKNOWN: 0.3}, text)
+        if blind and pooled.cells.min() > BRIGHT:
+            text = f"no part of the image is below {100.0 * BRIGHT:.0f} % of the full scale: too much light, or hidden"
+            return self._told({Cause.IMAGE_BAD: 0.7, Cause.UNKNOWN: 0.3}, text)
         if blind:
             return self._told(BLIND, "no finger is seen where it should be, nor near it; hidden, or far out of place")
         if scatter_px > SCATTERED_PX:

@@ -115,7 +115,10 @@ class Link:
                 return False
             declare, self._declare = self._declare, []
             for each in declare:
-                each(session)
+                try:
+                    each(session)
+                except Exception as error:  # noqa: BLE001  one that can't be declared is no reason to drop the others
+                    _log.error("something could not be declared on the Zenoh session: %s", error)
             self._session, self._fault = session, ""
             self._next_look_s = time.monotonic() + _LOOK_EVERY_S
         return True
