@@ -184,7 +184,15 @@ def test_the_client_finds_the_camera_and_brings_the_answer(publisher: Published,
 def test_the_client_says_who_is_missing(endpoint: str):
     with (
         Client("arm", "wrist", connect=[endpoint]) as client,
-        pytest.raises(NotCarriedOut, match="no monitor arm/wrist is on the network"),
+        pytest.raises(NotCarriedOut, match=r"no monitor arm/wrist is seen; there is no connection to tcp/127"),
+    ):
+        client.send(CommandName.UNDO, timeout_s=0.2)
+
+
+def test_the_client_says_who_is_there_instead(publisher: Published, endpoint: str):
+    with (
+        Client("leg", connect=[endpoint]) as client,
+        pytest.raises(NotCarriedOut, match=r"no monitor leg/\* is seen; there are arm/wrist"),
     ):
         client.send(CommandName.UNDO, timeout_s=0.2)
 

@@ -241,6 +241,17 @@ def test_without_a_feed_the_frames_opening_stays():
     assert bench.network.transforms[0].jaw_opening_m == 0.03
 
 
+def test_estimates_of_an_earlier_run_are_kept(tmp_path: Path):
+    path = tmp_path / "estimates.jsonl"
+    for seq in (1, 2, 3):
+        estimates = EstimatesFile(path)
+        estimates.write(frame_record(seq))
+        estimates.close()
+    names = ("estimates-1.jsonl", "estimates-2.jsonl", "estimates.jsonl")
+    assert [json.loads((tmp_path / name).read_text())["seq"] for name in names] == [1, 2, 3]
+    assert len(list(tmp_path.iterdir())) == 3
+
+
 def test_estimates_are_on_disk_after_a_flush(tmp_path: Path):
     path = tmp_path / "estimates.jsonl"
     path.write_text("old\n")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from typing import TYPE_CHECKING
 
@@ -31,12 +32,24 @@ class Network:
 def open_network(config: Config) -> Network:
     """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
     from gripmon.daemon import Reports
-    from gripmon.publish import NullPublisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+    from gripmon.publish import NullPublisher
 
     settings, link = config.settings, _open_link(config)
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if link is None:
         return Network(None, NullPublisher(), jaw, None, Reports())
+    with contextlib.ExitStack() as failed:
+        failed.callback(link.close)  # a process must not end while its session is being opened
+        network = _on_link(config, link, jaw)
+        failed.pop_all()
+    return network
+
+
+def _on_link(config: Config, link: Link, jaw: JawFeed | None) -> Network:
+    from gripmon.daemon import Reports
+    from gripmon.publish import Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+
+    settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
         jaw = _network_jaw(config, link, publisher.keys)
@@ -86,7 +99,6 @@ def _ros2_node(config: Config, link: Link) -> Publisher | None:
     try:
         return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
     except Ros2Missing as error:
-        link.close()
         raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None
 
 
@@ -123,7 +135,6 @@ def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
     try:
         typestore()
     except Ros2Missing as error:
-        link.close()
         raise common.CommandFailedError(f"{config.path}: jaw.source: {error}", common.EXIT_USAGE) from None
     key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
     return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)

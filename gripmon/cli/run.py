@@ -52,7 +52,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="put the recording and estimates.jsonl (one JSON line a frame) here; made if it is missing",
+        help="put the recording and estimates.jsonl (one JSON line a frame) here; made if it is missing, and what "
+        "is there is kept (estimates-1.jsonl …)",
     )
     parser.add_argument(
         "--fresh-state",

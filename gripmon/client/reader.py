@@ -68,6 +68,7 @@ class Client:
         settings = reader_settings(connect, zenoh_config_file)
         self._session = open_session(zenoh_config(settings), settings)
         self._depth = depth
+        self._where = " or ".join(connect) if zenoh_config_file is None else f"what {zenoh_config_file} names"
         self._heard: MonitorName | None = None
         self._newest: FrameRecord | None = None
         self._samples = self._subscribe()
@@ -194,7 +195,7 @@ class Client:
         end_s = time.monotonic() + timeout_s
         while not (alive := self.alive()):
             if time.monotonic() >= end_s:
-                raise NotCarriedOut(f"no monitor {self.keys.robot}/{self.keys.camera} is on the network")
+                raise NotCarriedOut(f"no monitor {self.keys.robot}/{self.keys.camera} is seen; {self._in_its_place()}")
             time.sleep(0.02)
         if len(alive) > 1:
             names = ", ".join(map(str, alive))
@@ -202,6 +203,14 @@ class Client:
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {names}; name the camera"
             )
         return alive[0]
+
+    def _in_its_place(self) -> str:
+        """Who is there instead of the monitor that is meant."""
+        if not any(True for _ in self._session.info.links()):
+            return f"there is no connection to {self._where}"
+        replies = self._session.liveliness().get(Keys("*", "*")["alive"], timeout=1.0)
+        names = sorted({str(monitor_name(reply.ok.key_expr)) for reply in replies if reply.ok is not None})
+        return f"there are {', '.join(names)}" if names else f"none at all at {self._where}"
 
     def _check_name(self, key: zenoh.KeyExpr) -> None:
         name = monitor_name(key)

@@ -14,7 +14,8 @@ _BUFFER_BYTES = 1 << 16
 
 
 class EstimatesFile:
-    """Begins a new file, also where an old one was.  Without a path it takes records and writes none.
+    """Begins a new file; one of before is kept beside it (``estimates-1.jsonl`` and so on, the newest has the highest
+    number).  Without a path it takes records and writes none.
 
     A disk that fails later must not stop the monitor: ``failure`` then says what is wrong, and writing ends.
     """
@@ -23,6 +24,8 @@ class EstimatesFile:
         """Raises OSError if the file can't be opened."""
         self.failure: str | None = None
         self._path = path
+        if path is not None:
+            _set_aside(path)
         self._file: IO[bytes] | None = None if path is None else path.open("wb", buffering=_BUFFER_BYTES)
 
     def write(self, record: FrameRecord) -> None:
@@ -55,3 +58,14 @@ class EstimatesFile:
         if file is not None:
             with contextlib.suppress(OSError):  # the same fault once more; said above
                 file.close()
+
+
+def _set_aside(path: Path) -> None:
+    """Keep what an earlier run wrote: what came before a crash is what people look for."""
+    if not path.is_file() or path.stat().st_size == 0:
+        return
+    number = 1
+    while (kept := path.with_name(f"{path.stem}-{number}{path.suffix}")).exists():
+        number += 1
+    path.rename(kept)
+    _log.info("%s is kept as %s", path, kept.name)
