@@ -30,7 +30,7 @@ trusted, and publishes it over Zenoh."""
 
 _EPILOG = """\
 first steps:
-  gripmon demo                                   everything at work on a simulated camera, 30 s
+  gripmon demo                                   everything at work on a simulated camera, 20 s
   gripmon check configs/live_camera.yaml         is my configuration sound?
   gripmon run configs/live_camera.yaml           the daemon
 
