@@ -159,7 +159,7 @@ def test_bad_requests_for_certificates(
         ("{ mode: 'router', lisen: {} }", "unknown field `lisen`"),
         ("{ mode: 'peer' }", "mode: peer doesn't route; router"),
         ("{}", 'listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]'),
-        ("{ listen: {endpoints: ['tls/127.0.0.1:1']} }", "can't route: "),
+        ("{ listen: {endpoints: ['tls/127.0.0.1:1']} }", "needs a certificate; "),
         ("{ listen: {endpoints: ['tcp/256.0.0.1:1']} }", "can't route: "),
         ("{ listen: {endpoints: ['xyz']} }", ""),
     ],

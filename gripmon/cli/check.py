@@ -29,11 +29,13 @@ _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
   gripmon check configs/folder.yaml --json | python3 -m json.tool
 
-exit codes: 0 sound; 2 a fault in the configuration (one line says file, key, what is wrong, what
-would be right); 3 the configuration is sound, but its camera can't be reached now"""
+exit codes: 0 sound; 2 a fault in the configuration, in a file of Zenoh's that it names, or a package
+that it needs is missing (one line says file, key, what is wrong, what would be right); 3 the
+configuration is sound, but its camera can't be reached now"""
 
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
 _CONNECT_S = 2.0
+_DOES = {"listen": "listens on", "connect": "connects to"}
 
 
 def add_parser(commands: Any) -> None:
@@ -48,7 +50,7 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon check``."""
     config = common.load(arguments.config)
-    report = {**expectation(config), "source": _source_report(config)}
+    report = {**expectation(config), "zenoh": _zenoh_values(config), "source": _source_report(config)}
     print(json.dumps(report, indent=2) if arguments.json else _as_text(report))
     return common.EXIT_FAILED if report["source"]["reachable"] is False else common.EXIT_DONE
 
@@ -80,6 +82,19 @@ def expectation(config: Config) -> dict[str, Any]:
         "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         "recording": settings.recording.directory if settings.recording.enabled else None,
     }
+
+
+def _zenoh_values(config: Config) -> dict[str, Any] | None:
+    """How the monitor would join the network; what can't be ends the command."""
+    from gripmon.config import ConfigError, check_network
+
+    try:
+        found = check_network(config)
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    if found is None:
+        return None
+    return {**found._asdict(), "file": None if found.file is None else str(found.file)}
 
 
 def _camera_values(config: Config) -> dict[str, Any]:
@@ -230,7 +245,7 @@ def _as_text(report: dict[str, Any]) -> str:
     }
     outside = {
         "source": f"{source['kind']}: {'NOT REACHABLE: ' if source['reachable'] is False else ''}{source['detail']}",
-        "Zenoh": report["keys"] or "off",
+        "Zenoh": _zenoh_line(report["keys"], report["zenoh"]),
         "recording": report["recording"] or "off",
     }
     lines = [f"{report['config']}: sound"]
@@ -239,6 +254,14 @@ def _as_text(report: dict[str, Any]) -> str:
     lines += expected.accuracy_lines(report["accuracy"])
     lines += [f"{name:<10} {text}" for name, text in outside.items()]
     return "\n".join(lines)
+
+
+def _zenoh_line(keys: str | None, session: dict[str, Any] | None) -> str:
+    if session is None:
+        return "off"
+    parts = [f"{keys}, {session['mode']}"]
+    parts += [f"{does} {', '.join(session[key])}" for key, does in _DOES.items() if session[key]]
+    return ", ".join(parts) + (f" (by {session['file']})" if session["file"] else "")
 
 
 def _camera_line(camera: dict[str, Any]) -> str:

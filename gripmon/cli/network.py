@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import logging
 from typing import TYPE_CHECKING
 
 from gripmon.cli import common
@@ -14,6 +15,9 @@ if TYPE_CHECKING:
     from gripmon.publish import Publisher, ZenohCommands
     from gripmon.sources import Source
     from gripmon.wire import Keys, Link
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,9 +35,14 @@ class Network:
 
 def open_network(config: Config) -> Network:
     """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
+    from gripmon.config import ConfigError, check_network
     from gripmon.daemon import Reports
     from gripmon.publish import NullPublisher
 
+    try:
+        check_network(config)
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
     settings, link = config.settings, _open_link(config)
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if link is None:
@@ -83,23 +92,23 @@ def _open_link(config: Config) -> Link | None:
 
     if not config.settings.publish.enabled:
         return None
+    settings = network_of(config.settings.publish, config.settings.ros2)
+    if settings != config.settings.publish:
+        _log.info("joining the ROS 2 router at %s as client (ros2.router)", ", ".join(settings.connect))
     try:
-        return Link(network_of(config.settings.publish, config.settings.ros2), config.directory)
+        return Link(settings, config.directory)
     except PublishError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
 
 
 def _ros2_node(config: Config, link: Link) -> Publisher | None:
     """The monitor as a ROS 2 node, where the configuration wants one."""
-    from gripmon.ros2 import Ros2Missing, Ros2Publisher, layout_of
+    from gripmon.ros2 import Ros2Publisher, layout_of
 
     settings = config.settings
     if not settings.ros2.enabled:
         return None
-    try:
-        return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
-    except Ros2Missing as error:
-        raise common.CommandFailedError(f"{config.path}: ros2.enabled: {error}", common.EXIT_USAGE) from None
+    return Ros2Publisher(link, settings.ros2, layout_of(settings.ros2, settings.robot, settings.camera_name))
 
 
 def _show_listeners(config: Config, link: Link) -> None:
@@ -124,18 +133,13 @@ def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
     """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
     from gripmon.publish import ZenohJaw
     from gripmon.publish.jaw import opening_of_joints
-    from gripmon.ros2 import JOINT_STATE, Ros2Missing, subscription_key
-    from gripmon.ros2.types import typestore
+    from gripmon.ros2 import JOINT_STATE, subscription_key
 
     jaw = config.settings.jaw
     travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
     if jaw.source == "zenoh":
         return ZenohJaw(link, keys["jaw"], travel_m=travel_m)
     assert jaw.topic is not None and jaw.opening is not None, "checked with the configuration"
-    try:
-        typestore()
-    except Ros2Missing as error:
-        raise common.CommandFailedError(f"{config.path}: jaw.source: {error}", common.EXIT_USAGE) from None
     key = subscription_key(jaw.domain_id, jaw.topic, JOINT_STATE)
     return ZenohJaw(link, key, opening_of_joints(jaw.opening), travel_m=travel_m)
 

@@ -15,6 +15,7 @@ from gripmon.camera import Camera, make_camera
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
+from gripmon.config.session import joined_or_fault
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
@@ -26,11 +27,12 @@ from gripmon.records import Array, ReferenceRecord, to_json
 from gripmon.ros2 import fault_of as ros2_fault
 from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.statefile import AUTO, Owner, calibration_of, default_path
+from gripmon.wire import Joining
 
 if TYPE_CHECKING:
     from gripmon.simulator import Scenario
 
-__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "load_config", "load_scenario"]
+__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "check_network", "load_config", "load_scenario"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,6 +130,18 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     if fault is not None:
         raise _error(path, fault)
     return replace(config, taught=_taught(config)) if with_taught else config
+
+
+def check_network(config: Config) -> Joining | None:
+    """How the network would be joined; None if nothing is published.
+
+    It finds what only matters to those who join it: files of Zenoh's, endpoints, packages for ROS 2.  Raises
+    :class:`ConfigError`.
+    """
+    found = joined_or_fault(config.settings, config.camera, config.directory)
+    if isinstance(found, Fault):
+        raise _error(config.path, found)
+    return found
 
 
 def builtin_config(name: str) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -12,8 +11,6 @@ from msgspec import Meta
 from gripmon.ros2.names import MOST_DOMAIN_ID, NodeName, RosNameError, as_token
 from gripmon.wire import DEFAULT_ENDPOINT, PublishSettings
 from gripmon.wire.settings import Endpoint
-
-_log = logging.getLogger(__name__)
 
 Frame = Annotated[str, Meta(pattern=r"^[^/\s]\S*$", description="a frame of tf: no blank, no / in front")]
 
@@ -144,7 +141,6 @@ def network_of(publish: PublishSettings, ros2: Ros2Settings) -> PublishSettings:
     said = any(getattr(publish, key) != getattr(defaults, key) for key in ("mode", "listen", "connect", "zenoh_config"))
     if not ros2.enabled or ros2.router is None or said:
         return publish
-    _log.info("joining the ROS 2 router at %s as client (ros2.router)", ros2.router)
     return msgspec.structs.replace(publish, mode="client", connect=(ros2.router,))
 
 

@@ -7,11 +7,12 @@ from __future__ import annotations
 from gripmon.wire.files import ZenohFileError
 from gripmon.wire.link import Link
 from gripmon.wire.router import Router
-from gripmon.wire.session import open_session, zenoh_config
+from gripmon.wire.session import Joining, joining, open_session, zenoh_config
 from gripmon.wire.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings, check_name
 
 __all__ = [
     "DEFAULT_ENDPOINT",
+    "Joining",
     "Keys",
     "Link",
     "PublishError",
@@ -19,6 +20,7 @@ __all__ = [
     "Router",
     "ZenohFileError",
     "check_name",
+    "joining",
     "open_session",
     "zenoh_config",
 ]

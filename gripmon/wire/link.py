@@ -10,8 +10,9 @@ from pathlib import Path
 
 import zenoh
 
+from gripmon.wire.endpoints import endpoints
 from gripmon.wire.files import in_short, said
-from gripmon.wire.reach import connect_endpoints, missing
+from gripmon.wire.reach import missing
 from gripmon.wire.session import open_session, zenoh_config
 from gripmon.wire.settings import PublishSettings
 
@@ -44,7 +45,7 @@ class Link:
         config = zenoh_config(settings, relative_to)
         self._opening_s = 1e-3 * float(config.get_json("transport/unicast/open_timeout"))
         self._is_client = said(config, "mode") == "client"
-        self._endpoints = connect_endpoints(config)
+        self._endpoints = endpoints(config, "connect")
         if self._is_client:
             self._fault = "no Zenoh session yet"
             self._opener = threading.Thread(

@@ -7,20 +7,9 @@ from collections.abc import Iterable
 
 import zenoh
 
-from gripmon.wire.files import said
-
 _LOCATOR = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
 _PORT = re.compile(r"(?P<host>.*):(?P<port>\d+)")
 _NUMERIC = re.compile(r"[\d.]+|\[[0-9a-fA-F:.%]+\]")
-
-
-def connect_endpoints(config: zenoh.Config) -> tuple[str, ...]:
-    """The endpoints that a session of this configuration connects to."""
-    listed = said(config, "connect/endpoints")
-    if isinstance(listed, dict):  # a list for each mode
-        listed = listed.get(said(config, "mode") or "peer")
-    # Zenoh allows an object in place of a text: {"endpoints": [...], "policy": ...}; what it means, only Zenoh knows.
-    return tuple(each for each in listed if isinstance(each, str)) if isinstance(listed, list) else ()
 
 
 def missing(session: zenoh.Session, endpoints: Iterable[str], *, one_is_enough: bool) -> str:

@@ -8,8 +8,9 @@ from typing import Self
 
 import zenoh
 
+from gripmon.wire.endpoints import endpoints, endpoints_fault
 from gripmon.wire.files import ZenohFileError, in_short, load_file, said
-from gripmon.wire.reach import connect_endpoints, missing
+from gripmon.wire.reach import missing
 
 
 class Router:
@@ -23,7 +24,9 @@ class Router:
         self.listens_on = _endpoints(said(config, "listen/endpoints"))
         if not self.listens_on:
             raise ZenohFileError(f'{path}: listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]')
-        self._connects_to = connect_endpoints(config)
+        if fault := endpoints_fault(config):
+            raise ZenohFileError(f"{path}: {fault[0]}.endpoints: {fault[1]}")
+        self._connects_to = endpoints(config, "connect")
         config.insert_json5("listen/exit_on_failure", "true")
         try:
             self._session = zenoh.open(config)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import zenoh
 
-from gripmon.wire.files import ZenohFileError, in_short, load_file
+from gripmon.wire.endpoints import endpoints, endpoints_fault
+from gripmon.wire.files import ZenohFileError, in_short, load_file, said
 from gripmon.wire.settings import PublishError, PublishSettings
 
 
@@ -23,10 +25,14 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         for key in ("mode", "listen", "connect", "multicast_scouting"):
             if getattr(settings, key) != getattr(defaults, key):
                 raise PublishError(f"publish.{key}: has no effect beside publish.zenoh_config; say it in that file")
+        path = relative_to / settings.zenoh_config
         try:
-            return load_file(relative_to / settings.zenoh_config)
+            config = load_file(path)
         except ZenohFileError as error:
             raise PublishError(f"publish.zenoh_config: {error}") from error
+        if fault := endpoints_fault(config):
+            raise PublishError(f"publish.zenoh_config: {path}: {fault[0]}/endpoints: {fault[1]}")
+        return config
     if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
         raise PublishError("publish.connect: a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
     config = zenoh.Config()
@@ -58,7 +64,25 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
             config.insert_json5(key, msgspec.json.encode(value).decode())
         except zenoh.ZError as error:
             raise PublishError(f"publish.{key.split('/')[0]}: {in_short(error)}") from error
+    if fault := endpoints_fault(config):
+        raise PublishError(f"publish.{fault[0]}: {fault[1]}")
     return config
+
+
+class Joining(NamedTuple):
+    """How a session would join the network: its mode, its endpoints, and the file of Zenoh's that says so, if any."""
+
+    mode: str
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    file: Path | None
+
+
+def joining(settings: PublishSettings, relative_to: Path = Path()) -> Joining:
+    """What :func:`zenoh_config` comes to, without a session.  Raises :class:`PublishError`."""
+    config = zenoh_config(settings, relative_to)
+    file = None if settings.zenoh_config is None else relative_to / settings.zenoh_config
+    return Joining(str(said(config, "mode")), endpoints(config, "listen"), endpoints(config, "connect"), file)
 
 
 def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:

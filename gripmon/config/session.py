@@ -1,0 +1,49 @@
+"""What a configuration needs beside itself to join the network: files of Zenoh's, possible endpoints, packages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gripmon.camera import Camera
+from gripmon.config.settings import Settings
+from gripmon.config.typed import Fault
+from gripmon.ros2 import Ros2Missing, network_of
+from gripmon.ros2.types import typestore
+from gripmon.sources import NetworkSettings, SourceError
+from gripmon.sources.network import PayloadDecoder
+from gripmon.wire import Joining, PublishError, joining
+
+
+def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Joining | Fault | None:
+    """How the network would be joined, or why it can't be; None if it won't.  Paths count from ``directory``."""
+    if not settings.publish.enabled:
+        return None
+    try:
+        found = joining(network_of(settings.publish, settings.ros2), directory)
+    except PublishError as error:
+        return _fault(str(error))
+    return _package_fault(settings, camera) or found
+
+
+def _package_fault(settings: Settings, camera: Camera) -> Fault | None:
+    """A package that is missing, at the key that asks for it."""
+    for key, wanted in (
+        ("jaw.source", settings.jaw.source == "ros2_joint_state"),
+        ("ros2.enabled", settings.ros2.enabled),
+    ):
+        try:
+            _ = wanted and typestore()
+        except Ros2Missing as error:
+            return _fault(f"{key}: {error}")
+    if isinstance(settings.source, NetworkSettings):
+        try:
+            PayloadDecoder(settings.source.format, (camera.width_px, camera.height_px))
+        except SourceError as error:
+            return _fault(f"source.{error}")
+    return None
+
+
+def _fault(text: str) -> Fault:
+    key, _, rest = text.partition(": ")
+    wrong, _, right = rest.partition("; ")
+    return Fault(key, wrong, right)

@@ -1,0 +1,126 @@
+"""``gripmon check`` refuses what ``gripmon run`` would refuse to join the network with, and in the same words."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gripmon.cli import main
+from gripmon.config import builtin_config
+from gripmon.ros2.types import typestore
+from gripmon.wire.endpoints import endpoint_fault
+
+TLS_FILE = '{listen: {endpoints: ["tls/127.0.0.1:7449"]}, transport: {link: {tls: {listen_certificate: "gone.pem"}}}}'
+ROS_JAW = {"source": "ros2_joint_state", "topic": "/joint_states", "opening": {"joints": ["finger"]}}
+
+
+def written(folder: Path, **sections: object) -> str:
+    """The demo's configuration with other sections, in a file."""
+    settings = yaml.safe_load(builtin_config("demo.yaml").read_text())
+    gripper = builtin_config("demo.yaml").parent / settings["gripper"]
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(settings | {"gripper": str(gripper)} | sections))
+    return str(path)
+
+
+def refused(path: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line of check, which is that of run, too."""
+    lines = []
+    for command in (["check", path], ["run", path, "--duration", "1"]):
+        assert main(command) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1
+        lines.append(err)
+    assert lines[0] == lines[1]
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("publish", "said"),
+    [
+        ({"zenoh_config": "nothing.json5"}, "publish.zenoh_config: no file "),
+        ({"zenoh_config": "tls.json5"}, "gone.pem"),
+        ({"zenoh_config": "port.json5"}, "port.json5: connect/endpoints: tcp/127.0.0.1:70000: 70000 can't be a port"),
+        ({"listen": ["tcp/127.0.0.1:99999"]}, "publish.listen: tcp/127.0.0.1:99999: 99999 can't be a port; a whole"),
+        ({"connect": ["tcp/10.0.0.5"]}, "publish.connect: tcp/10.0.0.5 has no port; host and port, e.g. tcp/127"),
+        ({"listen": ["tls/127.0.0.1:7447"]}, "publish.listen: tls/127.0.0.1:7447 needs a certificate; "),
+        ({"mode": "client"}, "publish.connect: a client needs a router; "),
+    ],
+)
+def test_a_session_that_cannot_be_opened(
+    publish: dict[str, object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "tls.json5").write_text(TLS_FILE)
+    (tmp_path / "port.json5").write_text('{connect: {endpoints: ["tcp/127.0.0.1:70000"]}}')
+    assert said in refused(written(tmp_path, publish=publish), capsys)
+
+
+@pytest.mark.parametrize("package", ["rosbags", "xxhash"])
+@pytest.mark.parametrize(
+    ("sections", "key"),
+    [
+        ({"source": {"kind": "zenoh", "topic": "/image", "format": "ros2_image"}}, "source.format"),
+        ({"jaw": ROS_JAW}, "jaw.source"),
+        ({"ros2": {"enabled": True}}, "ros2.enabled"),
+    ],
+)
+def test_packages_that_are_missing(
+    sections: dict[str, object],
+    key: str,
+    package: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+):
+    for name in [package, *(each for each in sys.modules if each.startswith(f"{package}."))]:
+        monkeypatch.setitem(sys.modules, name, None)  # as Python notes a module that can't be had
+    typestore.cache_clear()
+    jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}
+    line = refused(written(tmp_path, **sections, **jaw), capsys)
+    assert f"config.yaml: {key}: " in line
+    assert "; pip install 'gripmon[ros2]'" in line
+    typestore.cache_clear()
+
+
+def test_how_the_network_would_be_joined_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    def said(publish: dict[str, object]) -> str:
+        path = written(tmp_path, publish=publish)
+        assert main(["check", path]) == 0
+        return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Zenoh"))
+
+    assert said({}).endswith("gripmon/demo/wrist/, peer, listens on tcp/127.0.0.1:7447")
+    assert said({"mode": "client", "connect": ["tcp/10.0.0.5:7447"]}).endswith("client, connects to tcp/10.0.0.5:7447")
+    (tmp_path / "quiet.json5").write_text('{mode: "peer", connect: {endpoints: ["tcp/10.0.0.6:7447"]}}')
+    assert said({"zenoh_config": "quiet.json5"}).endswith(
+        f"peer, connects to tcp/10.0.0.6:7447 (by {tmp_path / 'quiet.json5'})"
+    )
+    assert said({"enabled": False}).split() == ["Zenoh", "off"]
+    assert main(["check", written(tmp_path), "--json"]) == 0
+    zenoh = {"file": None, "mode": "peer", "listen": ["tcp/127.0.0.1:7447"], "connect": []}
+    assert json.loads(capsys.readouterr().out)["zenoh"] == zenoh
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "wrong"),
+    [
+        ("tcp/127.0.0.1:7447", ""),
+        ("tcp/[::1]:7447#iface=lo", ""),
+        ("udp/robot.local:65535?rel=0", ""),
+        ("serial//dev/ttyS0#baudrate=9600", ""),
+        ("unixsock-stream//tmp/a", ""),
+        ("tcp/[::1]", "has no port"),
+        ("tcp/:7447", "has no host"),
+        ("ws/a:x", "x can't be a port"),
+        ("tcp/a:", "nothing can't be a port"),
+        ("tcp/a:0", "0 can't be a port"),
+        ("tcp/a:123456789012", "can't be a port"),
+    ],
+)
+def test_endpoints(endpoint: str, wrong: str):
+    fault = endpoint_fault(endpoint)
+    assert wrong in fault if wrong else not fault
+    assert not endpoint_fault("tcp/127.0.0.1:0", listens=True), "any port that is free"
