@@ -191,7 +191,8 @@ def _check_pinhole(settings: PinholeSettings) -> None:
             )
     if not 1.0 / _MAX_ASPECT <= settings.fy_px / settings.fx_px <= _MAX_ASPECT:
         raise ValueError(
-            f"fy_px: {settings.fy_px:g} px against fx_px {settings.fx_px:g} px; right would be nearly the same value"
+            f"fx_px and fy_px: {settings.fx_px:g} px and {settings.fy_px:g} px differ too much; right would be nearly "
+            "the same value"
         )
     if 0.0 < settings.cx_px < 1.0 and 0.0 < settings.cy_px < 1.0:
         raise ValueError(

@@ -174,6 +174,31 @@ FAULTS = [
     ("^reference:", "\treference:", "line 13", "not YAML"),
     ("^  cam_T_grip:", "  position_sigma_m: 5\n  cam_T_grip:", "reference.position_sigma_m", "(m)"),
     ("^  cam_T_grip:", "  covariance: [1, 2]\n  cam_T_grip:", "reference.covariance", "36"),
+    ("fx_px: 962", "fx_px: 9620", "camera.fx_px and fy_px", "9620 px and 962 px differ too much; "),
+    ("^source:", "jaw: {opening: 0.034}\nsource:", "jaw.opening", "is 0.034, did you mean 'opening_m'?; "),
+    ("^source:", "ros2: {enabled: yes}\nsource:", "ros2.enabled", "is 'yes'; true or false (true: also publish"),
+    (
+        "^source: .*",
+        "source: {kind: zenoh}\njaw: {source: zenoh}\npublish: {enabled: false}",
+        "source.kind",
+        "is zenoh, but publish.enabled is false; publish.enabled: true",
+    ),
+    (
+        "^source:",
+        "monitor: {policy: {warn_m: 0.003}}\nsource:",
+        "monitor.policy.warn_m",
+        "0.003 is above limit_m, 0.0025; at most limit_m, or a larger limit_m",
+    ),
+    ("^source:", "monitor: {policy: {limit_rad: 0.001}}\nsource:", "monitor.policy.warn_rad", "0.003 is above"),
+    ("^source:", "monitor: {recalibration: {frames: 70}}\nsource:", "monitor.recalibration.frames", "70 is above"),
+    (
+        "^source:",
+        "monitor: {recalibration: {sure_sigma_m: 0.001}}\nsource:",
+        "monitor.recalibration.sure_sigma_m",
+        "above largest_sigma_m",
+    ),
+    ("^source:", "publish: {retry_first_s: 5}\nsource:", "publish.retry_first_s", "5 is above retry_longest_s, 1; "),
+    ("device: 0", "device: 0, retry_longest_s: 0.1", "source.retry_first_s", "0.5 is above retry_longest_s, 0.1; "),
 ]
 
 
@@ -207,6 +232,13 @@ GRIPPER_FAULTS = [
     (r"from: L_in_near, to", "frm: L_in_near, to", "edges.L_tip_in.frm", "did you mean 'from'"),
     (r"from: L_in_near, to", "from: nobody, to", "edges.L_tip_in.from", "there is no point"),
     (r"^name: .*", "name: a\nname: b", "line 5", "twice"),
+    (
+        r"motion: {axis: .*}",
+        "motion: {table: [[0, 0, 0], [1, 0, 0]]}}",
+        "fingers.left.motion.table[0]",
+        "has 3 values; a list of 4 values",
+    ),
+    (r"axis: \[[^\]]*\]", "axis: [1, 0, 0, 0]", "fingers.left.motion.axis", "has 4 values; a list of 3 values"),
 ]
 
 

@@ -15,6 +15,7 @@ from gripmon.camera import Camera, make_camera
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
+from gripmon.config.order import order_fault
 from gripmon.config.session import joined_or_fault
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
@@ -22,7 +23,7 @@ from gripmon.config.yaml_file import read_yaml
 from gripmon.corners import TaughtEdges, TaughtModel
 from gripmon.corners.taught import mismatch
 from gripmon.geometry import from_record, to_record
-from gripmon.gripper import LARGEST_EXTENT_M, Gripper, GripperError, GripperModel
+from gripmon.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
 from gripmon.records import Array, ReferenceRecord, to_json
 from gripmon.ros2 import fault_of as ros2_fault
 from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
@@ -118,8 +119,9 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     config = Config(path, settings, camera, gripper, gripper_path, reference)
     fault = (
         monitor_fault(settings.monitor)
-        or jaw_fault(settings, gripper)
+        or order_fault(settings)
         or network_fault(settings)
+        or jaw_fault(settings, gripper)
         or _ros2_fault(settings)
         or view_fault(config.view(), gripper, camera)
     )
@@ -176,6 +178,10 @@ def _gripper(path: Path, gripper_path: Path) -> Gripper:
             if max(map(abs, point.xyz_m)) > LARGEST_EXTENT_M:
                 wrong = f"{max(map(abs, point.xyz_m)):g} m from the TCP"
                 raise ConfigError(gripper_path, f"points.{name}.xyz_m", wrong, "metres (millimetres were meant?)")
+        for name, finger in model.fingers.items():
+            for form, motion in (("axis", AxisMotion), ("table", TableMotion)):
+                if finger.motion is not None and set(finger.motion) == {form}:
+                    to_settings(finger.motion, motion, f"fingers.{name}.motion")
         return Gripper(model)
     except SettingsError as error:
         raise _error(gripper_path, error.fault) from None

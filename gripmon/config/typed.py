@@ -118,10 +118,18 @@ def _struct_fault(value: Any, node: mi.StructType, key: str, description: str) -
         if field.encode_name in value:
             fault = _find_fault(value[field.encode_name], field.type, inner_key)
             if fault is not None:
-                return fault
+                return _with_unit(fault, inner_key, field.encode_name, names)
         elif field.required:
             return Fault(inner_key, "is missing", _expected(field.type))
     return None
+
+
+def _with_unit(fault: Fault, key: str, name: str, known: list[str]) -> Fault:
+    """``opening`` is a section, but has a number, and there is an ``opening_m``: perhaps that was meant."""
+    longer = [each for each in known if each.startswith(f"{name}_")]
+    if fault.key != key or len(longer) != 1:
+        return fault
+    return fault._replace(wrong=f"{fault.wrong}, did you mean '{longer[0]}'?")
 
 
 def _dict_fault(value: Any, node: mi.DictType, key: str, description: str) -> Fault | None:
@@ -209,7 +217,8 @@ def _expected(node: mi.Type, description: str = "") -> str:
     """What would be right for a type, in words: kind, bounds and the settings' own description with the unit."""
     if isinstance(node, mi.Metadata):
         return _expected(node.type, (node.extra_json_schema or {}).get("description", "") or description)
-    suffix = f": {description}" if description else ""
+    # What says by itself "true: …; false: …" would be a second colon in the line.
+    suffix = "" if not description else f" ({description})" if ": " in description else f": {description}"
     if isinstance(node, mi.UnionType):
         options = [t for t in node.types if not isinstance(_unwrap(t), mi.NoneType)]
         structs = [s for s in map(_unwrap, options) if isinstance(s, mi.StructType)]
