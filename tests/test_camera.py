@@ -189,7 +189,7 @@ ABSURD: dict[str, tuple[LensSettings, str, str]] = {
     "millimetres": (PaperLens(**(PINHOLE | {"fy_px": 8.0})), "fy_px", "pixel pitch"),
     "metres written as microns": (PaperLens(**(PINHOLE | {"fx_px": 8e6})), "fx_px", "pixel pitch"),
     "not a number": (PaperLens(**(PINHOLE | {"fx_px": float("nan")})), "fx_px", "right would be"),
-    "aspect": (PaperLens(**(PINHOLE | {"fy_px": 96.2})), "fy_px", "nearly the same"),
+    "aspect": (PaperLens(**(PINHOLE | {"fy_px": 96.2})), "fx_px and fy_px", "nearly the same"),
     "centre as fraction": (PaperLens(**(PINHOLE | {"cx_px": 0.5, "cy_px": 0.5})), "cx_px", "about 384"),
     "centre far outside": (PaperLens(**(PINHOLE | {"cy_px": 2900.0})), "cy_px", "288"),
     "centre not finite": (PaperLens(**(PINHOLE | {"cx_px": float("inf")})), "cx_px", "384"),
