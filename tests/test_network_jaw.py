@@ -160,6 +160,36 @@ def test_what_is_malformed_is_said_once_an_occasion(clock: list[float], caplog: 
     assert seen.count == 2001 and len(caplog.records) == 2
 
 
+def test_good_ones_for_some_seconds_end_the_words_but_not_the_count(
+    clock: list[float], caplog: pytest.LogCaptureFixture
+):
+    seen = Malformed("frame", "a/b")
+    seen.good()
+    assert seen.fault() == ""
+    for _ in range(20):
+        seen.add("too short")
+    for said in (True, True, False):
+        clock[0] += 0.4 * malformed.CALM_S
+        seen.good()
+        assert bool(seen.fault()) == said, "a few good ones aren't enough"
+    clock[0] += malformed.CALM_S
+    assert seen.fault() == "" and seen.count == 20
+    seen.add("too short")
+    assert seen.fault() == "over 10 malformed frames on a/b: too short"
+    clock[0] += 2.0 * malformed.CALM_S
+    assert seen.fault(), "silence is no good sign"
+    assert len(caplog.records) == 1, "one occasion, said once"
+
+
+def test_a_good_opening_is_told(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(malformed, "CALM_S", 0.0)
+    with robot() as arm:
+        arm.errs("34")
+        assert arm.jaw.fault().startswith("no jaw opening received, 1 malformed jaw message on ")
+        arm.says("0.03", 0.03)
+        assert arm.jaw.fault() == "" and arm.jaw.malformed == 1
+
+
 def test_a_stranger_writes_no_lines_of_his_own(caplog: pytest.LogCaptureFixture):
     seen = Malformed("frame", "a/b")
     seen.add("bad\n2026-01-01 INFO all is well\x1b[2J\u202e" + "x" * 10_000)

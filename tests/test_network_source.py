@@ -29,7 +29,7 @@ from gripmon.sources import (
     open_source,
 )
 from gripmon.sources.network import clock_fault
-from gripmon.wire import Keys, Link, PublishSettings
+from gripmon.wire import Keys, Link, PublishSettings, malformed
 
 KEY = "cell/camera"
 
@@ -139,6 +139,16 @@ def test_malformed_payloads_are_passed_over_as_long_as_good_ones_come(driver: Dr
     assert camera.fault().startswith(f"some malformed frames on {KEY}: ")
     assert camera.fault().endswith(f"; stamps on {KEY} are a day or more behind this machine's clock")
     assert len([r for r in caplog.records if "malformed frame" in r.message]) == 1, "said once"
+
+
+def test_good_frames_end_what_is_said_of_bad_ones(driver: Driver, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(malformed, "CALM_S", 0.0)
+    driver.put(b"rubbish")
+    assert frame_of(driver.camera).image is None
+    assert driver.camera.fault().startswith("1 malformed frame on ")
+    driver.put(grey(), raw_note(stamp_ns=time.time_ns()))
+    assert frame_of(driver.camera).image is not None
+    assert driver.camera.fault() == "" and driver.camera.malformed == 1
 
 
 def test_rubbish_alone_is_a_camera_that_delivers_rubbish(driver: Driver):

@@ -98,6 +98,7 @@ class ZenohJaw:
         except JawError as error:
             self._malformed.add(str(error))
             return
+        self._malformed.good()
         with self._lock:
             self._newest_m, self._arrival_s = opening_m, arrival_s
 

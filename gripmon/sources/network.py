@@ -193,6 +193,7 @@ class NetworkCamera:
                 fault = str(error) or type(error).__name__
                 self._malformed.add(fault)
                 continue
+            self._malformed.good()
             return self._frame(arrival, content)
         if self._closed:
             return None

@@ -11,13 +11,17 @@ _log = logging.getLogger(__name__)
 REMEMBERED_S = 60.0
 """So long after the last one it is still said; one that comes later is a new occasion."""
 
+CALM_S = 3.0
+"""Good ones for so long, and nothing else: it is no longer said."""
+
 _LONGEST_REASON = 200
 
 
 class Malformed:
     """Counts the payloads on a key that could not be used.
 
-    An occasion ends when none has come for :data:`REMEMBERED_S`.  The log gets one line an occasion, and the words of
+    An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is silent sooner, when good ones have
+    come for :data:`CALM_S`.  The log gets one line an occasion, and the words of
     :meth:`fault` change only when the count passes a power of ten, so that nobody can fill a log, or keep the network
     busy, by sending rubbish.  Any thread may call.
     """
@@ -28,7 +32,7 @@ class Malformed:
         self._lock = threading.Lock()
         self._count = self._here = 0
         self._reason = ""
-        self._last_s = 0.0
+        self._last_s = self._good_s = 0.0
 
     @property
     def count(self) -> int:
@@ -49,10 +53,15 @@ class Malformed:
         if begins:
             _log.warning("%s (said once)", said)
 
+    def good(self) -> None:
+        """One came that could be used."""
+        self._good_s = time.monotonic()
+
     def fault(self) -> str:
-        """How many of this occasion, roughly, and the first one's reason, for a person; empty if there are none."""
+        """How many of this occasion, roughly, and the first one's reason, for a person; empty if it is over."""
         with self._lock:
-            if self._here == 0 or time.monotonic() - self._last_s > REMEMBERED_S:
+            over = time.monotonic() - self._last_s > REMEMBERED_S or self._good_s - self._last_s > CALM_S
+            if self._here == 0 or over:
                 return ""
             several = "s" * (self._here > 1)
             return f"{_roughly(self._here)} malformed {self._what}{several} on {self._key}: {self._reason}"
