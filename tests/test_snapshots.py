@@ -24,7 +24,7 @@ from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.daemon import DaemonSettings, Reports, run
 from gripmon.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
-from gripmon.sources import Waiting
+from gripmon.sources import FolderSettings, FolderSource, Waiting
 from gripmon.wire import PublishSettings
 
 
@@ -240,31 +240,45 @@ def test_a_huge_image_becomes_a_jpeg_that_a_reply_can_carry():
     assert len(data) < largest_bytes(CommandReply)
 
 
-def test_send_writes_image_and_record(endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_send_writes_images_and_records_one_after_the_other(
+    endpoint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     out = tmp_path / "now"
     arguments = ["send", "snapshot", "--robot", "arm", "--connect", endpoint, "--out", str(out)]
-    with running(endpoint, lambda i: Frame(i, i, picture(i))) as daemon:
+    with running(endpoint, lambda i: Frame(i, i, picture(i), 0.02)) as daemon:
         wait_until(lambda: daemon.frames, "a frame")
         assert main(arguments) == 0
         said = capsys.readouterr().out.splitlines()
-        first = from_json((out / "snapshot.json").read_bytes(), CommandReply)
         assert main([*arguments, "--json"]) == 0
-    assert said[1:] == [str(out / "snapshot.png"), str(out / "snapshot.json")]
-    second = from_json((out / "snapshot.json").read_bytes(), CommandReply)
-    assert from_json(capsys.readouterr().out.encode(), CommandReply) == second
-    assert first.snapshot is not None and second.snapshot is not None
-    assert second.snapshot.record.seq > first.snapshot.record.seq
-    image = cv2.imread(str(out / "snapshot.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(image, picture(second.snapshot.record.seq))
-    assert sorted(path.name for path in out.iterdir()) == ["snapshot.json", "snapshot.png"]
+    assert said[1:] == [str(out / name) for name in ("snapshot-1.png", "snapshot-1.json", "timestamps.csv")]
+    first, second = (from_json((out / f"snapshot-{i}.json").read_bytes(), CommandReply).snapshot for i in (1, 2))
+    assert from_json(capsys.readouterr().out.encode(), CommandReply).snapshot == second
+    assert first is not None and second is not None and second.record.seq > first.record.seq
+    source = FolderSource(FolderSettings(path=str(out)), Path())
+    for kept in (first, second):
+        frame = source.read()
+        assert frame is not None and frame.stamp_ns == kept.record.stamp_ns
+        assert frame.jaw_opening_m == kept.jaw_reported_m
+        np.testing.assert_array_equal(frame.image, picture(kept.record.seq))
+    assert source.read() is None
 
 
-def test_an_image_of_an_earlier_snapshot_does_not_stay(endpoint: str, tmp_path: Path):
-    (tmp_path / "snapshot.png").write_bytes(b"of yesterday")
+def test_a_frame_without_an_image_leaves_a_record_alone(endpoint: str, tmp_path: Path):
+    (tmp_path / "snapshot-8.jpg").write_bytes(b"of yesterday")
     with running(endpoint, lambda i: Frame(i, i, None)) as daemon:
         wait_until(lambda: daemon.frames, "a frame")
         assert main(["send", "snapshot", "--robot", "arm", "--connect", endpoint, "--out", str(tmp_path)]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["snapshot.json"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["snapshot-8.jpg", "snapshot-9.json"]
+
+
+@pytest.mark.parametrize(
+    ("table", "said"), [("file,stamp_ns\n", "has no column jaw_opening_m; another folder"), ("?", "line 1 is '?'; ")]
+)
+def test_somebody_elses_table_is_left_alone(table: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "timestamps.csv").write_text(table)
+    assert main(["send", "snapshot", "--robot", "arm", "--out", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
+    assert (tmp_path / "timestamps.csv").read_text() == table
 
 
 def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: Path):

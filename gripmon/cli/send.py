@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.cli import common, snapshots
 from gripmon.cli.fleet_table import printable
 
 if TYPE_CHECKING:
@@ -25,7 +25,8 @@ Tell a running monitor something, and print its answer.
   reset             go back to the configured reference, likewise
   acknowledge [ID]  take note of an open alert, or of all
   state             print the references, a proposal and the open alerts
-  snapshot          write the newest frame's image, and what the monitor made of it, to --out
+  snapshot          write the newest frame's image, and what the monitor made of it, to --out,
+                    numbered, with a row in timestamps.csv: ready for replay and teach
 
 What can't be done is refused with a reason, and nothing changes.  Every request has an id: where no
 answer came, --request with that id asks for the same again, which is not carried out twice."""
@@ -34,7 +35,7 @@ _EXAMPLES = """\
   gripmon send state --robot arm1
   gripmon send undo --robot arm1
   gripmon send undo recalibration-3-1f0c9a2b --robot arm1 --camera wrist
-  gripmon send snapshot --robot arm1 --out now        now/snapshot.png and now/snapshot.json
+  gripmon send snapshot --robot arm1 --out now        now/snapshot-1.png, -1.json, timestamps.csv
 
 exit codes: 0 done; 2 wrong usage; 3 refused, or no answer; 130 Ctrl-C"""
 
@@ -73,8 +74,10 @@ def send(arguments: argparse.Namespace) -> int:
     if wrong := _misuse(arguments):
         raise common.CommandFailedError(f"send: {wrong}", common.EXIT_USAGE)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
+    if out is not None:
+        snapshots.check_table(out)
     reply, image = _ask(arguments)
-    written = _write(reply, image, out) if out is not None and reply.done else []
+    written = snapshots.write(reply, image, out) if out is not None and reply.done else []
     if arguments.json:
         from gripmon.records import to_json
 
@@ -132,26 +135,6 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
         except NotCarriedOut as error:
             again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
             raise common.CommandFailedError(f"send: {printable(str(error))}{again}", common.EXIT_FAILED) from None
-
-
-def _write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
-    """The image of a snapshot and snapshot.json, in place of earlier ones; each is there whole or not at all."""
-    from gripmon.atomic import write_atomically
-    from gripmon.records import to_json
-
-    images = {"png": out / "snapshot.png", "jpeg": out / "snapshot.jpg"}
-    files = {out / "snapshot.json": to_json(reply) + b"\n"}
-    about = None if reply.snapshot is None else reply.snapshot.image
-    if image is not None and about is not None and about.encoding in images:  # a name from outside makes no path
-        files = {images[about.encoding]: image} | files
-    try:
-        for path in images.values():
-            path.unlink(missing_ok=True)
-        for path, data in files.items():
-            write_atomically(path, data)
-    except OSError as error:
-        raise common.not_writable(path, error) from None
-    return list(files)
 
 
 def _table(state: MonitorState) -> list[str]:

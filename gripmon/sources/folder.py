@@ -18,7 +18,7 @@ from gripmon.sources.base import SourceError
 _SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
 IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
 TIMESTAMPS_NAME = "timestamps.csv"
-_COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
+COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 _NS = 1_000_000_000
 
 
@@ -136,12 +136,12 @@ def read_table(path: Path) -> dict[str, TableRow]:
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise SourceError(f"timestamps: there is no file {path}; a table {','.join(_COLUMNS[:2])}") from None
+        raise SourceError(f"timestamps: there is no file {path}; a table {','.join(COLUMNS[:2])}") from None
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"{path}: can't be read ({error}); a table in UTF-8") from None
     lines = csv.reader(text.splitlines())
     header = tuple(cell.strip() for cell in next(lines, []))
-    if header not in (_COLUMNS[:2], _COLUMNS):
+    if header not in (COLUMNS[:2], COLUMNS):
         raise SourceError(f"{path}: line 1 is '{','.join(header)}'; file,stamp_ns or file,stamp_ns,jaw_opening_m")
     rows: dict[str, TableRow] = {}
     for cells in lines:

@@ -1,0 +1,72 @@
+"""Snapshots as files that the other commands read: numbered, with a table of stamps and jaw openings beside them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.records import CommandReply
+
+_SUFFIXES = {"png": ".png", "jpeg": ".jpg"}  # a name from outside makes no path
+_NUMBERED = re.compile(r"snapshot-([0-9]{1,9})\.(json|png|jpg)")
+
+
+def check_table(out: Path) -> None:
+    """End the command with exit code 2, before any work, if no row can be added to the table in a folder."""
+    from gripmon.sources import SourceError
+    from gripmon.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
+
+    path = out / TIMESTAMPS_NAME
+    if not path.exists():
+        return
+    try:
+        read_table(path)
+    except SourceError as error:
+        raise common.CommandFailedError(f"--out {out}: {error}", common.EXIT_USAGE) from None
+    header = path.read_text(encoding="utf-8-sig").partition("\n")[0]
+    if tuple(cell.strip() for cell in header.split(",")) != COLUMNS:
+        raise common.CommandFailedError(
+            f"--out {out}: {path} has no column {COLUMNS[-1]}; another folder", common.EXIT_USAGE
+        )
+
+
+def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
+    """``snapshot-<n>.png``, ``snapshot-<n>.json`` and a row in ``timestamps.csv``, as a source of kind ``folder`` and
+    ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.
+    """
+    from gripmon.atomic import write_atomically
+    from gripmon.records import to_json
+    from gripmon.sources.folder import TIMESTAMPS_NAME
+
+    number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)
+    files = {out / f"snapshot-{number}.json": to_json(reply) + b"\n"}
+    snapshot = reply.snapshot
+    suffix = None if snapshot is None or snapshot.image is None else _SUFFIXES.get(snapshot.image.encoding)
+    try:
+        if image is not None and snapshot is not None and suffix is not None:
+            path, table = out / f"snapshot-{number}{suffix}", out / TIMESTAMPS_NAME
+            files = {path: image} | files
+            # Last of all: it names the image.
+            files[table] = _with_row(table, path.name, snapshot.record.stamp_ns, snapshot.jaw_reported_m)
+        for path, data in files.items():
+            write_atomically(path, data)
+    except OSError as error:
+        raise common.not_writable(path, error) from None
+    return list(files)
+
+
+def _with_row(table: Path, name: str, stamp_ns: int, jaw_m: float | None) -> bytes:
+    from gripmon.sources.folder import COLUMNS
+
+    text = io.StringIO()
+    lines = csv.writer(text, lineterminator="\n")
+    before = table.read_text(encoding="utf-8-sig") if table.exists() else ",".join(COLUMNS)
+    # An opening below zero is a closed jaw whose report is a little off: none that a table can have.
+    lines.writerow((name, max(stamp_ns, 0), repr(jaw_m) if jaw_m is not None and 0.0 <= jaw_m <= 1.0 else ""))
+    return f"{before.rstrip()}\n{text.getvalue()}".encode()
