@@ -16,7 +16,7 @@ def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, st
     """None if the frame may be measured; else the reason, and in words what came and what would be right."""
     image = frame.image
     if image is None or not isinstance(image, np.ndarray):
-        return Refusal.NOT_AN_IMAGE, frame.fault or "there is no image"
+        return frame.refusal, frame.fault or "there is no image"
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         return Refusal.WRONG_TYPE, f"shape {image.shape}; H x W, or H x W x 3 in the order BGR"
     if image.shape[:2] != (camera.height_px, camera.width_px):

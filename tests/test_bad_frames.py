@@ -16,7 +16,18 @@ from watched import frames_of, new_monitor, reference_of, replaced
 from gripmon.camera import make_camera
 from gripmon.gripper import gripper_from_dict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict, to_json
+from gripmon.records import (
+    AlertEvent,
+    AlertKind,
+    CornerFault,
+    Frame,
+    FrameRecord,
+    Origin,
+    Refusal,
+    State,
+    Verdict,
+    to_json,
+)
 
 HEIGHT, WIDTH = PAPER_LENS.height_px, PAPER_LENS.width_px
 
@@ -36,6 +47,10 @@ BAD: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "nothing, as the source could not read it": (
         lambda f: replaced(f, image=None, fault="truncated: 1200 of 442386 bytes"),
         "not_an_image: truncated: 1200 of 442386 bytes",
+    ),
+    "nothing, as it had another size": (
+        lambda f: replaced(f, image=None, fault="64x48 pixels", refusal=Refusal.WRONG_SIZE),
+        "wrong_size: 64x48 pixels",
     ),
     "nothing": (lambda f: replaced(f, image=None), "not_an_image"),
     "a list": (lambda f: replaced(f, image=[[0, 1], [2, 3]]), "not_an_image"),

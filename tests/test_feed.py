@@ -126,7 +126,10 @@ def test_nothing_to_send_is_a_failure(heard: Heard, folder: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["nowhere.mp4", "--robot", "arm"], "feed: nowhere.mp4: device: 'nowhere.mp4' has no known form"),
+        (
+            ["nowhere.mp4", "--robot", "arm"],
+            "feed: nowhere.mp4: there is no such folder or file; a folder of images, a video",
+        ),
         (["{folder}", "--robot", "a/b"], "robot name 'a/b' can't be part of a Zenoh key"),
         (["{folder}", "--robot", "arm", "--connect", "localhost"], "feed: "),
         (["{empty}", "--robot", "arm"], "no image in"),

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import zenoh
 from loopback import WAIT_S, free_endpoint, plain_session, wait_until
-from sent_frames import HEIGHT, WIDTH, colour, grey, raw_note
+from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.publish.frames import FramePublisher, raw_encoding
-from gripmon.records import Frame
+from gripmon.records import Frame, Refusal
 from gripmon.sources import (
     READ_TIMEOUT_S,
     LiveSettings,
@@ -139,6 +139,16 @@ def test_malformed_payloads_are_passed_over_as_long_as_good_ones_come(driver: Dr
     assert camera.fault().startswith(f"some malformed frames on {KEY}: ")
     assert camera.fault().endswith(f"; stamps on {KEY} are a day or more behind this machine's clock")
     assert len([r for r in caplog.records if "malformed frame" in r.message]) == 1, "said once"
+
+
+def test_an_image_of_another_size_is_refused_as_that(driver: Driver):
+    other = np.zeros((HEIGHT, WIDTH // 2), np.uint8)
+    driver.put(other, note(width=WIDTH // 2, height=HEIGHT, encoding="mono8"))
+    bad = frame_of(driver.camera)
+    assert bad.image is None and bad.refusal is Refusal.WRONG_SIZE
+    assert bad.fault == "20x30 pixels; 40x30 as the camera's calibration says"
+    driver.put(b"rubbish")
+    assert frame_of(driver.camera).refusal is Refusal.NOT_AN_IMAGE
 
 
 def test_good_frames_end_what_is_said_of_bad_ones(driver: Driver, monkeypatch: pytest.MonkeyPatch):

@@ -110,7 +110,10 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
     shown = [line.split("/")[0] for line in lines if "/wrist" in line]
     assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 7
     below = " ".join(line.strip() for line in lines[-2:])
-    assert "15 monitors: 1 gone, 1 stopped, 1 silent, 3 unknown, 2 suspect, 7 valid; no connection to tcp/x;" in below
+    assert (
+        "15 monitors: 1 gone, 1 stopped, 1 silent, 2 unknown, 1 starting, 2 suspect, 7 valid; no connection to tcp/x;"
+        in below
+    )
     assert "8 more than fit here, none in more trouble" in below
 
 

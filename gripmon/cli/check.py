@@ -73,7 +73,11 @@ def expectation(config: Config) -> dict[str, Any]:
         },
         "reference": _reference_values(config),
         "taught": _taught_values(config),
-        "jaw": {"source": settings.jaw.source, "opening_m": config.jaw_opening_m},
+        "jaw": {
+            "source": settings.jaw.source,
+            "opening_m": config.jaw_opening_m,
+            "nominal": settings.jaw.opening_m is None,
+        },
         "corners": _corner_values(gripper.corner_ids, view),
         "edges": [
             {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
@@ -277,7 +281,7 @@ def _gripper_line(gripper: dict[str, Any], jaw: dict[str, Any]) -> str:
     low_mm, high_mm = (1e3 * v for v in gripper["jaw_m"])
     opening = f"{1e3 * jaw['opening_m']:.1f} mm"
     if jaw["source"] == "fixed":
-        return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, fixed at {opening}"
+        return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, fixed at {opening}{', the nominal one' * jaw['nominal']}"
     return f"{name}: jaw {low_mm:g} to {high_mm:g} mm, opening from {jaw['source']}; the following at {opening}"
 
 

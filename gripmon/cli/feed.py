@@ -162,6 +162,9 @@ def _open(arguments: argparse.Namespace) -> Source:
         settings = FolderSettings(path=name, fps=arguments.fps or 25.0)
     elif path.is_file():
         settings = VideoSettings(path=name)
+    elif not (name.isdecimal() or name.startswith("/dev/") or "://" in name or "!" in name):
+        right = "a folder of images, a video file, or a camera (0, /dev/video0, a URL, a GStreamer pipeline)"
+        raise common.CommandFailedError(f"feed: {name}: there is no such folder or file; {right}", common.EXIT_USAGE)
     else:
         settings = LiveSettings(device=int(name) if name.isdecimal() else name, fps=arguments.fps)
     try:

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "fps", "heard s", "reference", "alerts")
 _FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
 _STYLES = {
-    "gone": "bold red", "silent": "bold red", "unknown": "red", "stopped": "dim", "suspect": "yellow", "valid": "green"
+    "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
+    "stopped": "dim", "valid": "green"
 }  # fmt: skip
 _MARKS = {"error": "!!", "warning": "!", "info": "i"}
 

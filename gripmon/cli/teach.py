@@ -56,8 +56,8 @@ def add_parser(commands: Any) -> None:
         "--jaw-opening",
         type=common.positive_number,
         metavar="M",
-        help="jaw opening in all images (m); default: the configuration's with jaw.source fixed, else from a "
-        "timestamps.csv beside each image",
+        help="jaw opening in all images (m); default: with jaw.source fixed jaw.opening_m, or the gripper's "
+        "nominal if that is absent, else from a timestamps.csv beside each image",
     )
     parser.add_argument(
         "--picture", metavar="FILE.png", help="also draw the first image with what was taught, offsets enlarged"

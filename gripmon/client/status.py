@@ -23,6 +23,7 @@ class Condition(enum.StrEnum):
     STOPPED = "stopped"
     SILENT = "silent"
     UNKNOWN = "unknown"
+    STARTING = "starting"
     SUSPECT = "suspect"
     VALID = "valid"
 
@@ -47,19 +48,20 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def condition(self) -> Condition:
-        """By its token, its silence, and the verdict on its last transform."""
+        """By its token, its silence, and the verdict on its last transform; starting before its first state message."""
         if self.gone_since_ns is not None:
             # What else was wrong may follow.
             said_so = self.state is not None and self.state.message.partition(";")[0] == "stopped"
             return Condition.STOPPED if said_so else Condition.GONE
         if self.state_age_s > SILENT_AFTER_S:
             return Condition.SILENT
-        verdict = Verdict.UNKNOWN if self.state is None else self.state.verdict
+        if self.state is None:
+            return Condition.STARTING
         return {
             Verdict.UNKNOWN: Condition.UNKNOWN,
             Verdict.SUSPECT: Condition.SUSPECT,
             Verdict.VALID: Condition.VALID,
-        }[verdict]
+        }[self.state.verdict]
 
     @property
     def drift_m(self) -> float | None:

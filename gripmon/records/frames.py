@@ -79,8 +79,8 @@ class Frame:
     """One camera frame as a source hands it over.
 
     ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
-    (truncated file, failed read); ``fault`` then says why in a few words.  ``jaw_opening_m`` is what the robot
-    reported for this frame, None if nobody did.  ``name`` is the file or stream that the frame came from.
+    (truncated file, failed read); ``fault`` then says why in a few words, ``refusal`` in one.  ``jaw_opening_m`` is
+    what the robot reported for this frame, None if nobody did.  ``name`` is the file or stream that it came from.
     """
 
     seq: int
@@ -89,6 +89,7 @@ class Frame:
     jaw_opening_m: float | None = None
     name: str = ""
     fault: str | None = None
+    refusal: Refusal = Refusal.NOT_AN_IMAGE
 
 
 class CornerRecord(msgspec.Struct, frozen=True):

@@ -10,9 +10,18 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.records import Frame, FrameNote, Image, largest_bytes
+from gripmon.records import Frame, FrameNote, Image, Refusal, largest_bytes
 from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
-from gripmon.sources.payload import JPEG, PNG, PayloadError, check_size, file_image, raw_image, read_note
+from gripmon.sources.payload import (
+    JPEG,
+    PNG,
+    PayloadError,
+    WrongSizeError,
+    check_size,
+    file_image,
+    raw_image,
+    read_note,
+)
 from gripmon.wire import Link
 from gripmon.wire.malformed import Malformed
 from gripmon.wire.settings import KEY_PATTERN
@@ -183,7 +192,7 @@ class NetworkCamera:
 
     def read(self) -> Frame | Waiting | None:
         deadline_s = time.monotonic() + READ_TIMEOUT_S
-        fault = ""
+        fault, refusal = "", Refusal.NOT_AN_IMAGE
         while (arrival := self._take(deadline_s)) is not None:
             try:
                 content = self._content(arrival.sample)
@@ -191,6 +200,7 @@ class NetworkCamera:
                 if not isinstance(error, PayloadError):
                     _log.debug("a payload on %s", self.key, exc_info=error)
                 fault = str(error) or type(error).__name__
+                refusal = Refusal.WRONG_SIZE if isinstance(error, WrongSizeError) else Refusal.NOT_AN_IMAGE
                 self._malformed.add(fault)
                 continue
             self._malformed.good()
@@ -198,7 +208,7 @@ class NetworkCamera:
         if self._closed:
             return None
         if fault:
-            return Frame(self._next_seq(), self._stamp_now_ns(), None, None, self.key, fault)
+            return Frame(self._next_seq(), self._stamp_now_ns(), None, None, self.key, fault, refusal)
         return Waiting(self._why_silent())
 
     def close(self) -> None:

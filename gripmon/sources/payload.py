@@ -26,6 +26,10 @@ class PayloadError(ValueError):
     """A payload that can't be used; the text is "what is wrong; what would be right", in one line."""
 
 
+class WrongSizeError(PayloadError):
+    """An image, but not one of this camera."""
+
+
 def read_note(attachment: bytes | None) -> FrameNote:
     """The attachment; an empty one where there is none.  Raises :class:`PayloadError`."""
     if not attachment:
@@ -37,10 +41,10 @@ def read_note(attachment: bytes | None) -> FrameNote:
 
 
 def check_size(size_px: tuple[int, int], expected_px: tuple[int, int]) -> None:
-    """Raises :class:`PayloadError` unless an image is as large as the camera's, (width, height)."""
+    """Raises :class:`WrongSizeError` unless an image is as large as the camera's, (width, height)."""
     if size_px != expected_px:
         came, right = (f"{width}x{height}" for width, height in (size_px, expected_px))
-        raise PayloadError(f"{came} pixels; {right} as the camera's calibration says")
+        raise WrongSizeError(f"{came} pixels; {right} as the camera's calibration says")
 
 
 def raw_image(payload: bytes, note: FrameNote, expected_px: tuple[int, int]) -> Image:
