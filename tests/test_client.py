@@ -9,7 +9,7 @@ import pytest
 from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
 from published import Published
 
-from gripmon.client import Client, MonitorName
+from gripmon.client import Client, MonitorName, TransformClient
 from gripmon.records import FrameRecord, MessageRefused
 from gripmon.wire import PublishError, PublishSettings
 
@@ -161,5 +161,14 @@ def test_bad_names_are_refused(names: tuple[str, str | None]):
 
 
 def test_a_bad_endpoint_is_refused():
-    with pytest.raises(PublishError, match=r"^publish\.connect: "):
+    with pytest.raises(PublishError, match=r"^connect: 'nonsense' is no endpoint; protocol/address, e.g. tcp/"):
         Client("arm", connect=["nonsense"])
+
+
+@pytest.mark.parametrize("kind", [Client, TransformClient])
+def test_a_text_is_one_endpoint(kind: type[Client] | type[TransformClient]):
+    endpoint = free_endpoint()
+    with plain_session(listen=endpoint, mode="peer") as other, kind("arm", "wrist", connect=endpoint):
+        wait_until(lambda: list(other.info.peers_zid()), "the connection")
+    with pytest.raises(PublishError, match=r"^connect: tcp/127.0.0.1:70000: 70000 can't be a port; a whole"):
+        kind("arm", connect="tcp/127.0.0.1:70000")

@@ -207,7 +207,11 @@ def test_a_file_of_zenohs_is_accepted(tmp_path: Path, endpoint: str, suffix: str
     ("changes", "text"),
     [
         ({"mode": "client"}, "publish.connect: a client needs a router"),
-        ({"connect": ("nonsense",)}, "publish.connect: "),
+        ({"connect": ("nonsense",)}, "publish.connect: 'nonsense' is no endpoint; protocol/address, e.g. tcp/"),
+        ({"connect": ("127.0.0.1:1",)}, "publish.connect: '127.0.0.1:1' is no endpoint; "),
+        ({"connect": ("tcp/127.0.0.1",)}, "publish.connect: tcp/127.0.0.1 has no port; "),
+        ({"listen": ("tcp/[::1]:65536",)}, "publish.listen: tcp/[::1]:65536: 65536 can't be a port; "),
+        ({"listen": ("tcp/[::1]:7447\n",)}, "publish.listen: 'tcp/[::1]:7447\\n' is no endpoint; "),
         ({"zenoh_config": "/nowhere.json5"}, "publish.zenoh_config: no file /nowhere.json5"),
         ({"zenoh_config": __file__}, "publish.zenoh_config: "),
         ({"zenoh_config": __file__, "connect": ("tcp/127.0.0.1:1",)}, "publish.connect: has no effect beside"),

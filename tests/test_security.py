@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import zenoh
 from loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
@@ -133,15 +135,42 @@ def test_only_the_operator_commands(site: Site):
     assert site.commands[before:] == [CommandName.UNDO]
 
 
-def test_send_says_what_may_be_wrong(site: Site):
-    def send(name: str) -> subprocess.CompletedProcess[str]:
+def test_send_says_what_may_be_wrong(site: Site, stranger: Path):
+    def send(path: Path) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "gripmon", "send", "reset", "--robot", "arm", "--timeout", "3"]
-        command += ["--zenoh-config", str(site.file(name))]
+        command += ["--zenoh-config", str(path)]
         return subprocess.run(command, capture_output=True, text=True, timeout=60.0, cwd=ROOT)
 
-    refused, obeyed = send("controller"), send("operator")
+    stranger_file = stranger / "operator.json5"
+    shutil.copy(site.file("operator"), stranger_file)
+    unknown = send(stranger_file)
+    assert unknown.returncode == 2 and unknown.stderr.count("\n") == 1
+    place = site.endpoint.replace("tcp/", "tls/")
+    assert unknown.stderr.startswith(f"send: --zenoh-config: can't open a Zenoh session: no connection to {place} (")
+    assert "or the certificates don't fit" in unknown.stderr
+    refused, obeyed = send(site.file("controller")), send(site.file("operator"))
     assert refused.returncode == 3 and refused.stderr.count("\n") == 1 and "may not let you" in refused.stderr
     assert (obeyed.returncode, obeyed.stdout) == (0, "so be it\n")
+
+
+def test_watch_doubts_the_file_that_was_given(site: Site, capsys: pytest.CaptureFixture[str]):
+    file = str(site.file("robot"))
+    doubt = f"is {file} for the right router, and may its certificate read there?"
+
+    def doubted() -> bool:  # on a slow machine there is no session yet
+        assert main(["watch", "--once", "--seconds", "1", "--zenoh-config", file]) == 3
+        return capsys.readouterr().err == f"watch: no monitor is on the network; {doubt}\n"
+
+    wait_until(doubted, "a table without monitors")
+
+
+def test_a_camera_is_fed_through_the_rules(site: Site, tmp_path: Path):
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((8, 8), np.uint8))
+    with site.session("monitor") as monitor:
+        images: list[zenoh.Sample] = []
+        _images = monitor.declare_subscriber(f"{PREFIX}/image", images.append)
+        command = ["feed", str(tmp_path), "--robot", "arm", "--zenoh-config", str(site.file("robot"))]
+        wait_until(lambda: main(command) == 0 and images, "the image")
 
 
 def test_a_controller_can_neither_speak_for_a_monitor_nor_for_the_jaw(site: Site):

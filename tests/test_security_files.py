@@ -17,7 +17,7 @@ from router_process import ROOT, plain_config, running
 from gripmon.cli import main
 from gripmon.config import load_config
 from gripmon.wire import PublishError, PublishSettings, zenoh_config
-from gripmon.wire.files import load_file, said
+from gripmon.wire.files import ZenohFileError, load_file, said
 
 SHIPPED = sorted((ROOT / "configs" / "zenoh").glob("*.json5"))
 LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")
@@ -83,8 +83,20 @@ def test_certificates_count_from_their_file_and_are_there(folder: Path, tmp_path
         zenoh_config(PublishSettings(zenoh_config="monitor.json5"), tmp_path)
     assert str(caught.value) == (
         f"publish.zenoh_config: {tmp_path}/monitor.json5: transport/link/tls/root_ca_certificate: "
-        f"no file {tmp_path}/certificates/ca.pem; gripmon certificates makes one"
+        f"no file {tmp_path}/certificates/ca.pem; "
+        "copy it from where the certificates were made (by gripmon certificates, once for all machines)"
     )
+
+
+def test_where_certificates_are_made_a_missing_one_can_be(tmp_path: Path):
+    certificates = tmp_path / "certificates"
+    assert main(["certificates", "operator", "--out", str(certificates)]) == 0
+    for name in ("router", "monitor"):
+        (tmp_path / f"{name}.json5").write_bytes((ROOT / "configs" / "zenoh" / f"{name}.json5").read_bytes())
+    with pytest.raises(ZenohFileError, match=f"; gripmon certificates monitor --out {certificates} makes it$"):
+        load_file(tmp_path / "monitor.json5")
+    with pytest.raises(ZenohFileError, match=f"certificates router --out {certificates} --host ADDRESS makes it$"):
+        load_file(tmp_path / "router.json5")
 
 
 def test_a_key_that_others_may_read_is_refused(tmp_path: Path):
@@ -115,7 +127,12 @@ def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, c
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
     assert main(["certificates", "monitor", "arm7", "--out", str(tmp_path)]) == 0
-    assert "monitor-key.pem: there already" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    hosts = "localhost, 127.0.0.1, ::1, 10.0.0.5, site.example"
+    assert f"router-key.pem: made, common name router, for a router (and as a client) at {hosts}\n" in printed
+    text = "there already, left alone: common name monitor, for a client only; to change that, delete both files\n"
+    assert f"monitor-key.pem: {text}" in printed
+    assert "arm7-key.pem: made, common name arm7, for a client only (--host makes it a router's)\n" in printed
     assert {file: file.read_bytes() for file in before} == before
     authority = x509.load_pem_x509_certificate(before[tmp_path / "ca.pem"])
     for name in ("router", "arm7"):
@@ -136,6 +153,7 @@ def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, c
         (["ca"], None, "can't be a name"),
         (["x"], "ca.pem", "can't be read"),
         (["x"], "ca-key.pem", "can't be read"),
+        (["one"], "one.pem", "one.pem is no certificate: "),
     ],
 )
 def test_bad_requests_for_certificates(
@@ -155,7 +173,9 @@ def test_bad_requests_for_certificates(
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("{", "expected"),
+        ("{", "line 1, column 2: expected"),
+        ("{\n mode: 'router',\n listen: 3 }", "line 3, column 10: invalid type: integer `3`, a mapping was expected"),
+        ("{ listen: {endpoints: ['tcp/10.0.0.1:70000']} }", "listen.endpoints: tcp/10.0.0.1:70000: 70000 can't be"),
         ("{ mode: 'router', lisen: {} }", "unknown field `lisen`"),
         ("{ mode: 'peer' }", "mode: peer doesn't route; router"),
         ("{}", 'listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]'),
@@ -172,6 +192,25 @@ def test_a_router_refuses_bad_files_in_one_line(
     assert main(["router", str(path)]) == 2
     line = capfd.readouterr().err
     assert line.startswith(f"router: {path}: ") and line.count("\n") == 1 and expected in line and ".rs" not in line
+    assert not set("{}|") & set(line), "no data structures of Zenoh's"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("mode: peer\n\tlisten: 3\n", "line 2, column 1: found a tab"),
+        ("mode: sideways\n", "line 1, column 7: mode: unknown variant `sideways`"),
+        ((ROOT / "configs" / "demo.yaml").read_text(), "this is gripmon's configuration, not Zenoh's"),
+        ((ROOT / "configs" / "network.yaml").read_text(), "this is gripmon's configuration, not Zenoh's"),
+    ],
+)
+def test_bad_yaml_is_said_in_one_line(tmp_path: Path, text: str, expected: str):
+    path = tmp_path / "zenoh.yaml"
+    path.write_text(text)
+    with pytest.raises(ZenohFileError) as caught:
+        load_file(path)
+    said_text = str(caught.value)
+    assert said_text.startswith(f"{path}: {expected}") and "\n" not in said_text and "{" not in said_text
 
 
 def test_a_router_without_its_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

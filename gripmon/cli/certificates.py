@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.wire.certificates import Issued
 
 _DESCRIPTION = """\
 Make a small private certificate authority in a folder, and certificates for those who shall talk to
@@ -20,9 +23,9 @@ _EXAMPLES = """\
   gripmon certificates --out certificates                     router, monitor, controller, operator, robot
   gripmon certificates --out certificates --host 10.0.0.5     the router will be reached at 10.0.0.5
   gripmon certificates arm1 arm2 --out certificates           more clients
-  gripmon certificates site7 --host site7.example --out certificates    another router
+  gripmon certificates central --host 10.0.0.1 --out certificates       another router; without --host a client
 
-It needs the package cryptography: pip install 'gripmon[certificates]'.
+It needs the package cryptography: pip install '.[certificates]' in gripmon's checkout.
 exit codes: 0 done; 2 wrong usage, a folder that can't be written to"""
 
 _CLIENTS = ("monitor", "controller", "operator", "robot")
@@ -53,9 +56,9 @@ def add_parser(commands: Any) -> None:
 def make(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon certificates``."""
     try:
-        from gripmon.wire.certificates import Authority
+        from gripmon.wire.certificates import Authority, read
     except ImportError:
-        text = "certificates: the package cryptography is missing; pip install 'gripmon[certificates]'"
+        text = "certificates: the package cryptography is missing; pip install '.[certificates]' in gripmon's checkout"
         raise common.CommandFailedError(text, common.EXIT_USAGE) from None
     folder = common.make_directory(Path(arguments.out))
     if arguments.names:
@@ -68,13 +71,22 @@ def make(arguments: argparse.Namespace) -> int:
             print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
         for name, hosts in wanted.items():
             made = authority.issue(name, hosts)
-            place = f", reached at {', '.join(hosts)}" if hosts and made else ""
-            print(f"{folder / name}.pem, {name}-key.pem: {'made' if made else 'there already, left alone'}{place}")
+            what = _in_words(read(folder / f"{name}.pem"))
+            if made and not hosts:
+                what += " (--host makes it a router's)"
+            said = f"made, {what}" if made else f"there already, left alone: {what}; to change that, delete both files"
+            print(f"{folder / name}.pem, {name}-key.pem: {said}")
     except OSError as error:
         raise common.not_writable(folder, error) from None
     except ValueError as error:
         raise common.CommandFailedError(f"certificates: {error}", common.EXIT_USAGE) from None
     return common.EXIT_DONE
+
+
+def _in_words(issued: Issued) -> str:
+    if issued.serves:
+        return f"common name {issued.name}, for a router (and as a client) at {', '.join(issued.hosts)}"
+    return f"common name {issued.name}, for a client only"
 
 
 def _name(text: str) -> str:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.cli import common, joining
 
 if TYPE_CHECKING:
     from gripmon.publish.frames import FramePublisher
@@ -27,10 +27,10 @@ _EXAMPLES = """\
   gripmon feed images/ --robot arm1
   gripmon feed wrist.mp4 --robot arm1 --format jpeg --loop
   gripmon feed /dev/video0 --robot arm1 --connect tcp/192.168.1.2:7447
+  gripmon feed images/ --robot arm1 --zenoh-config mine/zenoh/robot.json5    docs/security.md
 
 exit codes: 0 the images are at their end; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
 
-_DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _LOOK_AGAIN_S = 0.05
 _LAST_WORD_S = 0.2
 
@@ -46,12 +46,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--robot", required=True, metavar="NAME", help="the robot's name in the Zenoh keys")
     parser.add_argument("--camera", default="wrist", metavar="NAME", help="the camera's name there (default wrist)")
     parser.add_argument("--key", metavar="KEY", help="another key than gripmon/<robot>/<camera>/image")
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help=f"the monitor or a router; may be given several times (default {_DEFAULT_ENDPOINT})",
-    )
+    joining.add_options(parser, "the monitor's")
     parser.add_argument("--format", choices=("raw", "jpeg", "png"), default="raw", help="how (default raw)")
     parser.add_argument("--quality", type=_quality, default=90, metavar="Q", help="of JPEG, 1 to 100 (default 90)")
     parser.add_argument(
@@ -68,13 +63,21 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.wire import Keys, Link, PublishError, PublishSettings
     from gripmon.wire.settings import check_key
 
+    if wrong := joining.misuse(arguments):
+        raise common.CommandFailedError(f"feed: {wrong}", common.EXIT_USAGE)
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     source = _open(arguments)
     try:
         own = Keys(arguments.robot, arguments.camera)["image"]
         key = own if arguments.key is None else check_key(arguments.key)
-        link = Link(PublishSettings(mode="client", connect=tuple(arguments.connect or (_DEFAULT_ENDPOINT,))))
-    except (ValueError, PublishError) as error:
+        if arguments.zenoh_config:
+            link = Link(PublishSettings(zenoh_config=arguments.zenoh_config))
+        else:
+            link = Link(PublishSettings(mode="client", connect=tuple(arguments.connect or (joining.DEFAULT_ENDPOINT,))))
+    except PublishError as error:
+        source.close()
+        raise joining.failure("feed", error) from None
+    except ValueError as error:
         source.close()
         raise common.CommandFailedError(f"feed: {error}", common.EXIT_USAGE) from None
     feeder = _Feeder(arguments, link, key)
@@ -109,7 +112,7 @@ class _Feeder:
 
     def wait(self) -> None:
         """Until there is a monitor or a router: nothing is lost while it starts."""
-        while not self._link.connected:
+        while self._link.fault():
             time.sleep(_LOOK_AGAIN_S)
 
     def send(self, frame: Frame, due_s: float) -> None:

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, snapshots
+from gripmon.cli import common, joining, snapshots
 from gripmon.cli.fleet_table import printable
 
 if TYPE_CHECKING:
@@ -54,13 +54,7 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--robot", required=True, metavar="NAME", help="the robot's name in the configuration")
     parser.add_argument("--camera", metavar="NAME", help="the camera's name; needed if the robot has several")
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="the monitor's or a router's Zenoh endpoint, several times if need be; default: tcp/127.0.0.1:7447",
-    )
-    parser.add_argument("--zenoh-config", metavar="FILE", help="a configuration file of Zenoh's instead of --connect")
+    joining.add_options(parser, "the monitor's")
     parser.add_argument(
         "--timeout", type=common.positive_number, default=5.0, metavar="S", help="how long to wait (s); default: 5"
     )
@@ -96,8 +90,8 @@ def _misuse(arguments: argparse.Namespace) -> str:
     name = arguments.name
     if arguments.id and name not in _WITH_ARGUMENT:
         return f"{name} takes no ID, but {arguments.id} is given; leave it out"
-    if arguments.connect and arguments.zenoh_config:
-        return "--connect has no effect beside --zenoh-config; one of them"
+    if wrong := joining.misuse(arguments):
+        return wrong
     if name == "snapshot" and arguments.out is None:
         return "snapshot has nowhere to go; --out DIR"
     if name != "snapshot" and arguments.out is not None:
@@ -111,15 +105,17 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
     from gripmon.client import Client, NotCarriedOut
     from gripmon.records import CommandFault, CommandName
-    from gripmon.wire import DEFAULT_ENDPOINT
+    from gripmon.wire import PublishError
 
     try:
         client = Client(
             arguments.robot,
             arguments.camera,
-            connect=arguments.connect or (DEFAULT_ENDPOINT,),
+            connect=arguments.connect or (joining.DEFAULT_ENDPOINT,),
             zenoh_config_file=arguments.zenoh_config,
         )
+    except PublishError as error:
+        raise joining.failure("send", error) from None
     except ValueError as error:
         raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
     with client:

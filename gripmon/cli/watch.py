@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, fleet_table
+from gripmon.cli import common, fleet_table, joining
 from gripmon.cli.alert_log import AlertLog
 
 if TYPE_CHECKING:
@@ -48,13 +48,7 @@ def add_parser(commands: Any) -> None:
         _DESCRIPTION,
         _EXAMPLES,
     )
-    parser.add_argument(
-        "--connect",
-        action="append",
-        metavar="ENDPOINT",
-        help="a monitor's or a router's Zenoh endpoint, several times if need be; default: tcp/127.0.0.1:7447",
-    )
-    parser.add_argument("--zenoh-config", metavar="FILE", help="a configuration file of Zenoh's instead of --connect")
+    joining.add_options(parser, "a monitor's")
     parser.add_argument("--alerts", action="store_true", help="print the alerts instead of the table")
     parser.add_argument("--out", metavar="FILE", help="with --alerts: append them to this file, JSON lines")
     parser.add_argument("--transforms", action="store_true", help="listen to every frame's transform for rate and age")
@@ -80,7 +74,7 @@ def watch(arguments: argparse.Namespace) -> int:
             _repeat(log.write, _ALERT_PERIOD_S, end_s)
         elif arguments.once:
             time.sleep(seconds or 0.0)
-            return _show_once(fleet, as_json=arguments.json)
+            return _show_once(fleet, arguments)
         elif arguments.json:
             _repeat(lambda: _print_json(fleet), arguments.period, end_s)
         elif sys.stdout.isatty():
@@ -91,10 +85,8 @@ def watch(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    wrong = ""
-    if arguments.connect and arguments.zenoh_config:
-        wrong = "--connect has no effect beside --zenoh-config; one of them"
-    elif arguments.out and not arguments.alerts:
+    wrong = joining.misuse(arguments)
+    if arguments.out and not arguments.alerts:
         wrong = "--out is for alerts; add --alerts, or redirect the output of --json"
     elif arguments.alerts and (arguments.once or arguments.transforms):
         wrong = "--alerts prints alerts alone; leave out --once and --transforms"
@@ -116,18 +108,18 @@ def _open_log(arguments: argparse.Namespace) -> AlertLog:
 
 def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
     from gripmon.client import Fleet
-    from gripmon.wire import DEFAULT_ENDPOINT, PublishError
+    from gripmon.wire import PublishError
 
     try:
         return Fleet(
-            connect=arguments.connect or (DEFAULT_ENDPOINT,),
+            connect=arguments.connect or (joining.DEFAULT_ENDPOINT,),
             zenoh_config_file=arguments.zenoh_config,
             transforms=arguments.transforms,
             on_alert=None if log is None else log.alert,
             on_presence=None if log is None else log.presence,
         )
     except PublishError as error:
-        raise common.CommandFailedError(f"watch: {error}", common.EXIT_USAGE) from None
+        raise joining.failure("watch", error) from None
 
 
 def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> None:
@@ -151,16 +143,17 @@ def _fault(fleet: Fleet) -> str:
     return "; ".join(filter(None, (fleet.fault(), unreadable)))
 
 
-def _show_once(fleet: Fleet, *, as_json: bool) -> int:
+def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> int:
     statuses = _sorted(fleet)
-    if as_json:
+    if arguments.json:
         _print_json(fleet)
     elif statuses:
         print(fleet_table.plain(statuses, _fault(fleet)))
     if not statuses:
-        raise common.CommandFailedError(
-            f"watch: no monitor is on the network; {fleet.fault() or 'is --connect right?'}"
-        )
+        doubt = "is --connect right?"
+        if arguments.zenoh_config:  # a router's rules drop without a word what they don't allow
+            doubt = f"is {arguments.zenoh_config} for the right router, and may its certificate read there?"
+        raise common.CommandFailedError(f"watch: no monitor is on the network; {fleet.fault() or doubt}")
     return common.EXIT_DONE
 
 

@@ -15,7 +15,7 @@ import zenoh
 import zenoh.ext
 
 from gripmon.client.names import MonitorName, monitor_name
-from gripmon.client.network import reader_settings
+from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.status import MonitorStatus
 from gripmon.records import AlertRecord, MessageRefused, StateRecord, from_json
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
@@ -53,7 +53,7 @@ class Fleet:
     def __init__(
         self,
         *,
-        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        connect: str | Sequence[str] = (DEFAULT_ENDPOINT,),
         zenoh_config_file: str | None = None,
         transforms: bool = False,
         on_alert: Callable[[MonitorName, AlertRecord, bytes], None] | None = None,
@@ -71,7 +71,8 @@ class Fleet:
         self._lock = threading.Lock()  # guards what is above against Zenoh's threads
         self._keys = Keys("*", "*")
         self._declared: list[object] = []  # Zenoh undeclares what nobody refers to
-        self._link = Link(reader_settings(connect, zenoh_config_file))
+        with named_as_arguments():
+            self._link = Link(reader_settings(connect, zenoh_config_file))
         self._link.attach(self._declare)
 
     def __enter__(self) -> Self:

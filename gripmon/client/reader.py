@@ -12,7 +12,7 @@ import msgspec
 import zenoh
 
 from gripmon.client.names import MonitorName, monitor_name
-from gripmon.client.network import reader_settings
+from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.records import (
     CommandError,
     CommandFault,
@@ -54,7 +54,7 @@ class Client:
         robot: str,
         camera: str | None = None,
         *,
-        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        connect: str | Sequence[str] = (DEFAULT_ENDPOINT,),
         zenoh_config_file: str | None = None,
         depth: int = 16,
     ) -> None:
@@ -66,9 +66,10 @@ class Client:
         """
         self.keys = Keys(robot, camera if camera is not None else "*")
         settings = reader_settings(connect, zenoh_config_file)
-        self._session = open_session(zenoh_config(settings), settings)
+        with named_as_arguments():
+            self._session = open_session(zenoh_config(settings), settings)
         self._depth = depth
-        self._where = " or ".join(connect) if zenoh_config_file is None else f"what {zenoh_config_file} names"
+        self._where = " or ".join(settings.connect) if zenoh_config_file is None else f"what {zenoh_config_file} names"
         self._heard: MonitorName | None = None
         self._newest: FrameRecord | None = None
         self._samples = self._subscribe()

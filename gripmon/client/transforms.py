@@ -13,7 +13,7 @@ from gripmon.client.inbox import Entry, Inbox
 from gripmon.client.iterators import AsyncReadings, Readings
 from gripmon.client.judging import judge
 from gripmon.client.names import monitor_name
-from gripmon.client.network import reader_settings
+from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
 
@@ -30,7 +30,7 @@ class TransformClient:
         robot: str,
         camera: str | None = None,
         *,
-        connect: Sequence[str] = (DEFAULT_ENDPOINT,),
+        connect: str | Sequence[str] = (DEFAULT_ENDPOINT,),
         zenoh_config_file: str | None = None,
         policy: Policy | None = None,
         depth: int = 1,
@@ -50,7 +50,8 @@ class TransformClient:
         self._inbox = Inbox()
         self._threads: list[threading.Thread] = []
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
-        self._link = Link(reader_settings(connect, zenoh_config_file))
+        with named_as_arguments():
+            self._link = Link(reader_settings(connect, zenoh_config_file))
         self._link.attach(self._declare)
 
     def __enter__(self) -> Self:

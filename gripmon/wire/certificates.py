@@ -10,6 +10,7 @@ import datetime
 import ipaddress
 import os
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
@@ -62,6 +63,33 @@ class Authority:
         _write(key_path, _private_pem(key), secret=True)
         _write(path, certificate.public_bytes(serialization.Encoding.PEM))
         return True
+
+
+@dataclass(frozen=True)
+class Issued:
+    """What a certificate says of its holder: common name, whether a server may show it, and under which hosts."""
+
+    name: str
+    serves: bool
+    hosts: tuple[str, ...]
+
+
+def read(path: Path) -> Issued:
+    """What is in a certificate.  Raises ValueError for a file that is none, OSError for one that can't be read."""
+    try:
+        certificate = x509.load_pem_x509_certificate(path.read_bytes())
+        names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+        found = {type(each.value): each.value for each in certificate.extensions}
+    except (ValueError, x509.DuplicateExtension) as error:
+        raise ValueError(f"{path} is no certificate: {error}; delete it and its key for new ones") from error
+    uses = found.get(x509.ExtendedKeyUsage, ())
+    alternatives = found.get(x509.SubjectAlternativeName, ())
+    hosts = [str(each.value) for each in alternatives if isinstance(each, (x509.DNSName, x509.IPAddress))]
+    return Issued(
+        name=str(names[0].value) if names else "",
+        serves=ExtendedKeyUsageOID.SERVER_AUTH in uses,
+        hosts=tuple(hosts),
+    )
 
 
 def _is_missing(certificate: Path, key: Path) -> bool:

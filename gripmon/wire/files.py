@@ -8,6 +8,8 @@ from pathlib import Path
 import msgspec
 import zenoh
 
+from gripmon.wire.zenoh_errors import in_short
+
 _TLS = "transport/link/tls"
 _TLS_FILES = (
     "root_ca_certificate",
@@ -34,6 +36,9 @@ def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(path)
     except zenoh.ZError as error:
+        if _is_gripmons(path):
+            right = "one of Zenoh's, as those in configs/zenoh are"
+            raise ZenohFileError(f"{path}: this is gripmon's configuration, not Zenoh's; {right}") from error
         raise ZenohFileError(f"{path}: {in_short(error)}") from error
     if said(config, "mode") is None:
         config.insert_json5("mode", _json(default_mode))
@@ -50,9 +55,10 @@ def said(config: zenoh.Config, key: str) -> object:
     return msgspec.json.decode(config.get_json(key))
 
 
-def in_short(error: zenoh.ZError) -> str:
-    """Zenoh's message on one line, without the places in its source files."""
-    return " ".join(re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).split())
+def _is_gripmons(path: Path) -> bool:
+    """Is it a configuration of ours, given in place of one of Zenoh's?  Only asked when Zenoh can't read it."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return len(set(re.findall(r"^(robot|camera|gripper|reference|monitor)\s*:", text, re.MULTILINE))) > 1
 
 
 def _find_tls_files(config: zenoh.Config, path: Path) -> None:
@@ -63,10 +69,18 @@ def _find_tls_files(config: zenoh.Config, path: Path) -> None:
             continue
         file = path.parent / value
         if not file.is_file():
-            raise ZenohFileError(f"{path}: {key}: no file {file}; gripmon certificates makes one")
+            raise ZenohFileError(f"{path}: {key}: no file {file}; {_remedy(name, file)}")
         if name in _SECRETS and file.stat().st_mode & 0o077:
             raise ZenohFileError(f"{path}: {key}: others may read {file}; chmod 600 {file}")
         config.insert_json5(key, _json(str(file.resolve())))
+
+
+def _remedy(name: str, file: Path) -> str:
+    """Where a missing certificate or key is to come from: a second authority would help nobody."""
+    if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
+        host = " --host ADDRESS" if name.startswith("listen") else ""
+        return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
+    return "copy it from where the certificates were made (by gripmon certificates, once for all machines)"
 
 
 def _json(value: str) -> str:

@@ -11,10 +11,11 @@ from pathlib import Path
 import zenoh
 
 from gripmon.wire.endpoints import endpoints
-from gripmon.wire.files import in_short, said
+from gripmon.wire.files import said
 from gripmon.wire.reach import missing
 from gripmon.wire.session import open_session, zenoh_config
 from gripmon.wire.settings import PublishSettings
+from gripmon.wire.zenoh_errors import in_short
 
 _log = logging.getLogger(__name__)
 

@@ -9,8 +9,9 @@ from typing import Self
 import zenoh
 
 from gripmon.wire.endpoints import endpoints, endpoints_fault
-from gripmon.wire.files import ZenohFileError, in_short, load_file, said
+from gripmon.wire.files import ZenohFileError, load_file, said
 from gripmon.wire.reach import missing
+from gripmon.wire.zenoh_errors import in_short
 
 
 class Router:

@@ -11,8 +11,9 @@ import msgspec
 import zenoh
 
 from gripmon.wire.endpoints import endpoints, endpoints_fault
-from gripmon.wire.files import ZenohFileError, in_short, load_file, said
-from gripmon.wire.settings import PublishError, PublishSettings
+from gripmon.wire.files import ZenohFileError, load_file, said
+from gripmon.wire.settings import PublishError, PublishSettings, form_fault
+from gripmon.wire.zenoh_errors import in_short
 
 
 def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh.Config:
@@ -24,17 +25,21 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
     if settings.zenoh_config is not None:
         for key in ("mode", "listen", "connect", "multicast_scouting"):
             if getattr(settings, key) != getattr(defaults, key):
-                raise PublishError(f"publish.{key}: has no effect beside publish.zenoh_config; say it in that file")
+                raise PublishError(key, "has no effect beside publish.zenoh_config; say it in that file")
         path = relative_to / settings.zenoh_config
         try:
             config = load_file(path)
         except ZenohFileError as error:
-            raise PublishError(f"publish.zenoh_config: {error}") from error
+            raise PublishError("zenoh_config", str(error)) from error
         if fault := endpoints_fault(config):
-            raise PublishError(f"publish.zenoh_config: {path}: {fault[0]}/endpoints: {fault[1]}")
+            raise PublishError("zenoh_config", f"{path}: {fault[0]}/endpoints: {fault[1]}")
         return config
     if settings.mode == "client" and not (settings.connect or settings.multicast_scouting):
-        raise PublishError("publish.connect: a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
+        raise PublishError("connect", "a client needs a router; give its endpoint, e.g. tcp/192.168.1.2:7447")
+    for key in ("listen", "connect"):
+        for endpoint in getattr(settings, key):
+            if wrong := form_fault(endpoint):
+                raise PublishError(key, wrong)
     config = zenoh.Config()
     listen = settings.listen if settings.mode == "peer" else ()
     entries = {
@@ -63,9 +68,9 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         try:
             config.insert_json5(key, msgspec.json.encode(value).decode())
         except zenoh.ZError as error:
-            raise PublishError(f"publish.{key.split('/')[0]}: {in_short(error)}") from error
+            raise PublishError(key.split("/")[0], in_short(error)) from error
     if fault := endpoints_fault(config):
-        raise PublishError(f"publish.{fault[0]}: {fault[1]}")
+        raise PublishError(*fault)
     return config
 
 
@@ -90,10 +95,11 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        keys = [f"publish.{key}" for key in ("listen", "connect") if getattr(settings, key)]
-        key = " or ".join(keys) if settings.zenoh_config is None else "publish.zenoh_config"
+        keys = [key for key in ("listen", "connect") if getattr(settings, key)]
+        if settings.zenoh_config is not None:
+            keys = ["zenoh_config"]
         if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
-            key = key.split(" or ")[0]
             remedy = "stop the program that has it, or choose another port"
-            raise PublishError(f"{key}: {taken[1]} is already in use; {remedy}") from error
-        raise PublishError(f"{key}: can't open a Zenoh session: {in_short(error)}") from error
+            raise PublishError(keys[0], f"{taken[1]} is already in use; {remedy}") from error
+        text = f"can't open a Zenoh session: {in_short(error)}"
+        raise PublishError(" or publish.".join(keys), text) from error

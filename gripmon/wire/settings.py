@@ -20,7 +20,14 @@ Endpoint = Annotated[
 
 
 class PublishError(ValueError):
-    """The session can't be opened as configured; the text is ``key: what is wrong; what would be right``."""
+    """The session can't be opened as configured; the text is ``key: what is wrong; what would be right``.
+
+    ``key`` is the one of the section ``publish``; ``text`` what follows it, for those who call it by another name.
+    """
+
+    def __init__(self, key: str, text: str, name: str = "") -> None:
+        super().__init__(f"{name or f'publish.{key}'}: {text}")
+        self.key, self.text = key, text
 
 
 class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -65,6 +72,13 @@ class Keys:
 
     def __getitem__(self, leaf: str) -> str:
         return f"gripmon/{self.robot}/{self.camera}/{leaf}"
+
+
+def form_fault(endpoint: object) -> str:
+    """What is wrong with an endpoint's form, and what would be right; empty if it can be one."""
+    if not isinstance(endpoint, str) or not re.fullmatch(_ENDPOINT_PATTERN.rstrip("$"), endpoint):
+        return f"{endpoint!r} is no endpoint; protocol/address, e.g. {DEFAULT_ENDPOINT}"
+    return ""
 
 
 def check_name(role: str, name: str) -> str:
