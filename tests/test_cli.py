@@ -288,14 +288,14 @@ def test_ctrl_c_in_simulate_leaves_no_traceback(tmp_path: Path):
 
 def test_the_demo_keeps_what_it_promises(tmp_path: Path):
     out = tmp_path / "demo"
-    done = gripmon("demo", "--seconds", "8", "--fps", "20", "--out", out)
+    done = gripmon("demo", "--seconds", "10", "--fps", "12", "--out", out)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     records = [
         msgspec.json.decode(line, type=FrameRecord) for line in (out / "estimates.jsonl").read_bytes().splitlines()
     ]
     assert len(list(out.glob("*.rrd"))) == 1 and summary["recordings"] == ["demo-0001.rrd"]
-    assert summary["frames"] == len(records) > 100
+    assert summary["frames"] == len(records) > 60
     assert summary["transforms_received"] == summary["frames"]
     comparison = summary["comparison"]
     assert comparison["without_correction"]["across_mm"]["max"] > 4.0
