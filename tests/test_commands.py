@@ -168,7 +168,7 @@ def test_malformed_requests_are_counted_and_said_once(
         for _ in range(3):
             answers(session, f"{CMD}/undo", b"no JSON")
     assert publisher.commands.malformed == 3
-    assert [m for m in caplog.messages if "malformed command on" in m] == caplog.messages and len(caplog.messages) == 1
+    assert sum("malformed command on" in message for message in caplog.messages) == 1
 
 
 # --- the client ---
