@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import zenoh
+from commanded import Loop, reply_to
+from loopback import free_endpoint, plain_session
+from published import Published
+
+from gripmon.wire import PublishSettings
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -15,3 +22,32 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def _state_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """No test finds what another one, or the user's own monitor, keeps over restarts."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state-home"))
+
+
+@pytest.fixture
+def endpoint() -> str:
+    """An address on loopback that nobody listens at."""
+    return free_endpoint()
+
+
+@pytest.fixture
+def publisher(endpoint: str) -> Iterator[Published]:
+    """The monitor ``arm/wrist``, without a camera, listening there."""
+    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def loop(publisher: Published) -> Iterator[Loop]:
+    """What carries out that monitor's commands."""
+    made = Loop(publisher.commands, reply_to)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
+    """Somebody else on the network, connected to that monitor."""
+    with plain_session(connect=endpoint) as opened:
+        yield opened

@@ -15,18 +15,6 @@ from gripmon.wire import PublishError, PublishSettings
 
 
 @pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def publisher(endpoint: str) -> Iterator[Published]:
-    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
-    yield made
-    made.close()
-
-
-@pytest.fixture
 def client(publisher: Published, endpoint: str) -> Iterator[Client]:
     with Client("arm", connect=[endpoint]) as made:
         wait_until(made.alive, "the client to find the monitor")

@@ -7,12 +7,11 @@ import json
 import re
 import threading
 from collections import Counter
-from collections.abc import Iterator
 
 import pytest
 import zenoh
 from commanded import CMD, Loop, answers, reply_to
-from loopback import free_endpoint, plain_session, wait_until
+from loopback import plain_session, wait_until
 from published import Published
 
 from gripmon.cli import main
@@ -20,31 +19,6 @@ from gripmon.client import Client, NotCarriedOut
 from gripmon.publish.commands import ZenohCommands
 from gripmon.records import Command, CommandFault, CommandName, CommandReply
 from gripmon.wire import Keys, Link, PublishSettings
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def publisher(endpoint: str) -> Iterator[Published]:
-    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def loop(publisher: Published) -> Iterator[Loop]:
-    made = Loop(publisher.commands, reply_to)
-    yield made
-    made.end()
-
-
-@pytest.fixture
-def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
-    with plain_session(connect=endpoint) as made:
-        yield made
 
 
 def asked_with(request_id: str, argument: str = "") -> bytes:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
-from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -19,31 +18,6 @@ from gripmon.client import Client, NotCarriedOut
 from gripmon.publish.commands import ZenohCommands
 from gripmon.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
 from gripmon.wire import Keys, Link, PublishSettings
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def publisher(endpoint: str) -> Iterator[Published]:
-    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def loop(publisher: Published) -> Iterator[Loop]:
-    made = Loop(publisher.commands, reply_to)
-    yield made
-    made.end()
-
-
-@pytest.fixture
-def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
-    with plain_session(connect=endpoint) as made:
-        yield made
 
 
 @pytest.mark.parametrize("name", list(CommandName))

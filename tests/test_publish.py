@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -16,7 +15,6 @@ from loopback import (
     ask,
     can_bind,
     frame_record,
-    free_endpoint,
     plain_session,
     reference_record,
     state_record,
@@ -29,24 +27,6 @@ from gripmon.records import Verdict
 from gripmon.wire import Keys, PublishError, PublishSettings
 
 PREFIX = "gripmon/arm/wrist"
-
-
-@pytest.fixture
-def endpoint() -> str:
-    return free_endpoint()
-
-
-@pytest.fixture
-def publisher(endpoint: str) -> Iterator[Published]:
-    made = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
-    yield made
-    made.close()
-
-
-@pytest.fixture
-def session(publisher: Published, endpoint: str) -> Iterator[zenoh.Session]:
-    with plain_session(connect=endpoint) as opened:
-        yield opened
 
 
 def received(subscriber: zenoh.Subscriber, put: object) -> zenoh.Sample:

@@ -249,10 +249,9 @@ class SequentialTest:
                 self._settings.false_alarms_per_day, self._frames_per_s, self.scatter.windows
             )
         heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
-        inflation = self._inflation**heavy * np.maximum(self._surge, 1.0)
-        # What is told of a mean is its standard deviation, not what would be too rare.
         surge = np.maximum(self._surge, 1.0)
-        each = np.stack([inflation, np.ones_like(inflation), surge])
+        # What is told of a mean is its standard deviation, not what would be too rare.
+        each = np.stack([self._inflation**heavy * surge, np.ones_like(surge), surge])
         of_mean, of_difference = self.scatter.covariances(self._reported, each)
         self._plain = whitening(np.stack([of_mean[2, :SHORT], of_difference[2, :SHORT]]))
         of_mean += self._reference
