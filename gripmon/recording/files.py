@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import rerun as rr
 
@@ -25,11 +27,13 @@ class FileSeries:
     """``name-0001.rrd`` and on.  Frames that arrive while nothing can be written are counted as lost.
 
     All files of a series carry one recording id: a viewer that is given several of them shows one recording.
+    ``extra_sinks`` is called for every file that begins; its rerun sinks get all that the file gets.
     """
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, extra_sinks: Callable[[], Sequence[Any]] = tuple):
         rr.set_strict_mode(True)
         self._scene = scene
+        self._extra_sinks = extra_sinks
         self._directory = Path(scene.directory)
         self._number = 1
         self._own_files: list[Path] = []
@@ -108,7 +112,7 @@ class FileSeries:
         path = self._next_path()
         stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
         try:
-            stream.set_sinks(rr.FileSink(path))
+            stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
             stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
             writer = RowWriter(stream, self._scene)
