@@ -1,0 +1,12 @@
+"""Reading recordings: what monitors wrote down, as columns, records and pictures, whatever state the files are in.
+
+``open_recordings(paths, progress)`` takes files and folders, of several runs and robots, in any order, and gives a
+:class:`Collection`: the recordings, each one run of one monitor, and the faults, one line each, of what could not be
+used.  No file is ever changed.
+"""
+
+from __future__ import annotations
+
+from gripmon.playback.table import FrameTable
+
+__all__ = ["FrameTable"]
