@@ -49,8 +49,8 @@ def route(arguments: argparse.Namespace) -> int:
         except ZenohFileError as error:
             raise common.CommandFailedError(f"router: {error}", common.EXIT_USAGE) from None
         with router:
-            _say(f"listening on {', '.join(router.listens_on)}")
             try:
+                _say(f"listening on {', '.join(router.listens_on)}")
                 _watch(router)
             finally:
                 _say("stopped")
