@@ -19,6 +19,7 @@ from gripmon.records import (
     MeasurementTrace,
     MonitorState,
     Origin,
+    RecordedCommand,
     ReferenceRecord,
     StateRecord,
     Verdict,
@@ -117,6 +118,7 @@ class Listener:
         self.alerts: list[AlertRecord] = []
         self.references: list[ReferenceRecord] = []
         self.offered: list[tuple[Frame, FrameRecord]] = []
+        self.commands: list[RecordedCommand] = []
         self.closed = 0
         self.dropped = 0
         self.failure: str | None = None
@@ -138,6 +140,10 @@ class Listener:
     def reference(self, record: ReferenceRecord) -> None:
         self._take("reference", record.revision)
         self.references.append(record)
+
+    def command(self, record: RecordedCommand) -> None:
+        self._take("command", record.seq)
+        self.commands.append(record)
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
         self._take("offer", record.revision)

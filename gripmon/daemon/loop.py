@@ -34,6 +34,7 @@ from gripmon.records import (
     FrameRecord,
     MonitorState,
     OpenAlert,
+    RecordedCommand,
     Severity,
     State,
     StateRecord,
@@ -210,14 +211,19 @@ class Daemon:
         if asked is None:
             return
         command, answer = asked.command, None
+        stamp_ns = time.time_ns()
         try:
-            answer = self._monitor.command(command, time.time_ns())
+            answer = self._monitor.command(command, stamp_ns)
             said = f"{'done' if answer.done else 'refused'}: {answer.text}"
         except Exception as error:  # noqa: BLE001  said, to the asker, too
             said = f"internal error: {_in_short(error)}"
             _log.debug("command %s", command.name, exc_info=error)
         _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, said)
         self._make_reference_known()
+        text = said if answer is None else answer.text
+        carried_out = answer is not None and answer.done
+        told = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
+        self._deliver("command's recording", self._recorder.command, told)
         # What has been answered as done must be so after a crash, too.
         self._deliver("state's keeping", self._keep_changes, at_once=True)
         if answer and answer.done and self._keeper.failure:
@@ -332,6 +338,7 @@ class Daemon:
             malformed=self._ask(reports.malformed, 0),
         )
         self._deliver("state", self._publisher.state, self._said)
+        self._deliver("state's recording", self._recorder.state, self._said)
         if due:
             self._next_state_s = now_s + self._settings.state_period_s
             self._keep_house()

@@ -17,8 +17,20 @@ from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.process import WorkerProcess
 from gripmon.recording.settings import RecordingSettings
-from gripmon.recording.wire import EncodedBatch, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
-from gripmon.records import AlertRecord, Frame, FrameRecord, Image, MeasurementTrace, ReferenceRecord, State, Verdict
+from gripmon.recording.wire import EncodedBatch, Events, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
+from gripmon.records import (
+    AlertRecord,
+    Frame,
+    FrameRecord,
+    Image,
+    MeasurementTrace,
+    RecordedCommand,
+    RecordedConfiguration,
+    ReferenceRecord,
+    State,
+    StateRecord,
+    Verdict,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -54,6 +66,8 @@ class Recorder(Protocol):
 
     def alert(self, alert: AlertRecord) -> None: ...
     def reference(self, reference: ReferenceRecord) -> None: ...
+    def command(self, command: RecordedCommand) -> None: ...
+    def state(self, state: StateRecord) -> None: ...
     def close(self, timeout_s: float = 2.0) -> None: ...
 
 
@@ -72,6 +86,12 @@ class NullRecorder:
     def reference(self, reference: ReferenceRecord) -> None:
         pass
 
+    def command(self, command: RecordedCommand) -> None:
+        pass
+
+    def state(self, state: StateRecord) -> None:
+        pass
+
     def close(self, timeout_s: float = 2.0) -> None:
         pass
 
@@ -88,6 +108,7 @@ def open_recorder(
     name: str | None = None,
     truth_tcp_m: Truth | None = None,
     patience_s: float = 0.0,
+    configuration: RecordedConfiguration | None = None,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
 
@@ -95,7 +116,7 @@ def open_recorder(
     which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
     the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  ``patience_s`` is
     for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a frame.  A camera
-    can't wait: 0.  Raises OSError when the directory can't be made.
+    can't wait: 0.  ``configuration`` is written into every file.  Raises OSError when the directory can't be made.
     """
     if not settings.enabled:
         return NullRecorder()
@@ -105,7 +126,7 @@ def open_recorder(
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
     where = str(folder.resolve())
     has_truth = truth_tcp_m is not None
-    scene = make_scene(settings, where, name, robot, camera_name, camera, gripper, reference, has_truth)
+    scene = make_scene(settings, where, name, robot, camera_name, camera, gripper, reference, has_truth, configuration)
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
 
 
@@ -137,6 +158,8 @@ class ProcessRecorder:
         self._frames: deque[_Waiting] = deque()
         self._alerts: deque[AlertRecord] = deque(maxlen=_EVENTS_KEPT)
         self._references: deque[ReferenceRecord] = deque(maxlen=_EVENTS_KEPT)
+        self._commands: deque[RecordedCommand] = deque(maxlen=_EVENTS_KEPT)
+        self._states: deque[StateRecord] = deque(maxlen=_EVENTS_KEPT)
         # Written by the hand-over thread only.
         self._images_taken = 0
         self._images_without_slot = 0
@@ -213,6 +236,14 @@ class ProcessRecorder:
         """Record a new reference; the first one was given at the start."""
         self._references.append(reference)
 
+    def command(self, command: RecordedCommand) -> None:
+        """Record a command and what became of it."""
+        self._commands.append(command)
+
+    def state(self, state: StateRecord) -> None:
+        """Record a state message."""
+        self._states.append(state)
+
     def close(self, timeout_s: float = 2.0) -> None:
         """Write what is waiting, finish the file, release everything; at most ``timeout_s``, then by force."""
         if self._closing.is_set():
@@ -255,9 +286,9 @@ class ProcessRecorder:
         worker.pump()
         worker.read_reports()
         self._status = worker.status
-        while worker.ready and (self._frames or self._alerts or self._references):
+        while worker.ready:
             batch = self._next_batch(worker)
-            if not (batch.frames or batch.alerts or batch.references):
+            if not (batch.frames or batch.events):
                 break
             worker.send(self._encode(batch))
         if worker.gone:
@@ -296,10 +327,10 @@ class ProcessRecorder:
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)
-        references = _drain(self._references)
-        if references:
-            self._newest_reference = references[-1]
-        return EncodedBatch(frames, _drain(self._alerts), references)
+        events = Events(_drain(self._alerts), _drain(self._references), _drain(self._commands), _drain(self._states))
+        if events.references:
+            self._newest_reference = events.references[-1]
+        return EncodedBatch(frames, events)
 
     def _wait_for_slot(self, worker: WorkerProcess, image: Image | None) -> bool:
         """Whether the next frame stays in the queue because its image has no room yet and patience is left."""

@@ -10,10 +10,10 @@ from typing import Any
 
 import rerun as rr
 
+from gripmon.recording.columns import Row
 from gripmon.recording.layout import make_blueprint
-from gripmon.recording.rows import Row, RowWriter
-from gripmon.recording.wire import Scene
-from gripmon.records import AlertRecord, ReferenceRecord
+from gripmon.recording.rows import RowWriter
+from gripmon.recording.wire import Events, Scene
 
 APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0
@@ -41,8 +41,7 @@ class FileSeries:
         self._stream: rr.RecordingStream | None = None
         self._writer: RowWriter | None = None
         self._rows: list[Row] = []
-        self._alerts: list[AlertRecord] = []
-        self._references: list[ReferenceRecord] = []
+        self._events = Events()
         self._newest_reference = scene.reference
         self._frames_in_file = 0
         self._retry_s = _FIRST_RETRY_S
@@ -59,13 +58,10 @@ class FileSeries:
     def add_frames(self, rows: list[Row]) -> None:
         self._rows += rows
 
-    def add_alerts(self, alerts: list[AlertRecord]) -> None:
-        self._alerts += alerts
-
-    def add_references(self, references: list[ReferenceRecord]) -> None:
-        self._references += references
-        if references:
-            self._newest_reference = references[-1]
+    def add_events(self, events: Events) -> None:
+        self._events += events
+        if events.references:
+            self._newest_reference = events.references[-1]
 
     def write(self) -> None:
         """Put on disk what has been added; begin, end or change the file where that is due."""
@@ -74,9 +70,9 @@ class FileSeries:
         if self._stream is None or self._writer is None or self._file is None:
             self._lose()
             return
-        rows, alerts, references = self._rows, self._alerts, self._references
-        self._rows, self._alerts, self._references = [], [], []
-        self._writer.write(rows, alerts, references)
+        rows, events = self._rows, self._events
+        self._rows, self._events = [], Events()
+        self._writer.write(rows, events)
         try:
             self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
             size = self._file.stat().st_size
@@ -115,15 +111,15 @@ class FileSeries:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
             stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
-            writer = RowWriter(stream, self._scene)
+            writer = RowWriter(stream, self._scene, self._number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
             path.unlink(missing_ok=True)
             self._fail(f"can't write {path}: {error}")
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
-        if self._newest_reference not in self._references:
-            self._references.insert(0, self._newest_reference)
+        if self._newest_reference not in self._events.references:
+            self._events = Events(references=[self._newest_reference]) + self._events
         self._stream, self._writer, self._file = stream, writer, path
         self._frames_in_file = 0
         self._number += 1
@@ -149,7 +145,7 @@ class FileSeries:
 
     def _lose(self) -> None:
         self.frames_lost += len(self._rows)
-        self._rows, self._alerts, self._references = [], [], []
+        self._rows, self._events = [], Events()
 
     def _next_path(self) -> Path:
         while True:

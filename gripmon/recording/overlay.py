@@ -14,7 +14,7 @@ from gripmon.recording.wire import Scene, TraceNote, pairs
 from gripmon.records import FrameRecord
 
 if TYPE_CHECKING:
-    from gripmon.recording.rows import Row, Sender
+    from gripmon.recording.columns import Row, Sender
 
 IMAGE = "rig/camera/image"
 _POINT_PX = 1.6

@@ -13,7 +13,7 @@ from gripmon.recording.wire import Scene
 from gripmon.records import Array, FrameRecord, ReferenceRecord, Verdict
 
 if TYPE_CHECKING:
-    from gripmon.recording.rows import Row, Sender
+    from gripmon.recording.columns import Row, Sender
 
 _IMAGE_PLANE_SHARE = 1.35  # of the distance to the TCP: the image is a backdrop for the fingers
 _AXIS_M = 0.012

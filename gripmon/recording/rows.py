@@ -14,144 +14,68 @@ chunk an entity, which costs a tenth of logging frame by frame.
 ``image/…``                     statistics of the recorded images
 ``status/state``, ``verdict``   as state changes;  ``events`` alerts and changes as text
 ``record``                      the frame's whole record, one JSON line as ``replay`` writes it, to the last digit
+``meta``, ``configuration``     what this file is and what the monitor ran with, static, JSON as all that follows
+``reference``                   the one in force at the file's beginning, and each new one
+``alert``                       alerts that are in no frame's record: the daemon's own
+``command``, ``state``          commands that were carried out or refused; state messages
 ==============================  ====================================================================================
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import rerun as rr
 
 from gripmon.recording import palette
+from gripmon.recording.columns import Row, Sender
+from gripmon.recording.events import EventWriter, Line
 from gripmon.recording.overlay import OverlayWriter
 from gripmon.recording.rig import RigWriter
-from gripmon.recording.wire import Scene, TraceNote
-from gripmon.records import (
-    Alert,
-    AlertEvent,
-    AlertRecord,
-    FrameRecord,
-    ReferenceRecord,
-    Severity,
-    State,
-    Verdict,
-    to_json,
-)
-
-_LONGEST_SILENCE_NS = 86_400_000_000_000  # between a frame and an alert that belongs to no frame: a day
-_LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
-
-
-@dataclass(frozen=True, slots=True)
-class Picture:
-    """An encoded image and what was measured on it (grey values 0..255)."""
-
-    blob: bytes
-    media_type: str
-    mean_grey: float
-    contrast_grey: float
-    saturated_percent: float
-    sharpness: float
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    record: FrameRecord
-    picture: Picture | None
-    trace: TraceNote | None
-    truth_tcp_m: tuple[float, float, float] | None
-    jaw_reported_m: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    stamp_ns: int
-    seq: int
-    level: str
-    text: str
-
-
-class Sender:
-    """Sends columns with both timelines."""
-
-    def __init__(self, stream: rr.RecordingStream):
-        self.stream = stream
-
-    def static(self, path: str, *archetypes: rr.AsComponents) -> None:
-        for archetype in archetypes:
-            self.stream.log(path, archetype, static=True)
-
-    def columns(self, path: str, stamps_ns: list[int], seqs: list[int], columns: rr.ComponentColumnList) -> None:
-        times = np.array(stamps_ns, np.int64).astype("datetime64[ns]")
-        indexes = [rr.TimeColumn("capture_time", timestamp=times), rr.TimeColumn("frame", sequence=seqs)]
-        self.stream.send_columns(path, indexes, columns)
-
-    def frames(self, path: str, rows: Sequence[Row], columns: rr.ComponentColumnList) -> None:
-        self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)
-
-    def scalars(self, path: str, rows: Sequence[Row], values: Sequence[Sequence[float]]) -> None:
-        """Several curves; a row without values leaves a gap in them."""
-        flat = np.array([v for some in values for v in some], dtype=np.float64)
-        self.frames(path, rows, rr.Scalars.columns(scalars=flat).partition([len(some) for some in values]))
-
-    def curve(self, path: str, rows: Sequence[Row], values: Sequence[float | None]) -> None:
-        """One curve; None leaves a gap in it."""
-        self.scalars(path, rows, [() if value is None else (value,) for value in values])
+from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.wire import Events, Scene, TraceNote
+from gripmon.records import FrameRecord, Meta, ReferenceRecord, to_json
 
 
 class RowWriter:
     """Writes rows into one file.  The constructor writes what is static."""
 
-    def __init__(self, stream: rr.RecordingStream, scene: Scene):
+    def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int):
         self._send = Sender(stream)
+        self._events = EventWriter(self._send)
         self._overlay = OverlayWriter(self._send, scene)
         self._rig = RigWriter(self._send, scene)
-        self._state = ""
-        self._verdict = ""
         self._references: list[ReferenceRecord] = []
-        self._newest_stamp_ns: int | None = None
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
         self._log_static(scene)
+        self._log_origin(scene, file_number)
 
-    def write(self, rows: Sequence[Row], alerts: Sequence[AlertRecord], references: Sequence[ReferenceRecord]) -> None:
+    def write(self, rows: Sequence[Row], events: Events) -> None:
         """Send everything that was gathered since the last call.
 
         References wait for a frame: their own stamp may lie long before the recording, or be no time at all.
         """
-        for r in references:
+        for r in events.references:
             self._reference_tcp_m[r.reference_id, r.revision] = r.cam_T_grip.translation_m
-        self._references += references
-        events = [_event(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in alerts]
+        self._references += events.references
+        lines: list[Line] = []
         if rows:
-            self._newest_stamp_ns = rows[-1].record.stamp_ns
-            events += [self._write_reference(r, _first_with(r, rows)) for r in self._references]
+            lines = [self._write_reference(r, _first_with(r, rows)) for r in self._references]
             self._references.clear()
-            events += self._status(rows)
             self._curves(rows)
             self._records(rows)
             self._overlay.write(rows)
             self._rig.write(rows)
-        if events:
-            columns = rr.TextLog.columns(text=[e.text for e in events], level=[e.level for e in events])
-            self._send.columns("events", [e.stamp_ns for e in events], [e.seq for e in events], columns)
+        self._events.write(rows, events, lines)
 
-    def _on_frames_clock(self, stamp_ns: int) -> int:
-        """Frames of old files have old stamps: among them an alert of today, which belongs to no frame, would stretch
-        the timeline over years.
-        """
-        if self._newest_stamp_ns is None or abs(stamp_ns - self._newest_stamp_ns) < _LONGEST_SILENCE_NS:
-            return stamp_ns
-        return self._newest_stamp_ns
-
-    def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Event:
+    def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Line:
         self._rig.write_reference(reference, first)
         whole = rr.AnyValues.columns(json=[to_json(reference).decode()])
         self._send.columns("reference", [first.stamp_ns], [first.seq], whole)
-        return Event(first.stamp_ns, first.seq, "INFO", f"reference {reference.reference_id} ({reference.origin})")
+        return Line(first.stamp_ns, first.seq, "INFO", f"reference {reference.reference_id} ({reference.origin})")
 
     def _log_static(self, scene: Scene) -> None:
         static = self._send.static
@@ -169,9 +93,25 @@ class RowWriter:
         static("drift/d_mm", rr.SeriesLines(names="d (mm)", colors=palette.BUSY, widths=2.0))
         static("drift/delta_deg", rr.SeriesLines(names="δ (°)", colors=palette.DOUBTFUL, widths=2.0))
         static("quality/rms_px", rr.SeriesLines(names="rms (px)", colors=palette.BUSY, widths=1.5))
-        static("status/state", _configuration(palette.STATES))
-        static("status/verdict", _configuration(palette.VERDICTS))
         static("about", rr.TextDocument(_about(scene), media_type="text/markdown"))
+
+    def _log_origin(self, scene: Scene, file_number: int) -> None:
+        """What this file is, and what the monitor ran with: each file stands alone."""
+        meta = Meta(
+            name=scene.name,
+            recording_id=scene.recording_id,
+            robot=scene.robot,
+            camera=scene.camera,
+            gripper=scene.gripper,
+            version=scene.version,
+            file_number=file_number,
+            started_ns=time.time_ns(),
+            image_policy=image_policy(scene.settings),
+            has_truth=scene.has_truth,
+        )
+        self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
+        if scene.configuration is not None:
+            self._send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
 
     def _curves(self, rows: Sequence[Row]) -> None:
         send = self._send
@@ -206,25 +146,6 @@ class RowWriter:
         if row.truth_tcp_m is None or reference_tcp_m is None:
             return []
         return [1e3 * (true - old) for true, old in zip(row.truth_tcp_m, reference_tcp_m, strict=True)]
-
-    def _status(self, rows: Sequence[Row]) -> list[Event]:
-        """State and verdict where they change, and what happened as text."""
-        events = []
-        for row in rows:
-            record = row.record
-            at = [record.stamp_ns], [record.seq]
-            if record.state != self._state or record.verdict != self._verdict:
-                before = f"{self._state} ({self._verdict}) → " if self._state else ""
-                reason = f": {record.reason}" if record.reason else ""
-                text = f"{before}{record.state} ({record.verdict}){reason}"
-                events.append(Event(record.stamp_ns, record.seq, "INFO", text))
-            if record.state != self._state:
-                self._send.columns("status/state", *at, rr.StateChange.columns(state=[record.state]))
-            if record.verdict != self._verdict:
-                self._send.columns("status/verdict", *at, rr.StateChange.columns(state=[record.verdict]))
-            self._state, self._verdict = record.state, record.verdict
-            events += [_event(record.stamp_ns, record.seq, alert) for alert in record.alerts]
-        return events
 
     def _records(self, rows: Sequence[Row]) -> None:
         lines = [to_json(row.record).decode() for row in rows]
@@ -261,14 +182,11 @@ def _edge_point_counts(trace: TraceNote) -> tuple[float, float]:
     return float(used.sum()), float(used.size - used.sum())
 
 
-def _event(stamp_ns: int, seq: int, alert: Alert | AlertRecord) -> Event:
-    event = "" if alert.event is AlertEvent.NOTED else f" {alert.event}"
-    said = f"{alert.kind}{event} [{alert.cause}] {alert.text}"
-    return Event(stamp_ns, seq, _LEVELS[alert.severity], f"{said} ({alert.alert_id})" if alert.alert_id else said)
-
-
-def _configuration(colours: dict[State, palette.Colour] | dict[Verdict, palette.Colour]) -> rr.StateConfiguration:
-    return rr.StateConfiguration(values=[str(value) for value in colours], colors=list(colours.values()))
+def image_policy(settings: RecordingSettings) -> str:
+    """Which images are kept, and how, in words."""
+    kind = "PNG" if settings.image_format == "png" else f"JPEG {settings.jpeg_quality} %"
+    rate = f"{settings.image_rate_hz:g} images/s" if settings.image_rate_hz > 0.0 else "no images but"
+    return f"{kind}, {rate}, one at every alert and change"
 
 
 def _about(scene: Scene) -> str:

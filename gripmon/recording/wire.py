@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.settings import RecordingSettings
-from gripmon.records import AlertRecord, FrameRecord, MeasurementTrace, ReferenceRecord
+from gripmon.records import (
+    AlertRecord,
+    FrameRecord,
+    MeasurementTrace,
+    RecordedCommand,
+    RecordedConfiguration,
+    ReferenceRecord,
+    StateRecord,
+)
 
 _JAW_SAMPLES = 33
 _LENGTH_BYTES = 4
@@ -49,6 +57,7 @@ class Scene(msgspec.Struct, frozen=True):
     reference: ReferenceRecord
     has_truth: bool
     version: str
+    configuration: RecordedConfiguration | None
 
 
 class ImageNote(msgspec.Struct, frozen=True, array_like=True):
@@ -77,20 +86,38 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     jaw_reported_m: float | None
 
 
+class Events(msgspec.Struct, frozen=True, array_like=True):
+    """What happened beside the frames: alerts that are in no frame's record, and the rest as the daemon has it."""
+
+    alerts: list[AlertRecord] = []
+    references: list[ReferenceRecord] = []
+    commands: list[RecordedCommand] = []
+    states: list[StateRecord] = []
+
+    def __bool__(self) -> bool:
+        return bool(self.alerts or self.references or self.commands or self.states)
+
+    def __add__(self, later: Events) -> Events:
+        return Events(
+            self.alerts + later.alerts,
+            self.references + later.references,
+            self.commands + later.commands,
+            self.states + later.states,
+        )
+
+
 class Batch(msgspec.Struct, frozen=True, array_like=True):
     """What goes over the pipe at once, as it is read."""
 
     frames: list[FrameNote]
-    alerts: list[AlertRecord]
-    references: list[ReferenceRecord]
+    events: Events
 
 
 class EncodedBatch(msgspec.Struct, frozen=True, array_like=True):
     """The same as it is written: every :class:`FrameNote` is encoded on its own."""
 
     frames: list[msgspec.Raw]
-    alerts: list[AlertRecord]
-    references: list[ReferenceRecord]
+    events: Events
 
 
 class Status(msgspec.Struct, frozen=True):
@@ -116,6 +143,7 @@ def make_scene(
     gripper: Gripper,
     reference: ReferenceRecord,
     has_truth: bool = False,
+    configuration: RecordedConfiguration | None = None,
 ) -> Scene:
     from gripmon import __version__
 
@@ -142,6 +170,7 @@ def make_scene(
         reference=reference,
         has_truth=has_truth,
         version=__version__,
+        configuration=configuration,
     )
 
 

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.recording.columns import Picture, Row
 from gripmon.recording.files import FileSeries
-from gripmon.recording.rows import Picture, Row
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
 
@@ -73,8 +73,7 @@ class RecordingLoop:
             self._files = FileSeries(scene)
             return
         batch = self._decode(payload)
-        self._files.add_references(batch.references)
-        self._files.add_alerts(batch.alerts)
+        self._files.add_events(batch.events)
         self._files.add_frames([self._row(note) for note in batch.frames])
         if any(note.image is not None for note in batch.frames):
             self._report()

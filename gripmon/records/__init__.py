@@ -39,6 +39,7 @@ from gripmon.records.frames import (
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
+from gripmon.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
 from gripmon.records.values import Array, Drift, Image, Smoothed, Transform, to_json
@@ -72,10 +73,14 @@ __all__ = [
     "JawReading",
     "MeasurementTrace",
     "MessageRefused",
+    "Meta",
     "MonitorState",
     "Motion",
     "OpenAlert",
     "Origin",
+    "RecordedCommand",
+    "RecordedConfiguration",
+    "RecordedFile",
     "ReferenceInputs",
     "ReferenceRecord",
     "Refusal",

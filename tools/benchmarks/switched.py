@@ -8,7 +8,7 @@ import msgspec
 
 from gripmon.config import Config
 from gripmon.recording import Trace, open_recorder
-from gripmon.records import AlertRecord, Frame, FrameRecord, ReferenceRecord
+from gripmon.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
 
 
 class SwitchedRecorder:
@@ -43,6 +43,12 @@ class SwitchedRecorder:
 
     def reference(self, record: ReferenceRecord) -> None:
         self._inner.reference(record)
+
+    def command(self, command: RecordedCommand) -> None:
+        self._inner.command(command)
+
+    def state(self, state: StateRecord) -> None:
+        self._inner.state(state)
 
     def close(self, timeout_s: float = 5.0) -> None:
         self._inner.close(timeout_s)
