@@ -72,6 +72,24 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None) -> Network:
     return Network(link, publishers, jaw, commands, reports)
 
 
+def with_metrics(config: Config, publisher: Publisher) -> Publisher:
+    """The publisher, and beside it the server for Prometheus where the configuration wants one; ends the command with
+    exit code 2 where it can't listen.
+    """
+    from gripmon.metrics import MetricsError, MetricsServer
+    from gripmon.publish import Publishers
+
+    settings = config.settings
+    if not settings.metrics.enabled:
+        return publisher
+    try:
+        metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
+    except MetricsError as error:
+        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+    _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
+    return Publishers(publisher, {"metrics": metrics})
+
+
 def with_source(reports: Reports, source: Source) -> Reports:
     """The reports, and what a camera on the network says beside them."""
     from gripmon.sources import NetworkCamera

@@ -99,7 +99,7 @@ def run_daemon(
     import cv2
 
     from gripmon import daemon
-    from gripmon.cli.network import open_network, with_source
+    from gripmon.cli.network import open_network, with_metrics, with_source
     from gripmon.monitor import Monitor
 
     settings = config.settings
@@ -119,6 +119,8 @@ def run_daemon(
         )
         network = open_network(config)
         opened.callback(network.publisher.close)
+        publisher = with_metrics(config, network.publisher)
+        opened.callback(publisher.close)
         on_network()
         recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
         opened.callback(recorder.close)
@@ -127,7 +129,7 @@ def run_daemon(
         return daemon.run(
             monitor,
             source,
-            network.publisher,
+            publisher,
             recorder,
             settings.daemon,
             robot=settings.robot,

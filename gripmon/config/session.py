@@ -7,6 +7,7 @@ from pathlib import Path
 from gripmon.camera import Camera
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
+from gripmon.metrics import package_fault
 from gripmon.ros2 import Ros2Missing, network_of
 from gripmon.ros2.types import typestore
 from gripmon.sources import NetworkSettings, SourceError
@@ -16,6 +17,8 @@ from gripmon.wire import Joining, PublishError, joining
 
 def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Joining | Fault | None:
     """How the network would be joined, or why it can't be; None if it won't.  Paths count from ``directory``."""
+    if (missing := package_fault(settings.metrics)) is not None:
+        return Fault(*missing)
     if not settings.publish.enabled:
         return None
     try:

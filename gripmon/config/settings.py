@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from gripmon.camera import LensSettings
 from gripmon.daemon import DaemonSettings
+from gripmon.metrics import MetricsSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.recording import RecordingSettings
 from gripmon.ros2 import JointOpening, Ros2Settings
@@ -105,5 +106,6 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     publish: PublishSettings = PublishSettings()
     ros2: Ros2Settings = Ros2Settings()
     recording: RecordingSettings = RecordingSettings()
+    metrics: MetricsSettings = MetricsSettings()
     daemon: DaemonSettings = DaemonSettings()
     state: StateSettings = StateSettings()
