@@ -129,6 +129,7 @@ def trace(i: int) -> MeasurementTrace:
         edge_uv_px=rng.uniform(0.0, HEIGHT_PX, (points, 2)),
         edge_used=rng.random(points) < 0.8,
         edge_index=np.zeros(points, np.intp),
+        edge_residual_px=rng.normal(size=points),
         predicted_edges_uv_px=tuple(rng.uniform(0.0, HEIGHT_PX, (n, 2)) for n in (5, 2, 9)),
         predicted_corners_uv_px=predicted_corners,
     )

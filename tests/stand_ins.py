@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from loopback import frame_record, reference_record
 
-from gripmon.recording import Trace
+from gripmon.recording import Notes, Trace
 from gripmon.records import (
     AlertRecord,
     Command,
@@ -16,7 +16,9 @@ from gripmon.records import (
     CornerRecord,
     Frame,
     FrameRecord,
+    Limits,
     MeasurementTrace,
+    MonitorNotes,
     MonitorState,
     Origin,
     RecordedCommand,
@@ -33,6 +35,8 @@ REFUSED = {
     "alerts": (),
     "reason": "black",
 }
+
+NOTES = MonitorNotes(0.5, Limits(1e-4, 3e-3, 2.5e-3, 0.02, (1e-5,) * 6, None, None, None, (1.0,) * 6, (0.0,) * 6))
 
 
 class ScriptedMonitor:
@@ -82,6 +86,9 @@ class ScriptedMonitor:
 
     def trace(self) -> MeasurementTrace | None:
         return None
+
+    def notes(self) -> MonitorNotes:
+        return NOTES
 
 
 class ScriptedSource:
@@ -145,7 +152,7 @@ class Listener:
         self._take("command", record.seq)
         self.commands.append(record)
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         self._take("offer", record.revision)
         self.offered.append((frame, record))
 

@@ -64,7 +64,7 @@ def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.nd
 
 def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
     none = np.empty((0, 2))
-    empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), (), np.full((8, 2), np.nan))
+    empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), np.empty(0), (), np.full((8, 2), np.nan))
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0, corners=()), lambda: empty)
     writer.close(10.0)

@@ -117,7 +117,7 @@ def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple
         if record.revision != revision:
             revision = record.revision
             recorder.reference(monitor.reference)
-        recorder.offer(frame, record, monitor.trace)
+        recorder.offer(frame, record, monitor.trace, monitor.notes)
         yield to_json(record) + b"\n", record
 
 

@@ -28,6 +28,7 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
         edge_uv_px=prediction.uv_px[sample] + candidates.offset_px[:, None] * prediction.normal[sample],
         edge_used=consensus.weight > 0.0,
         edge_index=prediction.layout.edge[sample],
+        edge_residual_px=consensus.residual_px,
         predicted_edges_uv_px=tuple(lines),
         predicted_corners_uv_px=corners_uv_px,
     )

@@ -180,7 +180,7 @@ class Daemon:
             self._alert(alert, record.state, frame.stamp_ns, recorded=True)
         for alert in self._watch.frame(record, time.monotonic()):
             self._alert(alert, record.state, frame.stamp_ns)
-        self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace)
+        self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace, self._monitor.notes)
         self._deliver("estimates", self._estimates.write, record)
         self._deliver("reflection", self._monitor.ponder)
         undelivered = "; ".join(self._faults.values())

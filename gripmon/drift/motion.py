@@ -57,6 +57,8 @@ class MotionWatch:
         self._creep: Creep | None = None
         self._vibrates: Vibration | None = None
         self._last = Motion(False, AlertKind.DRIFT, np.zeros(6), np.zeros(6), 0)
+        self.statistic_share: float | None = None
+        """The newest frame's largest statistic over its threshold, 1 at the threshold; None if it wasn't tested."""
 
     def reset(self, reference_covariance: Array) -> None:
         """There is a new reference, with the covariance (6, 6) of its error: drift is reckoned from zero."""
@@ -84,11 +86,13 @@ class MotionWatch:
 
         None for a shift while the reference's error isn't known yet.
         """
+        self.statistic_share = None
         if shift is None:
             self._last = Motion(self._present, self._kind, np.zeros(6), np.sqrt(covariance.diagonal()), 0)
             return self._last
         test = self.test
         finding = test.add(shift[None], covariance[None], at_least=self._shortest_window(shift))
+        self.statistic_share = float(finding.excess[0])
         moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
         length = int(finding.length[0])
         self._newest.append(shift)
@@ -131,6 +135,7 @@ class MotionWatch:
 
     def skip(self) -> Motion:
         """A frame whose transform is doubtful tells nothing: all is as it was."""
+        self.statistic_share = None
         return replace(self._last, begun=False, stepped=False, suspicious=False)
 
     def _shortest_window(self, shift: Array) -> int:

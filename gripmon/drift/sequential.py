@@ -102,6 +102,8 @@ class SequentialTest:
         self._reported: Array = np.zeros((streams, 6, 6))
         self._reference: Array = np.zeros((streams, 6, 6))
         self._frames = 0
+        self.refreshes = 0
+        """How often covariances and thresholds were reckoned anew."""
         self._surge = np.ones((len(LENGTHS), streams))
         self._tail = np.full((len(LENGTHS), streams), STUDENT_TAIL)
         self._stale = True
@@ -175,6 +177,17 @@ class SequentialTest:
         index = int(np.searchsorted(LENGTHS, frames, side="right")) - 1
         return self.windows.mean_of_last(frames), self._mean_covariance[index]
 
+    def noticed(self) -> Array | None:
+        """(6,) constant shifts, each alone on its axis, that the first stream's windows that are full show by their
+        means; None while there is none.
+        """
+        full = self.windows.full()[0][:, 0]
+        if not self.refreshes or not full.any():
+            return None
+        precision = np.square(self._whitening[0, full, 0]).sum(axis=-2)
+        sizes = np.sqrt(self._limit[0, full, 0, None] / precision)
+        return np.asarray(sizes.min(axis=0) + self._tolerated)
+
     def usual_covariance(self) -> Array:
         """(6, 6) of the first stream's shifts about their mean, by what was learnt and what frames claim."""
         return np.asarray(self.scatter.of_single_frames()[0] + self._reported[0])
@@ -241,6 +254,7 @@ class SequentialTest:
 
     def _refresh(self) -> None:
         fitted, self._stale = self._stale, False
+        self.refreshes += 1
         self._from_reported = np.linalg.cholesky(self._reported)
         self._to_reported = np.linalg.inv(self._from_reported)
         # Slow to compute, slow to change.

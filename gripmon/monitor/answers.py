@@ -26,6 +26,12 @@ from gripmon.records import (
 from gripmon.smoothing import PoseAverage
 from gripmon.stream import StreamFault
 
+FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
+"""Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
+
+JAW_SURPRISE = 5.0
+"""Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
+
 
 def flat(covariance: Array) -> tuple[float, ...]:
     """(6, 6) row by row."""
@@ -89,3 +95,12 @@ def of_stream(faults: tuple[StreamFault, ...]) -> Explanation:
             known = CauseWeight(fault.cause, 1.0)
             return Explanation((known,), known, fault.text)
     return Explanation()
+
+
+def gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
+    """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
+    not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
+    """
+    if abs(measurement.jaw_surprise) > JAW_SURPRISE:
+        return True
+    return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY

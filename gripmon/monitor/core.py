@@ -23,11 +23,13 @@ from gripmon.monitor.answers import (
     drift_between,
     flat,
     frozen,
+    gripper_astray,
     of_stream,
     smoothed_record,
     unmeasured_corners,
 )
 from gripmon.monitor.asking import Inquiry
+from gripmon.monitor.notes import NoteTaker
 from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
@@ -47,6 +49,7 @@ from gripmon.records import (
     Frame,
     FrameRecord,
     MeasurementTrace,
+    MonitorNotes,
     MonitorState,
     Origin,
     ReferenceRecord,
@@ -59,14 +62,8 @@ from gripmon.references import CommandRefused
 from gripmon.smoothing import PoseAverage
 from gripmon.stream import StreamFault, StreamWatch
 
-FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
-"""Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""
-
 DOUBTED_FRAMES = 5
 """Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
-
-JAW_SURPRISE = 5.0
-"""Standard deviations of the reported jaw opening by which the seen one must differ to be the cause of a drift."""
 
 
 class Monitor:
@@ -97,6 +94,7 @@ class Monitor:
         self._inquiry = Inquiry(judge)
         self._watches = Watches(len(gripper.finger_ids))
         self._average = PoseAverage(settings.smoothing)
+        self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
         self._now_s = 0.0  # time that has passed since the first frame
@@ -231,6 +229,11 @@ class Monitor:
             return None
         return trace_of(self._newest, self._camera, self._gripper)
 
+    def notes(self) -> MonitorNotes:
+        """What the newest record was judged by; costs some microseconds."""
+        measured = self._newest is not None and self._newest.trusted
+        return self._notes.take(self._watch, self._baseline, self._average, measured)
+
     def _tick(self, frame: Frame) -> None:
         """Time passes to the frame's stamp; a clock that was set back stops it for this one frame only."""
         stamp_s = 1e-9 * frame.stamp_ns
@@ -260,7 +263,7 @@ class Monitor:
         shift = perturbation_between(self._ref_cam_T_grip, self._cam_T_grip)
         sigma = np.sqrt(self._covariance.diagonal())
         shares = agreeing_fingers(measurement, self._gripper)
-        astray = _gripper_astray(measurement, shares)
+        astray = gripper_astray(measurement, shares)
         self._astray = self._astray + 1 if astray else 0
         # Few doubtful frames tell nothing; many are how it is now.
         if 0 < self._astray < DOUBTED_FRAMES:
@@ -391,12 +394,3 @@ class Monitor:
     def _noted(self) -> list[Alert]:
         noted, self._due = self._due, []
         return noted
-
-
-def _gripper_astray(measurement: Measurement, shares: list[float]) -> bool:
-    """Whether the gripper contradicts its model: one finger is where the transform says and another, though sampled, is
-    not (hidden, or bent), or the seen jaw opening is not the reported one.  ``shares`` of each finger's profiles agree.
-    """
-    if abs(measurement.jaw_surprise) > JAW_SURPRISE:
-        return True
-    return max(shares) > FINGER_SEEN and min(shares) < FINGER_ASTRAY

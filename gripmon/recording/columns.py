@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from gripmon.recording.wire import TraceNote
-from gripmon.records import FrameRecord
+from gripmon.records import FrameRecord, Limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,11 +26,15 @@ class Picture:
 
 @dataclass(frozen=True, slots=True)
 class Row:
+    """A frame; its ``limits`` are the ones that were in force, as far as anybody said."""
+
     record: FrameRecord
     picture: Picture | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
     jaw_reported_m: float | None = None
+    statistic_share: float | None = None
+    limits: Limits | None = None
 
 
 class Sender:

@@ -24,6 +24,7 @@ from gripmon.records import (
     FrameRecord,
     Image,
     MeasurementTrace,
+    MonitorNotes,
     RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
@@ -44,8 +45,9 @@ _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
 Truth = Callable[[int], Vector | None]
-_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, float | None]
+_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, float | None, MonitorNotes | None]
 Trace = Callable[[], MeasurementTrace | None]
+Notes = Callable[[], MonitorNotes]
 _T = TypeVar("_T")
 
 
@@ -61,8 +63,8 @@ class Recorder(Protocol):
     @property
     def failure(self) -> str | None: ...
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
-        """``trace`` is called before this returns, and only where the picture is recorded."""
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
 
     def alert(self, alert: AlertRecord) -> None: ...
     def reference(self, reference: ReferenceRecord) -> None: ...
@@ -77,7 +79,7 @@ class NullRecorder:
     dropped = 0
     failure: str | None = None
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         pass
 
     def alert(self, alert: AlertRecord) -> None:
@@ -209,7 +211,7 @@ class ProcessRecorder:
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
         if self._patience_s > 0.0:
             self._wait_for_room()
@@ -220,13 +222,14 @@ class ProcessRecorder:
         self._queued += 1
         due = self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
         self._shown = shown
+        noted = None if notes is None else notes()
         if due and self._images_offered - self._images_taken < self._queue_images:
             self._images_offered += 1
             self._image_stamp_ns = record.stamp_ns
-            self._frames.append((record, True, frame.image, trace(), frame.jaw_opening_m))
+            self._frames.append((record, True, frame.image, trace(), frame.jaw_opening_m, noted))
         else:
             self._images_not_queued += bool(due)
-            self._frames.append((record, False, None, None, frame.jaw_opening_m))
+            self._frames.append((record, False, None, None, frame.jaw_opening_m, noted))
 
     def alert(self, alert: AlertRecord) -> None:
         """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
@@ -318,12 +321,16 @@ class ProcessRecorder:
     def _next_batch(self, worker: WorkerProcess) -> EncodedBatch:
         frames: list[msgspec.Raw] = []
         while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0][2]):
-            record, shown, image, trace, jaw_reported_m = self._frames.popleft()
+            record, shown, image, trace, jaw_reported_m, noted = self._frames.popleft()
             self._images_taken += shown
             note = None if image is None else self._share(worker, image)
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
-            frames.append(msgspec.Raw(self._encode(FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m))))
+            limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
+            worker.limits_sent = limits or worker.limits_sent
+            share = None if noted is None else noted.statistic_share
+            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits)
+            frames.append(msgspec.Raw(self._encode(whole)))
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
         worker.frames_sent += len(frames)

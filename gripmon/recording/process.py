@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.recording.wire import ImageRing, Scene, Status, framed
+from gripmon.records import Limits
 
 # The working directory must not be searched for modules (-P), but where this package came from must.
 _BOOTSTRAP = (
@@ -53,6 +54,7 @@ class WorkerProcess:
         self.status = Status(path=None, failure=None, frames=0, frames_lost=0, images_done=0)
         self.images_sent = 0
         self.frames_sent = 0
+        self.limits_sent: Limits | None = None
         self.gone = False
 
     @property

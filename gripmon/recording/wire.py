@@ -17,6 +17,7 @@ from gripmon.recording.settings import RecordingSettings
 from gripmon.records import (
     AlertRecord,
     FrameRecord,
+    Limits,
     MeasurementTrace,
     RecordedCommand,
     RecordedConfiguration,
@@ -69,21 +70,28 @@ class ImageNote(msgspec.Struct, frozen=True, array_like=True):
 
 
 class TraceNote(msgspec.Struct, frozen=True, array_like=True):
-    """A :class:`MeasurementTrace` in bytes: positions as float32 pairs, flags as uint8."""
+    """A :class:`MeasurementTrace` in bytes: positions as float32 pairs, distances as float32, flags as uint8."""
 
     edge_uv_px: bytes
     edge_used: bytes
+    edge_residual_px: bytes
     predicted_edges_uv_px: bytes
     predicted_edge_lengths: list[int]
     predicted_corners_uv_px: bytes
 
 
 class FrameNote(msgspec.Struct, frozen=True, array_like=True):
+    """``limits`` where they are others than those of the frame before; ``statistic_share`` as in
+    :class:`gripmon.records.MonitorNotes`.
+    """
+
     record: FrameRecord
     image: ImageNote | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
     jaw_reported_m: float | None
+    statistic_share: float | None
+    limits: Limits | None
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):
@@ -179,6 +187,7 @@ def pack_trace(trace: MeasurementTrace) -> TraceNote:
     return TraceNote(
         edge_uv_px=trace.edge_uv_px.astype(np.float32).tobytes(),
         edge_used=trace.edge_used.astype(np.uint8).tobytes(),
+        edge_residual_px=trace.edge_residual_px.astype(np.float32).tobytes(),
         predicted_edges_uv_px=b"".join([edge.astype(np.float32).tobytes() for edge in edges]),
         predicted_edge_lengths=[len(edge) for edge in edges],
         predicted_corners_uv_px=trace.predicted_corners_uv_px.astype(np.float32).tobytes(),

@@ -16,6 +16,7 @@ from gripmon.recording.columns import Picture, Row
 from gripmon.recording.files import FileSeries
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
+from gripmon.records import Limits
 
 _NICENESS = 10  # the loop goes first when both want the same core
 _STDIN = 0
@@ -42,6 +43,7 @@ class RecordingLoop:
         self._decode = msgspec.msgpack.Decoder(Batch).decode
         self._encode = msgspec.json.Encoder().encode
         self._images_done = 0
+        self._limits: Limits | None = None
         self._flush_period_s = 0.1
         self._parent_listens = True
 
@@ -84,7 +86,16 @@ class RecordingLoop:
         if note.image is not None:
             picture = encode_picture(self._ring.get(note.image), self._scene.settings)
             self._images_done += 1
-        return Row(note.record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m)
+        self._limits = note.limits or self._limits
+        return Row(
+            note.record,
+            picture,
+            note.trace,
+            note.truth_tcp_m,
+            note.jaw_reported_m,
+            note.statistic_share,
+            self._limits,
+        )
 
     def _report(self) -> None:
         files = self._files

@@ -39,6 +39,7 @@ from gripmon.records.frames import (
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
+from gripmon.records.notes import Limits, MonitorNotes
 from gripmon.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
@@ -71,9 +72,11 @@ __all__ = [
     "FrameRecord",
     "Image",
     "JawReading",
+    "Limits",
     "MeasurementTrace",
     "MessageRefused",
     "Meta",
+    "MonitorNotes",
     "MonitorState",
     "Motion",
     "OpenAlert",

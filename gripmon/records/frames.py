@@ -141,13 +141,15 @@ class MeasurementTrace:
     """Pixels behind the newest record, for people who look: all positions in the distorted image, px.
 
     ``edge_uv_px`` (n, 2) are the measured edge points, ``edge_used`` (n,) whether the fit believed them,
-    ``edge_index`` (n,) the gripper edge each belongs to; ``predicted_edges_uv_px`` one polyline (k, 2) a visible
+    ``edge_index`` (n,) the gripper edge each belongs to, ``edge_residual_px`` (n,) how far across it they lie from
+    where the fit has it; ``predicted_edges_uv_px`` one polyline (k, 2) a visible
     edge; ``predicted_corners_uv_px`` (c, 2) in the order of the gripper model, NaN where a corner is not visible.
     """
 
     edge_uv_px: Array
     edge_used: NDArray[np.bool_]
     edge_index: NDArray[np.intp]
+    edge_residual_px: Array
     predicted_edges_uv_px: tuple[Array, ...]
     predicted_corners_uv_px: Array
 

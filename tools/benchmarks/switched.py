@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.config import Config
-from gripmon.recording import Trace, open_recorder
+from gripmon.recording import Notes, Trace, open_recorder
 from gripmon.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
 
 
@@ -34,9 +34,9 @@ class SwitchedRecorder:
     def failure(self) -> str | None:
         return self._inner.failure
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace) -> None:
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         if self.on:
-            self._inner.offer(frame, record, trace)
+            self._inner.offer(frame, record, trace, notes)
 
     def alert(self, record: AlertRecord) -> None:
         self._inner.alert(record)

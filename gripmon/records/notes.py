@@ -1,0 +1,40 @@
+"""What a frame was judged by, beside what was decided: for recordings and for people who look."""
+
+from __future__ import annotations
+
+import msgspec
+
+SixNumbers = tuple[float, float, float, float, float, float]
+"""Along the camera's x, y, z (m), then about them (rad)."""
+
+
+class Limits(msgspec.Struct, frozen=True, array_like=True):
+    """Where it becomes worth telling, and what the stream has shown of its noise; changes slowly.
+
+    ``warn_m``, ``warn_rad``, ``limit_m`` and ``limit_rad`` are the policy's, ``tolerated`` what the drift test never
+    minds.  ``noticed``: shifts that would be noticed, each alone on its axis, if all frames that the test now rests on
+    had them, reckoned from ``offset``, the part of the shift that the reference's own error explains.  ``scatter``:
+    standard deviations of frames about their mean, as learnt.  ``average_share``: share of the frames' variance that
+    the smoothed transform has seen to scatter, ``average_walk`` how far it takes the mount to wander in a second.  None
+    is what isn't known yet.
+    """
+
+    warn_m: float
+    warn_rad: float
+    limit_m: float
+    limit_rad: float
+    tolerated: SixNumbers
+    noticed: SixNumbers | None
+    offset: SixNumbers | None
+    scatter: SixNumbers | None
+    average_share: SixNumbers
+    average_walk: SixNumbers
+
+
+class MonitorNotes(msgspec.Struct, frozen=True, array_like=True):
+    """Of one frame: the drift test's largest statistic over its threshold, 1 where it alarms (None: the frame wasn't
+    tested), and the limits that were in force.
+    """
+
+    statistic_share: float | None
+    limits: Limits
