@@ -2,11 +2,13 @@
 
 ``open_recordings(paths, progress)`` takes files and folders, of several runs and robots, in any order, and gives a
 :class:`Collection`: the recordings, each one run of one monitor, and the faults, one line each, of what could not be
-used.  No file is ever changed.
+used.  No file is ever changed, and images stay in the files until they are asked for.
 """
 
 from __future__ import annotations
 
+from gripmon.playback.opening import Collection, open_recordings
+from gripmon.playback.recordings import Picture, Recording, Shot, decode_image
 from gripmon.playback.table import FrameTable
 
-__all__ = ["FrameTable"]
+__all__ = ["Collection", "FrameTable", "Picture", "Recording", "Shot", "decode_image", "open_recordings"]

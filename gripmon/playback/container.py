@@ -1,0 +1,314 @@
+"""An ``.rrd`` file as a row of messages, of which any can be decoded by itself.
+
+rerun's reader takes a file as a whole: where one message is damaged or cut off it gives none of it, and where the
+footer is missing it reads everything.  Known here is only the frame around messages (a file header of 12 bytes, then
+for each message its kind and length, 8 bytes each, little endian); whole messages are handed to rerun's reader as a
+small file in memory, verbatim behind the header and the store's introduction.  So one image of an hour takes
+milliseconds, a cut loses only what it cut, and the original is never touched.  Where there is a footer, its manifest
+says which message holds what.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gripmon.playback import entities
+from gripmon.playback.table import IntArray
+
+MAGIC = b"RRF2"
+_FILE_HEADER_BYTES = 12
+_MESSAGE = struct.Struct("<QQ")
+_END, _STORE_INFO, _CHUNK, _BLUEPRINT = range(4)
+_FOOTER_MARK = b"RRF2FOOT"
+_FOOTER_BYTES = 64  # the mark lies within the last so many
+_BLOCK_BYTES = 1 << 20
+_LARGEST_MESSAGE_BYTES = 1 << 31
+
+
+class UnreadableFileError(ValueError):
+    """Nothing of a file can be used; the text says why, in a few words and without the file's name."""
+
+
+class Span(NamedTuple):
+    """Whole messages in a file: where they begin, and how many bytes."""
+
+    offset: int
+    size: int
+
+
+Block = tuple[Span, ...]
+"""What is decoded at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a footer says of the messages of one store: an element each.  ``first`` and ``last`` are frame numbers, the
+    least one there is where there are none.
+    """
+
+    entity: list[str]
+    offset: IntArray
+    size: IntArray
+    rows: IntArray
+    first: IntArray
+    last: IntArray
+
+
+class StoreName(NamedTuple):
+    application: str
+    recording_id: str
+
+
+class RrdFile:
+    """A file that holds at least the introduction of a recording.
+
+    ``faults`` gathers what is wrong with it as it is read, in a few words each; ``damaged`` counts messages that could
+    not be decoded.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Raises :class:`UnreadableFileError`, also for what the file system refuses."""
+        self.path = path
+        self.faults: list[str] = []
+        self.damaged = 0
+        self._introductions: list[bytes] = []
+        try:
+            with path.open("rb") as file:
+                self.size = os.fstat(file.fileno()).st_size
+                self._header = self._checked_header(file.read(_FILE_HEADER_BYTES))
+                self.has_footer = _has_footer(file.fileno(), self.size)
+                self.stores = self._find_stores(file.fileno())
+        except OSError as error:
+            raise UnreadableFileError(error.strerror or str(error)) from None
+        if not self.stores:
+            raise UnreadableFileError("is cut short before its recording begins")
+
+    def manifest(self, store: StoreName) -> Manifest | None:
+        """The footer's, None where it is missing or doesn't fit the file."""
+        if not self.has_footer:
+            return None
+        from rerun.chunk import RrdReader
+
+        try:
+            reader = RrdReader(self.path)
+            entry = next(e for e in reader.recordings() if e.recording_id == store.recording_id)
+            batch = reader.store(store=entry)._chunk_index().to_arrow()
+            return _manifest(batch, self.size)
+        except Exception as error:  # noqa: BLE001 - whatever rerun raises: the messages themselves may be sound
+            self._distrust_footer(error)
+            return None
+
+    def blocks(self) -> Iterator[Span]:
+        """All whole messages in the order of the file, about a megabyte at a time.
+
+        Ends at the file's end or at the first place that is no message, which goes to ``faults``.
+        """
+        with self.path.open("rb") as file:
+            descriptor = file.fileno()
+            begin = end = _FILE_HEADER_BYTES
+            while True:
+                kind, size = _message_at(descriptor, end, self.size)
+                if kind is None:
+                    self._say_where_it_ends(end, size)
+                if kind is None or kind == _END:
+                    break
+                if end - begin + size > _BLOCK_BYTES and end > begin:
+                    yield Span(begin, end - begin)
+                    begin = end
+                end += size
+            if end > begin:
+                yield Span(begin, end - begin)
+
+    def record_texts(self, store: StoreName, block: Block) -> list[str]:
+        """The frames' records in a block."""
+        chunks = self.decode(store, block, (f"/{entities.RECORD}",))
+        return [text for chunk in chunks for text in texts_of(chunk.to_record_batch(), "json")]
+
+    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Any]:
+        """rerun's chunks of a store in some messages, only of entities in ``content`` (all where it is None).
+
+        Messages that are damaged are left out and counted.  Raises OSError where the file can't be read any more.
+        """
+        with self.path.open("rb") as file:
+            parts = [os.pread(file.fileno(), span.size, span.offset) for span in block]
+            try:
+                return self._decode(store, parts, content)
+            except Exception:  # noqa: BLE001 - whatever rerun raises: find the message that it's about
+                messages = [m for part in parts for m in _messages(part)]
+        chunks = []
+        self.damaged += max(0, len(block) - len(messages))
+        for message in messages:
+            try:
+                chunks += self._decode(store, [message], content)
+            except Exception:  # noqa: BLE001 - as above
+                self.damaged += 1
+        return chunks
+
+    def _decode(self, store: StoreName, parts: Sequence[bytes], content: Sequence[str] | None) -> list[Any]:
+        reader, descriptor = self._small_file(parts)
+        try:
+            entries = [e for e in reader.recordings() if e.recording_id == store.recording_id]
+            stream = reader.stream(store=entries[0])
+            return (stream if content is None else stream.filter(content=content)).to_chunks()
+        finally:
+            os.close(descriptor)
+
+    def _small_file(self, parts: Sequence[bytes]) -> tuple[Any, int]:
+        """rerun's reader of a file in memory, and its descriptor."""
+        from rerun.chunk import RrdReader
+
+        descriptor = os.memfd_create("gripmon-playback")
+        try:
+            with open(descriptor, "wb", closefd=False) as file:
+                file.writelines((self._header, *self._introductions, *parts))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # that it has no footer
+                return RrdReader(f"/proc/self/fd/{descriptor}"), descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+
+    def _checked_header(self, header: bytes) -> bytes:
+        if self.size == 0:
+            raise UnreadableFileError("is empty")
+        if header[: len(MAGIC)] != MAGIC:
+            raise UnreadableFileError("is no rerun recording, whatever its name says")
+        if len(header) < _FILE_HEADER_BYTES:
+            raise UnreadableFileError("is cut short within its header")
+        written, ours = header[4:7], _rerun_version()
+        if tuple(written) <= ours:
+            return header
+        # Said here; with the newer number rerun's reader would say so of every block.
+        newer, older = ".".join(map(str, written)), ".".join(map(str, ours))
+        self.faults.append(f"was written by rerun {newer}, newer than {older} here; what could be understood was used")
+        return header[:4] + bytes((*ours, 0)) + header[8:]
+
+    def _find_stores(self, descriptor: int) -> list[StoreName]:
+        """The recordings (not layouts) in the file; their introductions come before their first chunks."""
+        expected = self._stores_of_footer() if self.has_footer else None
+        offset = _FILE_HEADER_BYTES
+        found: list[StoreName] = []
+        known = 0
+        while True:
+            kind, size = _message_at(descriptor, offset, self.size)
+            if kind == _STORE_INFO:
+                self._introductions.append(os.pread(descriptor, size, offset))
+            elif known < len(self._introductions):
+                known = len(self._introductions)
+                found = self._introduced()
+            if kind is None or kind == _END or (expected and len(found) >= len(expected)):
+                return found
+            offset += size
+
+    def _stores_of_footer(self) -> list[StoreName]:
+        from rerun.chunk import RrdReader
+
+        try:
+            return _recordings(RrdReader(self.path))
+        except Exception as error:  # noqa: BLE001 - whatever rerun raises
+            self._distrust_footer(error)
+            return []
+
+    def _introduced(self) -> list[StoreName]:
+        try:
+            reader, descriptor = self._small_file(())
+            os.close(descriptor)
+            return _recordings(reader)
+        except Exception:  # noqa: BLE001 - a damaged introduction introduces nothing
+            return []
+
+    def _distrust_footer(self, error: Exception) -> None:
+        self.has_footer = False
+        self.faults.append(f"has a footer that can't be used ({_one_line(error)}); its messages were read one by one")
+
+    def _say_where_it_ends(self, offset: int, missing: int) -> None:
+        if missing:
+            self.faults.append(f"is damaged at byte {offset}; the {offset / 1e6:.1f} MB before it were used")
+        elif offset < self.size:
+            whole = f"its {offset / 1e6:.1f} MB of whole messages were used"
+            self.faults.append(f"is cut short in the middle of a message at byte {self.size}; {whole}")
+        else:
+            self.faults.append("was not finished (no footer); all its messages were used")
+
+
+def _recordings(reader: Any) -> list[StoreName]:
+    return list(dict.fromkeys(StoreName(e.application_id, e.recording_id) for e in reader.recordings()))
+
+
+def _manifest(batch: Any, file_size: int) -> Manifest:
+    """Raises ValueError where it can't be that of this file."""
+    column = {name: batch.column(name) for name in batch.schema.names}
+
+    def integers(name: str) -> IntArray:
+        return column[name].cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
+
+    offset = integers("chunk_byte_offset") - _MESSAGE.size
+    size = integers("chunk_byte_size") + _MESSAGE.size
+    if np.any(offset < _FILE_HEADER_BYTES) or np.any(size <= 0) or np.any(offset + size > file_size):
+        raise ValueError("it names bytes beyond the file")
+    nothing = np.full(len(offset), np.iinfo(np.int64).min)
+    return Manifest(
+        entity=[path.removeprefix("/") for path in column["chunk_entity_path"].to_pylist()],
+        offset=offset,
+        size=size,
+        rows=integers("chunk_num_rows"),
+        first=integers("frame:start") if "frame:start" in column else nothing,
+        last=integers("frame:end") if "frame:end" in column else nothing,
+    )
+
+
+def _message_at(descriptor: int, offset: int, file_size: int) -> tuple[int | None, int]:
+    """Kind and whole size of the message at an offset; (None, 0) where the file ends, (None, 1) where none can be."""
+    header = os.pread(descriptor, _MESSAGE.size, offset)
+    if len(header) < _MESSAGE.size:
+        return None, 0
+    kind, size = _MESSAGE.unpack(header)
+    if kind > _BLUEPRINT or size > _LARGEST_MESSAGE_BYTES:
+        return None, 1
+    if offset + _MESSAGE.size + size > file_size:
+        return None, 0
+    return kind, _MESSAGE.size + size
+
+
+def _messages(part: bytes) -> Iterator[bytes]:
+    """The chunks' messages in some bytes, as far as they can be told apart."""
+    offset = 0
+    while offset + _MESSAGE.size <= len(part):
+        kind, size = _MESSAGE.unpack_from(part, offset)
+        end = offset + _MESSAGE.size + size
+        if kind > _BLUEPRINT or end > len(part):
+            return
+        if kind == _CHUNK:
+            yield part[offset:end]
+        offset = end
+
+
+def texts_of(batch: Any, component: str) -> list[str]:
+    """All texts of a component; of one that isn't there, or holds something else, none."""
+    if component not in batch.schema.names:
+        return []
+    values = batch.column(component)
+    values = values.flatten() if hasattr(values, "flatten") else values
+    return [text for text in values.to_pylist() if isinstance(text, str)]
+
+
+def _has_footer(descriptor: int, size: int) -> bool:
+    return _FOOTER_MARK in os.pread(descriptor, _FOOTER_BYTES, max(0, size - _FOOTER_BYTES))
+
+
+def _rerun_version() -> tuple[int, ...]:
+    import rerun as rr
+
+    return tuple(int("".join(c for c in part if c.isdigit()) or 0) for part in rr.__version__.split(".")[:3])
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
