@@ -93,7 +93,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     writer.close(10.0)
     assert (writer.dropped, writer.images_dropped, writer.failure) == (0, 0, None)
     assert writer.frames_written == COUNT
-    (path,) = directory.iterdir()
+    (path,) = directory.glob("*.rrd")
     assert path.name == "run-0001.rrd"
     return Recorded(path)
 
@@ -255,12 +255,12 @@ def test_camera_matches_the_configured_one(told: Recorded) -> None:
 
 
 def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
-    writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64)
+    writer = recorder(tmp_path, image_rate_hz=10.0, queue_images=64, around_alert_s=0.0)
     for i in range(60):
         state = State.DRIFTING if i in (31, 32) else State.TRACKING
         writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), partial(trace, i))
     writer.close(10.0)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     assert told.seqs() == list(range(60))
     shown = set(told.by_seq(OVERLAY, "blob"))
@@ -275,7 +275,7 @@ def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
         writer.offer(frame(i), record(i), partial(trace, i))
     writer.close(10.0)
     assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.rrd")
     assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(150))
 
 
@@ -286,7 +286,7 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
         writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
     writer.reference(moved)
     writer.close(10.0)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     assert [cell.seq for cell in told.timed("rig/reference")] == [0, 7]
     lines = told.by_seq("reference", "json").items()
@@ -316,7 +316,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
         )
     )
     writer.close(10.0)
-    (path,) = tmp_path.iterdir()
+    (path,) = tmp_path.glob("*.rrd")
     stamps = {cell.stamp_ns for cells in Recorded(path).cells.values() for cell in cells if cell.stamp_ns is not None}
     assert stamps == {START_NS + i * INTERVAL_NS for i in range(3)}
 

@@ -272,7 +272,9 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
         return
     path = Path(name)
     # One file, whatever its length.
-    settings = msgspec.structs.replace(config.settings.recording, enabled=True, max_file_bytes=2**62)
+    settings = msgspec.structs.replace(
+        config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
+    )
     if path.is_dir():
         raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
     common.make_directory(path.parent, "--recording")

@@ -163,6 +163,8 @@ class Daemon:
                 self._alert(alert, self._watch.state)
         else:
             self._handle(item)
+        for alert in self._watch.recording(self._recorder.failure, time.monotonic(), time.time_ns()):
+            self._alert(alert, self._watch.state)
         self._say_state(time.monotonic())
         return not self._watch.gives_up
 

@@ -22,7 +22,7 @@ from gripmon.records import (
 )
 
 _RATE_OVER_FRAMES = 64
-_SILENCE, _FAILURE = "silence", "failure"
+_SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
 
 
 class Watch:
@@ -86,6 +86,13 @@ class Watch:
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
         return list(self._alerts.present(_FAILURE, failed, now_s, stamp_ns))
+
+    def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
+        """Recording has stopped or thins, as it says itself; the monitor goes on."""
+        if failure is None:
+            return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
+        stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
+        return list(self._alerts.present(_RECORDING, stopped, now_s, stamp_ns))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

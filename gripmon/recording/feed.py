@@ -9,12 +9,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import msgspec
 
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
+from gripmon.recording.health import Health
 from gripmon.recording.process import WorkerProcess
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import EncodedBatch, Events, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
@@ -45,7 +46,20 @@ _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
 Truth = Callable[[int], Vector | None]
-_Waiting = tuple[FrameRecord, bool, Image | None, MeasurementTrace | None, float | None, MonitorNotes | None]
+
+
+class _Waiting(NamedTuple):
+    """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert."""
+
+    record: FrameRecord
+    counted: bool
+    image: Image | None
+    trace: MeasurementTrace | None
+    jaw_reported_m: float | None
+    notes: MonitorNotes | None
+    due: bool
+
+
 Trace = Callable[[], MeasurementTrace | None]
 Notes = Callable[[], MonitorNotes]
 _T = TypeVar("_T")
@@ -148,6 +162,10 @@ class ProcessRecorder:
         self._patience_s = patience_s
         self._queue_frames = settings.queue_frames
         self._queue_images = settings.queue_images
+        self._image_every = settings.image_every
+        self._ring_wanted = settings.around_alert_s > 0.0
+        # Images that may only be wanted later leave room for those that are.
+        self._ring_images = max(1, settings.queue_images - settings.queue_images // 4)
         self._image_interval_ns = round(1e9 / settings.image_rate_hz) if settings.image_rate_hz > 0.0 else None
         # Written by the loop's thread only.
         self._queued = 0
@@ -171,6 +189,7 @@ class ProcessRecorder:
         self._newest_reference = scene.reference
         self._own_failure: str | None = None
         self._stopped: str | None = None
+        self._health = Health(time.monotonic())
         self._restart_pause_s = 1.0
         self._restart_at = 0.0
         self._encode = msgspec.msgpack.Encoder().encode
@@ -199,7 +218,7 @@ class ProcessRecorder:
 
     @property
     def failure(self) -> str | None:
-        return self._own_failure or self._status.failure
+        return self._own_failure or self._health.fault or self._status.failure
 
     @property
     def path(self) -> Path | None:
@@ -223,13 +242,19 @@ class ProcessRecorder:
         due = self._image_is_due(record.stamp_ns) or record.alerts or shown != self._shown
         self._shown = shown
         noted = None if notes is None else notes()
-        if due and self._images_offered - self._images_taken < self._queue_images:
+        waiting = self._images_offered - self._images_taken
+        if due and waiting < self._queue_images:
             self._images_offered += 1
             self._image_stamp_ns = record.stamp_ns
-            self._frames.append((record, True, frame.image, trace(), frame.jaw_opening_m, noted))
+            item = _Waiting(record, True, frame.image, trace(), frame.jaw_opening_m, noted, True)
+        elif self._ring_wanted and not due and waiting < self._ring_images:
+            # Kept in case of an alert.  Its trace would cost the loop more than all the rest of this.
+            self._images_offered += 1
+            item = _Waiting(record, True, frame.image, None, frame.jaw_opening_m, noted, False)
         else:
             self._images_not_queued += bool(due)
-            self._frames.append((record, False, None, None, frame.jaw_opening_m, noted))
+            item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, bool(due))
+        self._frames.append(item)
 
     def alert(self, alert: AlertRecord) -> None:
         """Record an alert that belongs to no frame, such as a lost camera; those in a frame's record come with it."""
@@ -266,6 +291,8 @@ class ProcessRecorder:
             time.sleep(_ROOM_POLL_S)
 
     def _image_is_due(self, stamp_ns: int) -> bool:
+        if self._image_every > 0 and (self._queued - 1) % self._image_every == 0:
+            return True
         if self._image_interval_ns is None:
             return False
         # A capture time that jumps backwards starts a new count.
@@ -294,8 +321,14 @@ class ProcessRecorder:
             if not (batch.frames or batch.events):
                 break
             worker.send(self._encode(batch))
+        self._look(worker)
         if worker.gone:
             self._bury(worker, worker.reap(0.0) or "the recording process ended by itself")
+
+    def _look(self, worker: WorkerProcess) -> None:
+        if not worker.gone:
+            images = self.images_dropped
+            self._health.look(time.monotonic(), worker.heard_s, worker.heard, worker.pid, self.dropped, images)
 
     def _running_worker(self) -> WorkerProcess | None:
         if self._worker is None and time.monotonic() >= self._restart_at:
@@ -320,16 +353,16 @@ class ProcessRecorder:
 
     def _next_batch(self, worker: WorkerProcess) -> EncodedBatch:
         frames: list[msgspec.Raw] = []
-        while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0][2]):
-            record, shown, image, trace, jaw_reported_m, noted = self._frames.popleft()
-            self._images_taken += shown
-            note = None if image is None else self._share(worker, image)
+        while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0].image):
+            record, counted, image, trace, jaw_reported_m, noted, due = self._frames.popleft()
+            self._images_taken += counted
+            note = None if image is None else self._share(worker, image, due)
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
             limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
             worker.limits_sent = limits or worker.limits_sent
             share = None if noted is None else noted.statistic_share
-            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits)
+            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due)
             frames.append(msgspec.Raw(self._encode(whole)))
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
@@ -348,16 +381,17 @@ class ProcessRecorder:
         self._slot_waited_from = self._slot_waited_from or now
         return now - self._slot_waited_from < self._patience_s
 
-    def _slot_free(self, worker: WorkerProcess) -> bool:
-        if worker.images_sent - worker.status.images_done >= self._ring.slots:
+    def _slot_free(self, worker: WorkerProcess, spared: int = 0) -> bool:
+        slots = self._ring.slots - spared
+        if worker.images_sent - worker.status.images_done >= slots:
             worker.read_reports()
-        return worker.images_sent - worker.status.images_done < self._ring.slots
+        return worker.images_sent - worker.status.images_done < slots
 
-    def _share(self, worker: WorkerProcess, image: Image) -> ImageNote | None:
+    def _share(self, worker: WorkerProcess, image: Image, due: bool) -> ImageNote | None:
         if not self._ring.takes(image):
             return None  # a refused frame: its record says why
-        if not self._slot_free(worker):
-            self._images_without_slot += 1
+        if not self._slot_free(worker, 0 if due else self._ring.slots - self._ring_images):
+            self._images_without_slot += due
             return None
         note = self._ring.put(worker.images_sent % self._ring.slots, image)
         worker.images_sent += 1
@@ -378,6 +412,7 @@ class ProcessRecorder:
             if failure is not None:
                 _log.error("recording incomplete: %s", failure)
         self._own_failure = self._stopped or self._own_failure
+        self._health.fault = None
         self._ring.close()
 
 

@@ -1,26 +1,63 @@
-"""The series of files of one recording: begins, fills, ends them, and keeps clear of a full disk."""
+"""The series of files of one recording: begins, fills, ends them, and keeps clear of a full or a dead disk."""
 
 from __future__ import annotations
 
-import shutil
+import os
+import re
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import rerun as rr
 
+from gripmon.recording.budget import DiskBudget, claim, space_missing
 from gripmon.recording.columns import Row
 from gripmon.recording.layout import make_blueprint
+from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy
+from gripmon.recording.repair import repair
+from gripmon.recording.ring import Moments
 from gripmon.recording.rows import RowWriter
 from gripmon.recording.wire import Events, Scene
+from gripmon.records import AlertRecord
 
 APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0
 _LONGEST_RETRY_S = 30.0
-_FLUSH_TIMEOUT_S = 5.0
+_FLUSH_TIMEOUT_S = 2.0
+_STALLED_FLUSH_TIMEOUT_S = 0.1
+_SHORTEST_PIN_S = 5.0  # so much before and after an alert is pinned, even where no images are kept around it
+_SPANS_KEPT = 64
+_PICTURES_A_CHUNK = 16
+_ALERTS_KEPT = 64  # while nothing can be written: the next file says why
 # Space must have become a little more than it has to be, or recording would start and stop at every flush.
 _FREE_AGAIN = 1.02
+
+
+@dataclass
+class _File:
+    """A file and the capture times in it."""
+
+    path: Path
+    lock: int | None
+    begun_s: float
+    first_ns: int | None = None
+    last_ns: int | None = None
+    frames: int = 0
+    whole_bytes: int = 0
+
+    def cover(self, rows: Sequence[Row]) -> None:
+        stamps_ns = [row.record.stamp_ns for row in rows]
+        known_ns = [stamp_ns for stamp_ns in (self.first_ns, self.last_ns) if stamp_ns is not None]
+        if stamps_ns:
+            self.first_ns, self.last_ns = min(stamps_ns + known_ns), max(stamps_ns + known_ns)
+
+    def release(self) -> None:
+        if self.lock is not None:
+            os.close(self.lock)
+            self.lock = None
 
 
 class FileSeries:
@@ -33,35 +70,57 @@ class FileSeries:
     def __init__(self, scene: Scene, extra_sinks: Callable[[], Sequence[Any]] = tuple):
         rr.set_strict_mode(True)
         self._scene = scene
+        self._settings = settings = scene.settings
         self._extra_sinks = extra_sinks
         self._directory = Path(scene.directory)
-        self._number = 1
-        self._own_files: list[Path] = []
-        self._file: Path | None = None
+        self._budget = DiskBudget(self._directory, scene.robot, scene.camera, scene.name, settings.budget_bytes)
+        self._pins = PinBoard()
+        self._pinning = Moments(round(1e9 * max(settings.around_alert_s, _SHORTEST_PIN_S)))
+        self._alerts: deque[PinnedBy] = deque(maxlen=_SPANS_KEPT)
+        self._ended: deque[_File] = deque(maxlen=_SPANS_KEPT)
+        self._file: _File | None = None
         self._stream: rr.RecordingStream | None = None
         self._writer: RowWriter | None = None
         self._rows: list[Row] = []
+        self._late: list[Row] = []
         self._events = Events()
         self._newest_reference = scene.reference
-        self._frames_in_file = 0
+        self._unflushed = 0
+        self._stalled = False
         self._retry_s = _FIRST_RETRY_S
         self._retry_at = 0.0
         self.failure: str | None = None
         self.frames_written = 0
         self.frames_lost = 0
+        self._mend()
         self._begin()
 
     @property
     def path(self) -> str | None:
-        return None if self._file is None else str(self._file)
+        return None if self._file is None else str(self._file.path)
 
-    def add_frames(self, rows: list[Row]) -> None:
+    def add_frames(self, rows: Sequence[Row]) -> None:
         self._rows += rows
+
+    def add_pictures(self, rows: Sequence[Row]) -> None:
+        """Pictures of frames that were added before without them."""
+        self._late += rows
 
     def add_events(self, events: Events) -> None:
         self._events += events
         if events.references:
             self._newest_reference = events.references[-1]
+
+    def pin(self, alert: PinnedBy, stamp_ns: int | None) -> None:
+        """Nothing deletes the files around this capture time (None: no frame yet), past, present and coming ones."""
+        self._alerts.append(alert)
+        if stamp_ns is not None:
+            self._pinning.add(stamp_ns)
+        if self._file is not None:
+            self._pins.pin(self._file.path, (alert,))
+        for file in self._ended:
+            if self._touches(file):
+                self._pins.pin(file.path, (alert,))
 
     def write(self) -> None:
         """Put on disk what has been added; begin, end or change the file where that is due."""
@@ -70,97 +129,174 @@ class FileSeries:
         if self._stream is None or self._writer is None or self._file is None:
             self._lose()
             return
-        rows, events = self._rows, self._events
-        self._rows, self._events = [], Events()
-        self._writer.write(rows, events)
-        try:
-            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
-            size = self._file.stat().st_size
-        except Exception as error:  # noqa: BLE001 - rerun raises its own kinds; every one means that the file ends here
-            self.frames_lost += len(rows)
-            self._abandon(f"can't write {self._file}: {error}")
-            return
-        self.frames_written += len(rows)
-        self._frames_in_file += len(rows)
-        self._retry_s = _FIRST_RETRY_S
-        missing = self._space_missing()
-        if missing:
-            self.close()
-            self._fail(missing)
-        elif size >= self._scene.settings.max_file_bytes:
-            self.close()
-            self._begin()
+        if self._stalled:
+            self._lose()  # what rerun holds already is written when the disk answers again
+        else:
+            rows, late, events = self._rows, self._late, self._events
+            self._rows, self._late, self._events = [], [], Events()
+            self._writer.write(rows, events)
+            for first in range(0, len(late), _PICTURES_A_CHUNK):
+                self._writer.write_pictures(late[first : first + _PICTURES_A_CHUNK])
+            self._unflushed += len(rows)
+            self._file.cover(rows)
+        if self._flush(self._stream, self._file):
+            self._keep_house(self._file)
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
         if self._stream is not None:
             self._stream.disconnect()
-        self._stream = self._writer = None
-        self._file = None
+        self._leave()
         self._lose()
+
+    def _flush(self, stream: rr.RecordingStream, file: _File) -> bool:
+        """Whether all that was sent is on disk.  A disk that fails ends the file, one that stalls is waited for."""
+        timeout_s = _STALLED_FLUSH_TIMEOUT_S if self._stalled else _FLUSH_TIMEOUT_S
+        begun_s = time.monotonic()
+        try:
+            stream.flush(timeout_sec=timeout_s)
+            file.whole_bytes = file.path.stat().st_size
+        except Exception as error:  # noqa: BLE001 - rerun raises one kind for both; what fails does so at once
+            if time.monotonic() - begun_s >= 0.9 * timeout_s and file.path.exists():
+                self._stalled = True
+                self.failure = f"recording pauses: the disk under {self._directory} doesn't answer"
+            else:
+                self._abandon(f"can't write {file.path}: {error}")
+            return False
+        file.frames += self._unflushed
+        self.frames_written += self._unflushed
+        self._unflushed = 0
+        self._stalled = False
+        self.failure = None
+        self._retry_s = _FIRST_RETRY_S
+        return True
+
+    def _keep_house(self, file: _File) -> None:
+        """Pin what alerts touch, and begin the next file when this one is full, old, or breaks the budget."""
+        settings = self._settings
+        if self._touches(file):
+            self._pins.pin(file.path, tuple(self._alerts))
+        if missing := self._write_pins() or space_missing(self._directory, settings.min_free_bytes):
+            self._end()
+            self._fail(missing, "pauses")
+            return
+        old = file.frames > 0 and time.monotonic() - file.begun_s >= settings.max_file_s
+        if file.whole_bytes >= settings.max_file_bytes or old or not self._fits(file):
+            self._end()
+            self._begin()
+
+    def _fits(self, file: _File) -> bool:
+        """Whether the budget has room for more in this file."""
+        if not self._budget.exceeded_by(file.whole_bytes):
+            return True
+        try:
+            return not self._budget.make_room(self._pins.holds, file.path)
+        except OSError:
+            return True  # the next flush says what is wrong with the directory
+
+    def _touches(self, file: _File) -> bool:
+        return file.first_ns is not None and self._pinning.near(file.first_ns, file.last_ns)
+
+    def _write_pins(self) -> str:
+        try:
+            self._pins.write()
+        except OSError as error:
+            return f"can't pin in {self._directory}: {error.strerror}"
+        return ""
+
+    def _end(self) -> None:
+        """Complete the file before the next one; what waits stays for that."""
+        if self._stream is not None:
+            self._stream.disconnect()
+        self._leave()
+
+    def _leave(self) -> None:
+        self._stream = self._writer = None
+        if self._file is not None:
+            self._file.release()
+            if len(self._ended) == self._ended.maxlen:
+                self._pins.forget({self._ended[0].path})
+            self._ended.append(self._file)
+        self._file = None
+        self._stalled = False
 
     def _begin(self) -> None:
         """Open the next file and write what every file needs: the layout, all that is static, the reference."""
-        missing = self._space_missing(_FREE_AGAIN)
-        if missing:
-            self._fail(missing)
+        missing = space_missing(self._directory, self._settings.min_free_bytes, _FREE_AGAIN)
+        missing = missing or self._room_missing()
+        number = 0 if missing else self._next_number()
+        if missing or number == 0:
+            self._fail(missing or f"{self._directory} can't be read", "pauses")
             return
-        path = self._next_path()
+        path = self._directory / f"{self._scene.name}-{number:04d}.rrd"
         stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
         try:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
             stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
-            writer = RowWriter(stream, self._scene, self._number)
+            writer = RowWriter(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
+            del stream
             path.unlink(missing_ok=True)
             self._fail(f"can't write {path}: {error}")
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
         if self._newest_reference not in self._events.references:
             self._events = Events(references=[self._newest_reference]) + self._events
-        self._stream, self._writer, self._file = stream, writer, path
-        self._frames_in_file = 0
-        self._number += 1
+        self._stream, self._writer = stream, writer
+        self._file = _File(path, claim(path), time.monotonic())
         self.failure = None
-        self._own_files.append(path)
-        keep = self._scene.settings.keep_files
-        while keep and len(self._own_files) > keep:
-            self._own_files.pop(0).unlink(missing_ok=True)
+
+    def _room_missing(self) -> str:
+        try:
+            return self._write_pins() or self._budget.make_room(self._pins.holds)
+        except OSError as error:
+            return f"{self._directory}: {error.strerror}"
 
     def _abandon(self, why: str) -> None:
-        """Leave a file that can't be written any more; one without frames is worth nothing."""
-        self._stream = self._writer = None
-        if self._file is not None and self._frames_in_file == 0:
-            self._own_files.remove(self._file)
-            self._file.unlink(missing_ok=True)
-        self._file = None
+        """Leave a file that can't be written any more: without the message that was cut off, which would keep readers
+        from all the others.  One without frames is worth nothing.
+        """
+        file = self._file
+        self.frames_lost += self._unflushed
+        self._unflushed = 0
+        self._leave()
+        if file is not None:
+            try:
+                if file.frames == 0:
+                    file.path.unlink(missing_ok=True)
+                elif file.path.stat().st_size > file.whole_bytes:
+                    os.truncate(file.path, file.whole_bytes)
+            except OSError:
+                pass  # the same disk; a later start mends it
         self._fail(why)
         self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
 
-    def _fail(self, why: str) -> None:
-        self.failure = f"recording failed: {why}"
+    def _fail(self, why: str, what: str = "failed") -> None:
+        self.failure = f"recording {what}: {why}"
         self._retry_at = time.monotonic() + self._retry_s
 
     def _lose(self) -> None:
+        """Frames are gone; alerts wait, so that the recording says in time what it went through."""
         self.frames_lost += len(self._rows)
-        self._rows, self._events = [], Events()
+        alerts: list[AlertRecord] = self._events.alerts[-_ALERTS_KEPT:]
+        self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 
-    def _next_path(self) -> Path:
-        while True:
-            path = self._directory / f"{self._scene.name}-{self._number:04d}.rrd"
-            if not path.exists():
-                return path
-            self._number += 1
-
-    def _space_missing(self, factor: float = 1.0) -> str:
-        """Why there is no room for more, empty if there is."""
-        wanted = self._scene.settings.min_free_bytes
+    def _mend(self) -> None:
+        """Earlier files of this robot and camera, whose writer may have been killed."""
         try:
-            free = shutil.disk_usage(self._directory).free
-        except OSError as error:
-            return f"{self._directory}: {error.strerror}"
-        if free >= wanted * factor:
-            return ""
-        return f"{self._directory} has {free / 1e6:.0f} MB free, min_free_bytes keeps {wanted / 1e6:.0f} MB"
+            for entry in self._budget.recordings():
+                repair(entry.path)
+        except OSError:
+            pass  # what is wrong with the directory is said when the first file begins
+
+    def _next_number(self) -> int:
+        """Above all that there were: a file that was deleted leaves its number unused.  0: they can't be listed."""
+        numbered = re.compile(rf"{re.escape(self._scene.name)}-(\d{{4,}})\.rrd(?:{re.escape(SUFFIX)})?").fullmatch
+        try:
+            found = [numbered(path.name) for path in self._directory.iterdir()]
+        except OSError:
+            return 0
+        own = [numbered(file.path.name) for file in self._ended]
+        return 1 + max((int(match[1]) for match in (*found, *own) if match), default=0)

@@ -55,6 +55,16 @@ class OverlayWriter:
         if not rows:
             return
         self._images([row for row in rows if row.picture is not None])
+        self._draw(rows)
+
+    def write_late(self, rows: Sequence[Row]) -> None:
+        """Images of frames that were written before without; a refused frame's overlay is there already."""
+        self._images(rows)
+        rows = [row for row in rows if row.record.reason is None]
+        if rows:
+            self._draw(rows)
+
+    def _draw(self, rows: Sequence[Row]) -> None:
         traces = [row.trace for row in rows]
         self._edges(rows, traces)
         self._points("edges/used", rows, [_edge_points(trace, used=True) for trace in traces])

@@ -21,6 +21,7 @@ _BOOTSTRAP = (
 )
 _HOME = str(Path(__file__).resolve().parents[2])
 _PATIENCE_S = 0.01  # of a batch that is larger than the pipe
+_KILL_GRACE_S = 0.5  # a process that hangs in the disk dies when that answers, perhaps never
 _EXIT_GRACE_S = 0.2  # between a process's last descriptor and its exit code
 
 
@@ -52,6 +53,8 @@ class WorkerProcess:
         self._report_part = b""
         self._decode = msgspec.json.Decoder(Status).decode
         self.status = Status(path=None, failure=None, frames=0, frames_lost=0, images_done=0)
+        self.heard = False
+        self.heard_s = time.monotonic()
         self.images_sent = 0
         self.frames_sent = 0
         self.limits_sent: Limits | None = None
@@ -95,6 +98,7 @@ class WorkerProcess:
                 self.gone = True
             *lines, self._report_part = (self._report_part + part).split(b"\n")
             if lines:
+                self.heard, self.heard_s = True, time.monotonic()
                 self.status = self._decode(lines[-1])
 
     def finish(self, deadline: float) -> str | None:
@@ -120,8 +124,11 @@ class WorkerProcess:
             failure = None if code == 0 else f"the recording process ended with code {code}"
         except subprocess.TimeoutExpired:
             self._process.kill()
-            self._process.wait()
-            failure = "the recording process did not finish in time; `rerun rrd optimize` repairs its last file"
+            failure = "the recording process did not finish in time; the end of its last file may be missing"
+            try:
+                self._process.wait(_KILL_GRACE_S)
+            except subprocess.TimeoutExpired:
+                failure = "the recording process hangs in a disk that doesn't answer, and was left there"
         os.close(self._reports)
         return failure
 

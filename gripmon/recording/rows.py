@@ -71,6 +71,12 @@ class RowWriter:
             self._rig.write(rows)
         self._events.write(rows, events, lines)
 
+    def write_pictures(self, rows: Sequence[Row]) -> None:
+        """Send the pictures of frames that were written before without them."""
+        if rows:
+            self._picture_curves(rows)
+            self._overlay.write_late(rows)
+
     def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Line:
         self._rig.write_reference(reference, first)
         whole = rr.AnyValues.columns(json=[to_json(reference).decode()])
@@ -132,6 +138,10 @@ class RowWriter:
         traced = [r for r in rows if r.trace is not None]
         if traced:
             send.scalars("quality/edge_points", traced, [_edge_point_counts(r.trace) for r in traced if r.trace])
+        self._picture_curves(rows)
+
+    def _picture_curves(self, rows: Sequence[Row]) -> None:
+        send = self._send
         shown = [r for r in rows if r.picture is not None]
         pictures = [r.picture for r in shown if r.picture is not None]
         if pictures:
@@ -186,7 +196,11 @@ def image_policy(settings: RecordingSettings) -> str:
     """Which images are kept, and how, in words."""
     kind = "PNG" if settings.image_format == "png" else f"JPEG {settings.jpeg_quality} %"
     rate = f"{settings.image_rate_hz:g} images/s" if settings.image_rate_hz > 0.0 else "no images but"
-    return f"{kind}, {rate}, one at every alert and change"
+    every = f", of every {settings.image_every}. frame" if settings.image_every > 0 else ""
+    around = (
+        f", all within {settings.around_alert_s:g} s of a warning or error" if settings.around_alert_s > 0.0 else ""
+    )
+    return f"{kind}, {rate}{every}, one at every alert and change{around}"
 
 
 def _about(scene: Scene) -> str:

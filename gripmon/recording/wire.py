@@ -92,6 +92,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     jaw_reported_m: float | None
     statistic_share: float | None
     limits: Limits | None
+    due: bool  # its image is written in any case, not only around an alert
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):

@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import time
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -14,12 +15,15 @@ from numpy.typing import NDArray
 
 from gripmon.recording.columns import Picture, Row
 from gripmon.recording.files import FileSeries
+from gripmon.recording.pins import pinned_by
+from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
-from gripmon.records import Limits
+from gripmon.records import Alert, AlertRecord, Limits
 
 _NICENESS = 10  # the loop goes first when both want the same core
 _STDIN = 0
+_REPORT_PERIOD_S = 1.0  # the daemon must hear something
 
 
 def main(status_descriptor: int, memory_descriptor: int) -> None:
@@ -40,18 +44,24 @@ class RecordingLoop:
         self._scene: Scene | None = None
         self._files: FileSeries
         self._ring: ImageRing
+        self._moments: Moments
+        self._before: PictureRing
         self._decode = msgspec.msgpack.Decoder(Batch).decode
         self._encode = msgspec.json.Encoder().encode
         self._images_done = 0
         self._limits: Limits | None = None
+        self._around_ns = 0
+        self._trigger = Trigger()
+        self._newest_ns: int | None = None
         self._flush_period_s = 0.1
         self._parent_listens = True
 
     def run(self) -> None:
-        next_flush = time.monotonic() + self._flush_period_s
+        next_flush = next_report = time.monotonic() + self._flush_period_s
         ended = False
         while not ended:
-            readable, _, _ = select.select((_STDIN,), (), (), max(next_flush - time.monotonic(), 0.0))
+            next_turn = min(next_flush, next_report)
+            readable, _, _ = select.select((_STDIN,), (), (), max(next_turn - time.monotonic(), 0.0))
             if readable:
                 part = os.read(_STDIN, 1 << 20)
                 ended = not part
@@ -59,8 +69,11 @@ class RecordingLoop:
                     self._take(payload)
             if self._scene is not None and (ended or time.monotonic() >= next_flush):
                 self._files.write()
+                next_report = time.monotonic()
+                next_flush = next_report + self._flush_period_s
+            if time.monotonic() >= next_report:
                 self._report()
-                next_flush = time.monotonic() + self._flush_period_s
+                next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
             self._files.close()
             self._report()
@@ -72,32 +85,54 @@ class RecordingLoop:
             self._ring = ImageRing.for_camera(
                 scene.width_px, scene.height_px, scene.settings.queue_images, self._memory_descriptor
             )
+            self._around_ns = round(1e9 * scene.settings.around_alert_s)
+            self._moments = Moments(self._around_ns)
+            self._before = PictureRing(self._around_ns, scene.settings.ring_bytes)
             self._files = FileSeries(scene)
             return
         batch = self._decode(payload)
         self._files.add_events(batch.events)
-        self._files.add_frames([self._row(note) for note in batch.frames])
-        if any(note.image is not None for note in batch.frames):
-            self._report()
+        for note in batch.frames:
+            self._take_frame(note)
+        for alert in batch.events.alerts:
+            # Its own stamp may be of another clock than the frames'.
+            self._heed(alert, alert.seq, alert.stamp_ns, self._newest_ns)
 
-    def _row(self, note: FrameNote) -> Row:
+    def _take_frame(self, note: FrameNote) -> None:
+        """Around an alert every picture is written; of the others those that are due, the rest waits for an alert."""
         assert self._scene is not None
-        picture = None
+        record, picture = note.record, None
+        self._newest_ns = record.stamp_ns
+        for alert in record.alerts:
+            self._heed(alert, record.seq, record.stamp_ns, record.stamp_ns)
         if note.image is not None:
             picture = encode_picture(self._ring.get(note.image), self._scene.settings)
             self._images_done += 1
+            self._report()  # its slot is free
         self._limits = note.limits or self._limits
-        return Row(
-            note.record,
-            picture,
-            note.trace,
-            note.truth_tcp_m,
-            note.jaw_reported_m,
-            note.statistic_share,
-            self._limits,
+        row = Row(
+            record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
         )
+        if picture is not None and not note.due and not self._is_near(record.stamp_ns):
+            self._before.push(row)
+            row = replace(row, picture=None)
+        self._files.add_frames([row])
+
+    def _is_near(self, stamp_ns: int) -> bool:
+        return self._around_ns > 0 and self._moments.near(stamp_ns)
+
+    def _heed(self, alert: Alert | AlertRecord, seq: int, stamp_ns: int, near_ns: int | None) -> None:
+        """Of an alert that is worth it: pin the files around it, and write the pictures before it."""
+        if not self._trigger.by(alert):
+            return
+        self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
+        if self._around_ns > 0 and near_ns is not None:
+            self._moments.add(near_ns)
+            self._files.add_pictures(self._before.take(self._moments))
 
     def _report(self) -> None:
+        if self._scene is None:
+            return
         files = self._files
         status = Status(
             path=files.path,

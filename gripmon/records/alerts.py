@@ -54,6 +54,7 @@ class AlertKind(OpenEnum):
     IMAGE = "image"
     STREAM = "stream"
     SOURCE = "source"
+    RECORDING = "recording"
 
 
 class AlertEvent(enum.StrEnum):
