@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import math
 import sys
 import tempfile
-import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.cli.recorded_run import RecordedRun, is_recording
+from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -25,12 +25,21 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Run recorded frames through the monitor and write one JSON line for every input frame, in input
-order, refused ones included.  The same input gives the same bytes, except for latency_ns."""
+order, refused ones included.  The same input gives the same bytes, except for latency_ns.
+
+A recording of gripmon's brings its own configuration, the state that the monitor began with and the
+commands that it got: without --config the same core decides again what it decided then, to the byte
+where every frame was recorded as PNG (image_format: png and an image rate of every frame), else
+closely.  With another --config one sees what that would have done; --recording then shows both, named
+recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end."""
 
 _EXAMPLES = """\
   gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl
   gripmon replay wrist.mp4 --config configs/live_camera.yaml --out - | head -1
   gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl --recording story.rrd
+
+  gripmon replay recordings/ --out again.jsonl                             all files of one run
+  gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
 exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used; 130 interrupted (what
 was done until then is in FILE)"""
@@ -52,12 +61,16 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument(
         "input",
+        nargs="+",
         metavar="INPUT",
-        help="a folder of images, taken in the order of their names, a video file, or an .rrd recording of ours; a "
-        "timestamps.csv may lie in the folder, with the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
+        help="a folder of images, taken in the order of their names, a video file, or a recording of ours: an .rrd "
+        "file, all files of one run, or a folder of them; a timestamps.csv may lie beside images, with the columns "
+        "file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
     )
     parser.add_argument(
-        "--config", required=True, metavar="CONFIG", help="configuration (YAML); its source section is not used"
+        "--config",
+        metavar="CONFIG",
+        help="configuration (YAML), its source section is not used; left out for a recording: its own",
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="JSON lines go here; - is standard output")
     parser.add_argument(
@@ -75,50 +88,39 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon replay``."""
     import cv2
 
-    config = common.load(arguments.config, check_source=False)
     cv2.setNumThreads(1)
-    source = _open_input(Path(arguments.input), arguments.fps)
-    try:
-        with _output(arguments.out) as out, _recorder(arguments.recording, config) as recorder:
-            counts = _Counts()
-            try:
-                with common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame") as step:
-                    for line, record in replay(config, source, recorder):
-                        out.write(line)
-                        counts.add(record)
-                        step()
-            finally:
-                print(counts.summary(), file=sys.stderr)
-    finally:
-        source.close()
+    paths = [Path(name) for name in arguments.input]
+    with contextlib.ExitStack() as opened:
+        recorded = RecordedRun(paths, arguments.config, opened) if is_recording(paths) else None
+        config = recorded.config if recorded else _given_config(paths[0], arguments.config)
+        source = recorded.source if recorded else _open_input(paths[0], arguments.fps)
+        opened.callback(source.close)
+        out = opened.enter_context(_output(arguments.out))
+        recorder = opened.enter_context(_recorder(arguments.recording, config))
+        counts = _Counts()
+        try:
+            step = opened.enter_context(
+                common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame")
+            )
+            for line, record in replay(config, source, recorder, recorded.past if recorded else NOTHING_BEFORE):
+                out.write(line)
+                counts.add(record)
+                if recorded:
+                    recorded.compare(record)
+                step()
+        finally:
+            print(counts.summary(), file=sys.stderr)
+            if recorded:
+                print(recorded.summary(), file=sys.stderr)
     return common.EXIT_DONE if counts.usable else common.EXIT_FAILED
 
 
-def replay(config: Config, source: Source, recorder: Recorder) -> Iterator[tuple[bytes, FrameRecord]]:
-    """Process every frame of a source that isn't live: yields each record with its JSON line."""
-    import msgspec
-
-    from gripmon.monitor import Monitor
-    from gripmon.records import Frame, to_json, unmeasured_record
-
-    monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges)
-    with_jaw = _jaw_of(config)
-    revision = monitor.reference.revision
-    while (frame := source.read()) is not None:
-        assert isinstance(frame, Frame), "only a live source waits"
-        frame = with_jaw(frame)
-        start_ns = time.perf_counter_ns()
-        try:
-            record = monitor.process(frame)
-        except Exception as error:  # noqa: BLE001  said in the record and in the summary
-            reason = f"internal error: {type(error).__name__}: {' '.join(str(error).split())}"
-            record = unmeasured_record(frame, monitor.reference, reason)
-        record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
-        if record.revision != revision:
-            revision = record.revision
-            recorder.reference(monitor.reference)
-        recorder.offer(frame, record, monitor.trace, monitor.notes)
-        yield to_json(record) + b"\n", record
+def _given_config(path: Path, name: str | None) -> Config:
+    if name is None:
+        raise common.CommandFailedError(
+            f"{path}: only a recording brings its own configuration; --config CONFIG", common.EXIT_USAGE
+        )
+    return common.load(name, check_source=False)
 
 
 class _Counts:
@@ -167,22 +169,6 @@ class _Counts:
         return math.nan
 
 
-def _jaw_of(config: Config) -> Callable[[Any], Any]:
-    """How a frame gets its jaw opening: from the configuration, or it keeps what it came with."""
-    if config.settings.jaw.source != "fixed":
-        return lambda frame: frame
-    warned = False
-
-    def with_fixed_jaw(frame: Any) -> Any:
-        nonlocal warned
-        if frame.jaw_opening_m is not None and not warned and config.gripper.has_jaw:
-            warned = True
-            print("replay: the frames bring jaw openings, but jaw.source is fixed: they are not used", file=sys.stderr)
-        return dataclasses.replace(frame, jaw_opening_m=config.jaw_opening_m)
-
-    return with_fixed_jaw
-
-
 def _open_input(path: Path, fps: float | None) -> Source:
     import msgspec
 
@@ -193,24 +179,12 @@ def _open_input(path: Path, fps: float | None) -> Source:
             f"{path}: there is no such file or folder; a folder of images, a video or an .rrd", common.EXIT_USAGE
         )
     try:
-        if path.suffix.lower() == ".rrd":
-            return _open_recording(path)
         settings = settings_for_path(path)
         if fps is not None:
             settings = msgspec.structs.replace(settings, fps=fps)
         return open_source(settings)
     except SourceError as error:
         raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
-
-
-def _open_recording(path: Path) -> Source:
-    from gripmon.recording.replayed import RecordedFrames
-
-    frames = RecordedFrames(path)
-    if frames.frames_without_image:
-        others = f"{frames.frames_without_image} more were recorded without"
-        print(f"replay: {path} holds images of {len(frames)} frames; {others}", file=sys.stderr)
-    return frames
 
 
 class _Lines:
@@ -265,6 +239,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
     """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
     import msgspec
 
+    from gripmon.config.recorded import to_recorded
     from gripmon.recording import NullRecorder, open_recorder
 
     if name is None:
@@ -293,6 +268,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             directory=Path(scratch),
             name=path.stem,
             patience_s=_RECORDING_PATIENCE_S,
+            configuration=to_recorded(config),
         )
         try:
             yield recorder

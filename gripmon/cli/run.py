@@ -13,8 +13,9 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config
+    from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
-    from gripmon.records import Alert, ReferenceRecord
+    from gripmon.records import Alert, MonitorState
     from gripmon.sources import Source
     from gripmon.statefile import StateFile
     from gripmon.wire import Link
@@ -122,7 +123,7 @@ def run_daemon(
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)
         on_network()
-        recorder = _open_recorder(config, monitor.reference, out, recording_name, truth_tcp_m)
+        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m)
         opened.callback(recorder.close)
         source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
@@ -184,14 +185,21 @@ def _open_source(config: Config, link: Link | None) -> Source:
 
 def _open_recorder(
     config: Config,
-    reference: ReferenceRecord,
+    monitor: Monitor,
+    state: MonitorState | None,
     out: Path | None,
     name: str | None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
 ) -> Recorder:
+    from gripmon.config.recorded import to_recorded
     from gripmon.recording import open_recorder
 
     settings = config.settings
+    try:
+        configuration = to_recorded(config, state)
+    except OSError as error:
+        text = f"{config.path}: {error.filename}: can't be read any more ({error.strerror})"
+        raise common.CommandFailedError(text, common.EXIT_USAGE) from None
     try:
         return open_recorder(
             settings.recording,
@@ -199,10 +207,11 @@ def _open_recorder(
             camera_name=settings.camera_name,
             camera=config.camera,
             gripper=config.gripper,
-            reference=reference,
+            reference=monitor.reference,
             directory=out,
             name=name,
             truth_tcp_m=truth_tcp_m,
+            configuration=configuration,
         )
     except OSError as error:
         if out is not None:

@@ -95,3 +95,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def _kind(value: object) -> str:
     return "a list" if isinstance(value, list) else f"a single value {value!r}"
+
+
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # as above
+    """Quotes just what the loader here would take for something else than text."""
+
+
+_Dumper.yaml_implicit_resolvers = _Loader.yaml_implicit_resolvers
+
+
+def as_yaml(value: dict[str, Any]) -> str:
+    """Text from which :func:`read_yaml` reads the same mapping."""
+    text: str = yaml.dump(value, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
+    return text

@@ -1,0 +1,149 @@
+"""A recording as the input of ``gripmon replay``: with what the monitor ran then, or with another configuration."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+from gripmon.cli.replaying import Past
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.recording.replayed import RecordedFrames
+    from gripmon.records import FrameRecord
+
+_ENDING = ".rrd"
+
+
+def is_recording(paths: list[Path]) -> bool:
+    """Whether these are recordings, rather than images or a video; only recordings may be several."""
+    if all(_holds_recordings(path) for path in paths):
+        return True
+    if len(paths) > 1:
+        other = next(path for path in paths if not _holds_recordings(path))
+        raise common.CommandFailedError(
+            f"{other}: is no {_ENDING} file; one input, or several {_ENDING} files of one run", common.EXIT_USAGE
+        )
+    return False
+
+
+def recording_files(paths: list[Path]) -> list[Path]:
+    """The files that are meant; a folder stands for those in it."""
+    files: list[Path] = []
+    for path in paths:
+        found = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
+        missing = path if not path.exists() else None if found else path
+        if missing is not None:
+            raise common.CommandFailedError(f"{path}: there is no recording; an {_ENDING} file", common.EXIT_USAGE)
+        files += found
+    return list(dict.fromkeys(files))
+
+
+class RecordedRun:
+    """What was recorded, and how a monitor is to go through it again."""
+
+    def __init__(self, paths: list[Path], config_path: str | None, opened: contextlib.ExitStack) -> None:
+        """``config_path`` None: the recorded configuration.  What is opened is closed with ``opened``."""
+        from gripmon.recording.replayed import RecordedFrames
+        from gripmon.sources import SourceError
+
+        try:
+            self.source: RecordedFrames = RecordedFrames(recording_files(paths))
+        except SourceError as error:
+            raise common.CommandFailedError(f"{paths[0]}: {error}", common.EXIT_USAGE) from None
+        self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        self.recorded_config = self._recorded_config(opened)
+        if config_path is not None:
+            self.config = common.load(config_path, check_source=False)
+        elif self.recorded_config is not None:
+            self.config = self.recorded_config
+        else:
+            raise common.CommandFailedError(
+                f"{self.name}: holds no configuration; the one to replay with, by --config", common.EXIT_USAGE
+            )
+        self.config, self.past = self._begin(self.config)
+        self._frames = self._same = self._verdicts = self._states = 0
+        self._say_what_is_missing()
+
+    def compare(self, record: FrameRecord) -> None:
+        """Count what is decided now, about the frame that the source gave last, against what was then."""
+        import msgspec
+
+        then = self.source.record
+        assert then is not None, "only frames with a record are replayed"
+        self._frames += 1
+        self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == record
+        self._verdicts += then.verdict is not record.verdict
+        self._states += then.state is not record.state
+
+    def summary(self) -> str:
+        """How many frames were judged otherwise than then."""
+        if self._same == self._frames:
+            return f"replay: all {self._frames} as they were recorded, every number the same"
+        judged = f"{self._verdicts} another verdict, {self._states} another state"
+        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}"
+
+    def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
+        from gripmon.config import ConfigError
+        from gripmon.config.recorded import from_recorded
+
+        recorded = self.source.configuration
+        if recorded is None:
+            return None
+        folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="gripmon-replay-")))
+        try:
+            return from_recorded(recorded, folder)
+        except ConfigError as error:
+            text = str(error).replace(f"{folder}/", "")
+            right = "one of this version, by --config"
+            raise common.CommandFailedError(
+                f"{self.name}: its configuration can't be used ({text}); {right}", common.EXIT_USAGE
+            ) from None
+
+    def _begin(self, config: Config) -> tuple[Config, Past]:
+        """Where the monitor starts from: the state then, if that was about this calibration."""
+        source = self.source
+        state = None if source.configuration is None else source.configuration.start
+        first, recorded = source.reference, self.recorded_config
+        ours = recorded is not None and recorded.state_owner.calibration == config.state_owner.calibration
+        if first is None or recorded is None or not ours:
+            if recorded is not None:
+                print("replay: --config has another calibration: it begins with that one's reference", file=sys.stderr)
+            return config, Past(None, source.commands)
+        began_with = recorded.reference if state is None else state.references[-1]
+        if state is None and first.origin == began_with.origin:
+            return dataclasses.replace(config, reference=first), Past(None, source.commands)
+        if state is not None and (first.reference_id, first.revision) == (began_with.reference_id, began_with.revision):
+            return dataclasses.replace(config, reference=state.references[0]), Past(state, source.commands)
+        print(
+            f"replay: the run's beginning isn't in {self.name}: it begins with the reference that was in force in the "
+            f"first file, {first.reference_id}; the result comes close only",
+            file=sys.stderr,
+        )
+        return dataclasses.replace(config, reference=first), Past(None, source.commands)
+
+    def _say_what_is_missing(self) -> None:
+        source = self.source
+        if source.frames_without_image:
+            print(
+                f"replay: {self.name} holds images of {len(source) - source.stand_ins} frames; "
+                f"{source.frames_without_image} more were recorded without: the result comes close only",
+                file=sys.stderr,
+            )
+        if source.stand_ins:
+            print(
+                f"replay: {source.stand_ins} refused frames have no image in the recording; they are refused again as "
+                "their records say",
+                file=sys.stderr,
+            )
+
+
+def _holds_recordings(path: Path) -> bool:
+    if path.is_dir():
+        return any(path.glob(f"*{_ENDING}"))
+    return path.suffix.lower() == _ENDING

@@ -1,0 +1,65 @@
+"""A configuration as a recording holds it: all that the monitor's decisions rest on, so that a replay needs no other.
+
+Every value is written down, defaults too: a later version with other defaults decides the same.  Where images come
+from, the network and the place of the kept state are left out: decisions don't rest on them, and passwords may stand
+there.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gripmon.config import Config, load_config
+from gripmon.config.errors import ConfigError
+from gripmon.config.yaml_file import as_yaml
+from gripmon.records import MonitorState, RecordedConfiguration, RecordedFile
+
+_LEFT_OUT = ("source", "publish", "ros2", "state", "view")
+_PLAIN_NAME = re.compile(r"[^/\\\x00]{1,255}")
+_NO_SOURCE = {"kind": "folder", "path": "images-of-this-recording"}
+
+
+def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedConfiguration:
+    """The configuration with the files that it names, by plain names; ``start`` is what the monitor begins with.
+
+    Raises OSError for a file that is there no more.
+    """
+    named = {"gripper": config.gripper_path, **({} if config.taught is None else {"taught": _taught_path(config)})}
+    values: dict[str, Any] = msgspec.to_builtins(config.settings)
+    values = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
+    values["source"] = _NO_SOURCE
+    files: dict[str, RecordedFile] = {}
+    for role, path in named.items():
+        name = path.name if path.name not in (config.path.name, *files) else f"{role}-{path.name}"
+        files[name] = RecordedFile.of(path.read_bytes())
+        values[role] = name
+    files[config.path.name] = RecordedFile.of(as_yaml(values).encode())
+    return RecordedConfiguration(config.path.name, files, start)
+
+
+def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:
+    """Write the files into ``folder``, which is empty, and load them as any configuration.
+
+    Raises :class:`ConfigError` for a configuration that this version can't use, and OSError.
+    """
+    for name, file in recorded.files.items():
+        path = folder / name
+        if not _PLAIN_NAME.fullmatch(name) or name in (".", ".."):  # a recording may come from anywhere
+            raise ConfigError(folder, "", f"the recorded configuration has a file {name!r}", "a plain name")
+        try:
+            path.write_bytes(file.data)
+        except ValueError:
+            raise ConfigError(path, "", "the recorded file is damaged", "base64") from None
+    if recorded.main not in recorded.files:
+        raise ConfigError(folder, "", f"the recorded configuration lacks its file {recorded.main!r}", "all its files")
+    return load_config(folder / recorded.main, check_source=False)
+
+
+def _taught_path(config: Config) -> Path:
+    path = config.taught_path
+    assert path is not None, "there is a taught model"
+    return path

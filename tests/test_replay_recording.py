@@ -1,0 +1,384 @@
+"""``gripmon replay RECORDING``: a daemon's run, with all that happened in it, decided again to the byte."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import rerun as rr
+import zenoh
+from loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
+from network_daemon import ENVIRONMENT
+
+from gripmon.cli import main
+from gripmon.cli.replay import _recorder
+from gripmon.cli.replaying import replay
+from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.config.recorded import from_recorded, to_recorded
+from gripmon.recording import open_recorder
+from gripmon.records import Frame, RecordedConfiguration, RecordedFile, Refusal
+from gripmon.sources.folder import FolderSettings, FolderSource
+from gripmon.statefile import unpack
+
+ROOT = Path(__file__).resolve().parent.parent
+PREFIX = "gripmon/demo/wrist"
+EVERY_FRAME = "{image_format: png, image_rate_hz: 1000, queue_images: 256, queue_frames: 10000, min_free_bytes: 0}"
+
+
+def configured(folder: Path, endpoint: str, **sections: str) -> Path:
+    """The demo's configuration with other sections, each in braces."""
+    text = builtin_config("demo.yaml").read_text()
+    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
+    sections = {
+        "publish": f"{{listen: ['{endpoint}']}}",
+        "recording": EVERY_FRAME,
+        "source": "{kind: simulator, scenario: creep, duration_s: 6.0, fps: 30.0, realtime: false, ends: true}",
+        **sections,
+    }
+    for name, section in sections.items():
+        text = re.sub(rf"(?ms)^{name}:.*?(?=^\w|\Z)", "", text) + f"{name}: {section}\n"
+    path = folder / "monitor.yaml"
+    path.write_text(text)
+    return path
+
+
+@contextmanager
+def running(config: Path, out: Path, *options: str) -> Iterator[Any]:
+    command = [sys.executable, "-m", "gripmon", "run", str(config), "--out", str(out), *options]
+    with (out.parent / f"{out.name}.txt").open("wb") as said:
+        process = subprocess.Popen(command, stderr=said, env=ENVIRONMENT)
+        try:
+            yield process
+        finally:
+            process.kill()
+            process.wait()
+
+
+def without_latency(path: Path) -> list[bytes]:
+    return re.sub(rb'"latency_ns":\d+', b'"latency_ns":0', path.read_bytes()).splitlines()
+
+
+def replayed(inputs: Path | list[Path], out: Path, *options: str, code: int = 0) -> list[bytes]:
+    """The lines of a replay, without latencies."""
+    names = [str(path) for path in (inputs if isinstance(inputs, list) else [inputs])]
+    assert main(["replay", *names, "--out", str(out), *options]) == code
+    return without_latency(out)
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three seconds of a camera that a cable pulls aside."""
+    out = tmp_path_factory.mktemp("simulated") / "creep"
+    assert main(["simulate", "creep", "--out", str(out), "--seconds", "3", "--fps", "10", "--seed", "2"]) == 0
+    return out
+
+
+def sequence_config(sequence: Path, recording: str = EVERY_FRAME, name: str = "every.yaml", more: str = "") -> Path:
+    path = sequence / name
+    path.write_text((sequence / "config.yaml").read_text() + f"recording: {recording}\n{more}")
+    return path
+
+
+class Told:
+    """Sends commands to a monitor and hears what it publishes."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+
+    def newest(self) -> dict[str, Any]:
+        records = ask(self._session, f"{PREFIX}/transform")
+        return records[-1] if records else {"seq": -1, "revision": -1}
+
+    def await_frames(self, more: int) -> None:
+        first = self.newest()["seq"]
+        wait_until(lambda: self.newest()["seq"] >= first + more, f"{more} more frames")
+
+    def await_revision(self, revision: int) -> None:
+        wait_until(lambda: self.newest()["revision"] >= revision, f"revision {revision}")
+
+    def tell(self, name: str, argument: str = "") -> bool:
+        """Whether it was done."""
+        payload = json.dumps({"argument": argument}).encode()
+        (reply,) = self._session.get(f"{PREFIX}/cmd/{name}", payload=payload, timeout=WAIT_S)
+        assert reply.ok is not None, reply.err
+        return bool(json.loads(reply.ok.payload.to_bytes())["done"])
+
+    def await_done(self, name: str) -> bool:
+        """Tell it again and again until it is done, with refusals before that."""
+        wait_until(lambda: self.tell(name), f"{name} done")
+        return True
+
+
+@contextmanager
+def jaw_on_network(session: zenoh.Session) -> Iterator[None]:
+    """A robot that reports an opening a little off, at its own pace."""
+    rng, over = np.random.default_rng(5), threading.Event()
+
+    def report() -> None:
+        while not over.wait(0.015):
+            session.put(f"{PREFIX}/jaw", f"{0.034 + 1e-5 * rng.standard_normal()!r}".encode())
+
+    thread = threading.Thread(target=report)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+def test_a_run_with_commands_and_a_kept_state_is_decided_again_to_the_byte(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Two runs, the second from the state that the first kept; the jaw opening comes over the network in both."""
+    endpoint = free_endpoint()
+    source = "{kind: simulator, scenario: static, duration_s: 600.0, fps: 30.0, realtime: false}"
+    config = configured(
+        tmp_path, endpoint, source=source, state="{file: kept.json}", jaw="{source: zenoh}",
+        monitor="{jaw_sigma_m: 0.0001, recalibration: {mode: confirm}}",
+    )  # fmt: skip
+    done: dict[str, list[bool]] = {}
+    for name in ("first", "second"):
+        with running(config, tmp_path / name) as process:
+            wait_until(lambda: accepts(endpoint) or process.poll() is not None, "the monitor on the network")
+            with plain_session(connect=endpoint) as session, jaw_on_network(session):
+                told = Told(session)
+                told.await_frames(40)
+                revision = told.newest()["revision"]
+                said = done.setdefault(name, [])
+                said += [told.tell("accept"), told.tell("acknowledge"), told.tell("recalibrate")]
+                said.append(told.await_done("accept"))
+                told.await_revision(revision + 1)
+                told.await_frames(10)
+                said.append(told.tell("undo"))
+                told.await_frames(10)
+                said += [told.tell("reset"), told.tell("undo", "nothing-known"), told.tell("state")]
+                told.await_frames(20)
+                process.terminate()
+                assert process.wait(WAIT_S) == 0
+    assert {True, False} == set(done["first"]) and done["first"][-4], "some were done and some were refused"
+    kept = unpack((tmp_path / "kept.json").read_bytes()).state
+    assert len(kept.references) >= 5, "configured, and accepted and undone in both runs"
+    for name in ("first", "second"):
+        capsys.readouterr()
+        again = replayed(tmp_path / name, tmp_path / f"{name}.jsonl")
+        said_now = capsys.readouterr().err
+        assert again == without_latency(tmp_path / name / "estimates.jsonl"), said_now
+        assert "as they were recorded, every number the same" in said_now
+    first_lines = [json.loads(line) for line in (tmp_path / "second" / "estimates.jsonl").read_bytes().splitlines()]
+    assert first_lines[0]["revision"] >= 2, "the second run went on from the first"
+    openings = {line["jaw_opening_m"] for line in first_lines} - {None}
+    assert len(openings) > 30, "the network's openings differ from frame to frame"
+
+
+class Given:
+    """Frames from memory."""
+
+    live, connected, dropped = False, True, 0
+
+    def __init__(self, frames: list[Frame]) -> None:
+        self._frames = iter(frames)
+
+    def read(self) -> Frame | None:
+        return next(self._frames, None)
+
+    def close(self) -> None:
+        self._frames = iter(())
+
+
+def odd_frames(sequence: Path) -> list[Frame]:
+    """All that may come from a camera: refused frames of every kind, other pixel types, odd stamps and names."""
+    folder = FolderSource(FolderSettings(path="."), sequence)
+    frames = [frame for frame in iter(folder.read, None) if isinstance(frame, Frame)]
+    image = frames[0].image
+    assert image is not None
+    height, width = image.shape[:2]
+    changes: dict[int, dict[str, Any]] = {
+        4: {"image": np.zeros_like(image)},
+        5: {"image": np.full_like(image, 255)},
+        6: {"image": np.full_like(image, 90)},
+        7: {"image": image[:100, :100].copy()},
+        8: {"image": np.zeros((3 * height, 3 * width, 3), np.uint8)},
+        9: {"image": None, "fault": "truncated: or worse"},
+        10: {"image": None, "fault": "64x48 pixels", "refusal": Refusal.WRONG_SIZE},
+        11: {"image": np.where(image > 0, np.float32(np.nan), np.float32(0.0))},
+        12: {"image": image.astype(np.float64)},
+        13: {"image": image[:, :, None]},
+        14: {"jaw_opening_m": 0.4},
+        15: {"jaw_opening_m": None},
+        16: {"stamp_ns": frames[10].stamp_ns},
+        17: {"name": "a stream: of ours"},
+        18: {"image": np.stack([image] * 3, axis=2)},
+        19: {"image": frames[19].image.astype(np.uint16) * 257},  # type: ignore[union-attr]
+        22: {"image": frames[21].image},
+        23: {"image": frames[21].image},
+    }
+    odd = [dataclasses.replace(frame, **changes.get(frame.seq, {})) for frame in frames]
+    return [dataclasses.replace(frame, seq=frame.seq + 3 * (frame.seq > 25)) for frame in odd if frame.seq != 2]
+
+
+def test_refused_and_odd_frames_are_given_again(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = load_config(sequence_config(sequence), check_source=False)
+    with _recorder(str(tmp_path / "odd.rrd"), config) as recorder:
+        lines = [line for line, _ in replay(config, Given(odd_frames(sequence)), recorder)]
+    reasons = {json.loads(line)["reason"].partition(":")[0] for line in lines if json.loads(line)["reason"]}
+    assert reasons >= set(Refusal) - {Refusal.FROZEN}, "every kind of refusal"
+    (tmp_path / "then.jsonl").write_bytes(b"".join(lines))
+    again = replayed(tmp_path / "odd.rrd", tmp_path / "again.jsonl")
+    assert again == without_latency(tmp_path / "then.jsonl")
+    said = capsys.readouterr().err
+    assert "5 refused frames have no image in the recording" in said and "every number the same" in said
+
+
+def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = load_config(sequence_config(sequence), check_source=False)
+    settings = msgspec.structs.replace(config.settings.recording, max_file_bytes=1_500_000, flush_period_s=0.05)
+    paths = {}
+    for name in ("a", "b"):
+        recorder = open_recorder(
+            settings, robot="demo", camera_name="wrist", camera=config.camera, gripper=config.gripper,
+            reference=config.reference, directory=tmp_path / name, name=name, patience_s=30.0,
+            configuration=to_recorded(config),
+        )  # fmt: skip
+        source = FolderSource(FolderSettings(path="."), sequence)
+        lines = b""
+        for line, _ in replay(config, source, recorder):
+            lines += line
+            time.sleep(0.05)  # the files change at flushes
+        recorder.close(timeout_s=60.0)
+        paths[name] = sorted((tmp_path / name).glob("*.rrd"))
+        assert len(paths[name]) >= 3
+    (tmp_path / "then.jsonl").write_bytes(lines)
+    then = without_latency(tmp_path / "then.jsonl")
+    assert replayed(tmp_path / "b", tmp_path / "folder.jsonl") == then
+    assert replayed(paths["b"][::-1], tmp_path / "files.jsonl") == then
+    capsys.readouterr()
+    assert main(["replay", str(tmp_path / "a"), str(tmp_path / "b"), "--out", "-"]) == 2
+    assert capsys.readouterr().err.splitlines() == [
+        f"{tmp_path / 'a'}: path: these are files of 2 runs; the files of one"
+    ]
+    last = replayed(paths["b"][-1:], tmp_path / "last.jsonl")
+    assert 0 < len(last) < len(then), "each file brings what it takes"
+
+
+def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    config = sequence_config(sequence, "{image_format: jpeg, image_rate_hz: 2.0, min_free_bytes: 0}", "thin.yaml")
+    recording = tmp_path / "thin.rrd"
+    replayed(sequence, tmp_path / "then.jsonl", "--config", str(config), "--recording", str(recording))
+    capsys.readouterr()
+    lines = replayed(recording, tmp_path / "again.jsonl")
+    said = capsys.readouterr().err
+    counted = re.search(r"holds images of (\d+) frames; (\d+) more were recorded without", said)
+    assert counted and int(counted[1]) == len(lines) < 30 and int(counted[1]) + int(counted[2]) == 30
+    assert re.search(rf"replay: \d+ of {len(lines)} otherwise than recorded", said)
+
+
+def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """The camera is pulled aside by more than a millimetre: with a limit of half of that it is measured anew."""
+    recording = tmp_path / "then.rrd"
+    first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
+    then = replayed(sequence, tmp_path / "then.jsonl", *first)
+    tight = "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004}, recalibration: {mode: 'off'}}\n"
+    text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
+    (sequence / "tight.yaml").write_text(text + tight)
+    capsys.readouterr()
+    now = replayed(recording, tmp_path / "now.jsonl", "--config", str(sequence / "tight.yaml"))
+    said = capsys.readouterr().err
+    severities = [{alert["severity"] for alert in json.loads(line)["alerts"]} for line in now]
+    assert any("error" in some for some in severities), "past the limit"
+    pairs = [(json.loads(a), json.loads(b)) for a, b in zip(then, now, strict=True)]
+    states = sum(a["state"] != b["state"] for a, b in pairs)
+    verdicts = sum(a["verdict"] != b["verdict"] for a, b in pairs)
+    assert f"{verdicts} another verdict, {states} another state" in said
+
+
+def test_another_calibration_begins_with_its_own_reference(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    recording = tmp_path / "then.rrd"
+    first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
+    replayed(sequence, tmp_path / "then.jsonl", *first)
+    text = (sequence / "config.yaml").read_text()
+    (sequence / "other.yaml").write_text(re.sub(r"(?m)^(reference:)$", r"\1\n  id: another", text))
+    capsys.readouterr()
+    lines = replayed(recording, tmp_path / "now.jsonl", "--config", str(sequence / "other.yaml"))
+    assert {json.loads(line)["reference_id"] for line in lines} == {"another"}
+    assert "--config has another calibration" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("path", sorted(builtin_config("demo.yaml").parent.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_recorded_configuration_is_the_configuration(path: Path, tmp_path: Path):
+    """All settings but those that decisions don't rest on, to the last digit."""
+    config = load_config(path, check_source=False, with_taught=False)
+    again = from_recorded(
+        msgspec.json.decode(msgspec.json.encode(to_recorded(config)), type=RecordedConfiguration), tmp_path
+    )
+    for name in config.settings.__struct_fields__:
+        if name not in ("source", "publish", "ros2", "state", "view", "gripper"):
+            assert getattr(again.settings, name) == getattr(config.settings, name), name
+    assert again.gripper.model == config.gripper.model and again.reference == config.reference
+    assert again.state_owner == config.state_owner
+
+
+def test_no_password_is_recorded(tmp_path: Path):
+    text = builtin_config("live_camera.yaml").read_text()
+    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
+    text = text.replace("device: 0 ", "device: 'rtsp://operator:sesame1@camera/1' # or sesame2")
+    text = text.replace("connect: [] ", "connect: ['tls/host:7447#password=sesame3'] ")
+    assert "sesame1" in text and "sesame3" in text
+    path = tmp_path / "live.yaml"
+    path.write_text(text)
+    recorded = msgspec.json.encode(to_recorded(load_config(path, check_source=False)))
+    assert b"sesame" not in recorded and b"coefficients" in recorded
+
+
+@pytest.mark.parametrize("name", ["../outside.yaml", "/tmp/outside.yaml", "..", "a/b.yaml", ""])
+def test_a_recording_writes_nowhere_else(tmp_path: Path, name: str):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    recorded = RecordedConfiguration("monitor.yaml", {name: RecordedFile("robot: x")})
+    with pytest.raises(ConfigError, match="a plain name"):
+        from_recorded(recorded, inside)
+    assert [path.name for path in tmp_path.iterdir()] == ["inside"] and not list(inside.iterdir())
+
+
+def test_what_cannot_be_replayed_is_said_in_one_line(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    config = load_config(sequence_config(sequence), check_source=False)
+    old = open_recorder(
+        config.settings.recording, robot="demo", camera_name="wrist", camera=config.camera, gripper=config.gripper,
+        reference=config.reference, directory=tmp_path, name="old", patience_s=30.0,
+    )  # fmt: skip
+    for _ in replay(config, FolderSource(FolderSettings(path="."), sequence), old):
+        pass
+    old.close(timeout_s=60.0)
+    other = rr.RecordingStream("somebody_else", recording_id="x")
+    other.set_sinks(rr.FileSink(tmp_path / "other.rrd"))
+    other.log("a", rr.Scalars(1.0))
+    other.disconnect()
+    (tmp_path / "empty").mkdir()
+    cases = [
+        ([tmp_path / "old-0001.rrd"], "holds no configuration; the one to replay with, by --config"),
+        ([tmp_path / "other.rrd"], "is a recording of 'somebody_else'; one of gripmon's"),
+        ([tmp_path / "none.rrd"], "there is no recording; an .rrd file"),
+        ([tmp_path / "old-0001.rrd", sequence], "is no .rrd file; one input, or several .rrd files of one run"),
+        ([sequence], "only a recording brings its own configuration; --config CONFIG"),
+    ]
+    capsys.readouterr()
+    for inputs, expected in cases:
+        assert main(["replay", *map(str, inputs), "--out", "-"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert expected in line
