@@ -17,11 +17,10 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
     points_grip_m = gripper.points_grip_m(measurement.jaw_opening_m if gripper.has_jaw else None)
     points_cam_m = points_grip_m @ measurement.cam_T_grip[:3, :3].T + measurement.cam_T_grip[:3, 3]
     along = np.linspace(0.0, 1.0, 33)[:, None]
-    lines = []
-    for edge in np.flatnonzero(prediction.layout.visible):
-        start, end = points_cam_m[gripper.edge_points[edge]]
-        line = camera.project(start + along * (end - start))
-        lines.append(line[np.isfinite(line).all(axis=1)])
+    start, end = points_cam_m[gripper.edge_points[prediction.layout.visible]].swapaxes(0, 1)[:, :, None]
+    # All at once: this is called while the next frame may be waiting.
+    lines = camera.project((start + along * (end - start)).reshape(-1, 3)).reshape(len(start), -1, 2)
+    finite = np.asarray(np.isfinite(lines).all(axis=2))
     corners_uv_px = camera.project(points_cam_m[gripper.corner_points])
     corners_uv_px[~prediction.corners.visible] = np.nan
     return MeasurementTrace(
@@ -29,7 +28,7 @@ def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> Meas
         edge_used=consensus.weight > 0.0,
         edge_index=prediction.layout.edge[sample],
         edge_residual_px=consensus.residual_px,
-        predicted_edges_uv_px=tuple(lines),
+        predicted_edges_uv_px=tuple(line[there] for line, there in zip(lines, finite, strict=True)),
         predicted_corners_uv_px=corners_uv_px,
     )
 
