@@ -7,10 +7,24 @@ import os
 import sys
 
 from gripmon import __version__
-from gripmon.cli import certificates, check, demo, feed, replay, router, run, schema, send, simulate, teach, watch
+from gripmon.cli import (
+    certificates,
+    check,
+    demo,
+    export,
+    feed,
+    replay,
+    router,
+    run,
+    schema,
+    send,
+    simulate,
+    teach,
+    watch,
+)
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 
-_COMMANDS = (demo, run, watch, send, router, schema, feed, replay, simulate, check, teach, certificates)
+_COMMANDS = (demo, run, watch, send, router, schema, feed, replay, export, simulate, check, teach, certificates)
 
 # To be set before NumPy and OpenCV are imported; what the user has set stays.
 _ENVIRONMENT = {

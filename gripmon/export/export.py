@@ -21,20 +21,22 @@ from gripmon.atomic import remove_leftovers, write_atomically
 from gripmon.export.schemas import SCHEMAS
 from gripmon.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
 from gripmon.playback import FrameTable
-from gripmon.records import AlertRecord, ReferenceRecord, StateRecord
-from gripmon.records.recorded import Meta, RecordedCommand
+from gripmon.records import AlertRecord, Meta, RecordedCommand, ReferenceRecord, StateRecord
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
 
 _NULL = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST_NAME = 120
+_NUMBERED = re.compile(r"-(\d{4,9})$")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 
 
 class Part(Protocol):
     """What is exported of a recording, e.g. :class:`gripmon.playback.Recording` of a single file."""
 
+    @property
+    def recording_id(self) -> str: ...
     @property
     def meta(self) -> Meta | None: ...
     @property
@@ -70,7 +72,7 @@ class Exporter:
 
     def add(self, part: Part, path: Path) -> None:
         """Export what the file ``path`` of a recording holds.  Raises OSError if it can't be written."""
-        recording_id, number = (path.stem, 0) if part.meta is None else (part.meta.recording_id, part.meta.file_number)
+        recording_id, number = part.recording_id, _number(part, path)
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
         known = self._from.setdefault((part.robot, part.camera, name), path)
         if known != path:
@@ -132,6 +134,14 @@ def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path)
     write_atomically(path, buffer.getvalue())
+
+
+def _number(part: Part, path: Path) -> int:
+    """Of a file in its run; older ones say it in their names alone."""
+    if part.meta is not None:
+        return part.meta.file_number
+    found = _NUMBERED.search(path.stem)
+    return int(found[1]) if found else 0
 
 
 def _escaped(value: str) -> str:
