@@ -6,19 +6,28 @@ import contextlib
 import glob
 import os
 import secrets
+from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 
 def write_atomically(path: Path, data: bytes) -> None:
+    """A whole file at once, see :func:`opened_atomically`."""
+    with opened_atomically(path) as file:
+        file.write(data)
+
+
+@contextlib.contextmanager
+def opened_atomically(path: Path) -> Iterator[IO[bytes]]:
     """Write under another name beside ``path``, then rename: a reader sees the old file or the new one, and a fault
-    leaves the old one.  When this returns, the new one survives a power cut.  OSError if it can't be written.
+    leaves the old one.  When the context ends, the new one survives a power cut.  OSError if it can't be written.
     """
     name = path.with_name(f".{path.name}-{secrets.token_hex(4)}.tmp")
     # With the mode that any new file gets: mkstemp's is narrower, and the umask can't be read without changing it.
     descriptor = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         name.replace(path)

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import random
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import duckdb
 import msgspec
 import pytest
-from loopback import state_record
+from loopback import WAIT_S, state_record
 from recorded import INTERVAL_NS, frame, record, recorder, trace, wait_until
 
 from gripmon.cli import main
+from gripmon.playback import open_recordings
 from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Severity, State, to_json
 
+ROOT = Path(__file__).resolve().parent.parent
 COUNT = 400
 MIDNIGHT_NS = 20_526 * 86_400_000_000_000  # 2026-03-14
 STEP = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")
@@ -27,6 +32,10 @@ def told(i: int) -> FrameRecord:
     return record(i, state, alerts=(STEP,) if i == 200 else (), stamp_ns=stamp_ns)
 
 
+def bytes_in(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.glob("*.rrd"))
+
+
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run in two files at least."""
@@ -35,8 +44,10 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for i in range(COUNT):
         if i % 50 == 0:
             opened.state(msgspec.structs.replace(state_record(i), stamp_ns=told(i).stamp_ns))
-            wait_until(lambda: not opened.failure)
         opened.offer(dataclasses.replace(frame(i), stamp_ns=told(i).stamp_ns), told(i), lambda i=i: trace(i))
+        if i % 50 == 49:  # so that no file gets all of them at once
+            size = bytes_in(folder)
+            wait_until(lambda size=size: bytes_in(folder) > size, WAIT_S)
     opened.close(timeout_s=60.0)
     assert len(list(folder.glob("*.rrd"))) >= 2 and opened.dropped == 0
     return folder
@@ -83,14 +94,17 @@ def test_all_that_was_recorded_is_exported_once(recordings: Path, tmp_path: Path
 def test_a_recording_that_is_cut_short_gives_what_is_left(
     recordings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    whole = min(recordings.glob("*.rrd"))
-    cut = tmp_path / whole.name
-    cut.write_bytes(whole.read_bytes()[: int(0.6 * whole.stat().st_size)])
+    for path in recordings.glob("*.rrd"):
+        shutil.copy(path, tmp_path)
+    cut = max(tmp_path.glob("*.rrd"), key=lambda path: path.stat().st_size)
+    cut.write_bytes(cut.read_bytes()[: int(0.3 * cut.stat().st_size)])
     (tmp_path / "rubbish.rrd").write_bytes(random.Random(3).randbytes(5000))
     (tmp_path / "empty.rrd").touch()
     assert main(["export", str(tmp_path), "--out", str(tmp_path / "fleet")]) == 0
-    seqs = [row[0] for row in asked(tmp_path / "fleet", "SELECT seq FROM it ORDER BY seq")]
-    assert 0 < len(seqs) < COUNT and set(seqs) < set(range(COUNT))
+    seqs = {row[0] for row in asked(tmp_path / "fleet", "SELECT seq FROM it ORDER BY seq")}
+    alone = open_recordings([cut]).recordings
+    others = open_recordings([p for p in recordings.glob("*.rrd") if p.name != cut.name]).recordings
+    assert seqs == {seq for each in (*alone, *others) for seq in each.frames.seq.tolist()} <= set(range(COUNT))
     lines = capsys.readouterr().err.splitlines()
     assert {line.split(":")[0] for line in lines} == {str(tmp_path / n) for n in (cut.name, "rubbish.rrd", "empty.rrd")}
 
@@ -142,3 +156,20 @@ def test_a_table_that_cannot_be_written_ends_it(recordings: Path, tmp_path: Path
 def test_nothing_is_left_beside_the_files(recordings: Path, tmp_path: Path):
     assert main(["export", str(recordings), "--out", str(tmp_path)]) == 0
     assert all(name.endswith(".parquet") for name in contents(tmp_path))
+
+
+def test_a_full_disk_leaves_what_was_there(recordings: Path, tmp_path: Path):
+    """A limit on a file's length, which a writer meets as it meets a full disk: in the middle of its rows."""
+    small = tmp_path / "small.jsonl"
+    small.write_bytes(b"".join(to_json(told(i)) + b"\n" for i in range(10)))
+    large = tmp_path / "large.jsonl"
+    large.write_bytes(b"".join(to_json(told(i)) + b"\n" for i in range(COUNT)))
+    out = tmp_path / "fleet"
+    assert main(["export", str(small), "--out", str(out)]) == 0
+    small.write_bytes(large.read_bytes())  # the same recording, grown
+    before = contents(out)
+    command = f"ulimit -f 24; exec {sys.executable} -m gripmon export {small} --out {out}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=WAIT_S, cwd=ROOT)
+    assert done.returncode == 3
+    assert done.stderr == (f"{out}: can't be written (File too large), at {small}; what stands there is whole\n")
+    assert contents(out) == before

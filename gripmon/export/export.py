@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import itertools
 import re
 from collections import Counter
@@ -17,7 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from gripmon.atomic import remove_leftovers, write_atomically
+from gripmon.atomic import opened_atomically, remove_leftovers
 from gripmon.export.schemas import SCHEMAS
 from gripmon.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
 from gripmon.playback import FrameTable
@@ -127,13 +126,14 @@ class _Target(NamedTuple):
 def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
     """A Parquet file, a row group each, in place of the one that was there; the same rows give the same bytes."""
     texts = [field.name for field in schema if field.type == pa.string()]
-    buffer = io.BytesIO()
-    with pq.ParquetWriter(buffer, schema, compression="zstd", use_dictionary=texts) as writer:
-        for group in groups:
-            writer.write_table(group, row_group_size=max(1, len(group)))
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_leftovers(path)
-    write_atomically(path, buffer.getvalue())
+    with (
+        opened_atomically(path) as file,
+        pq.ParquetWriter(file, schema, compression="zstd", use_dictionary=texts) as writer,
+    ):
+        for group in groups:
+            writer.write_table(group, row_group_size=max(1, len(group)))
 
 
 def _number(part: Part, path: Path) -> int:
