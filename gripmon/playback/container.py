@@ -212,7 +212,9 @@ class RrdFile:
         from rerun.chunk import RrdReader
 
         try:
-            return _recordings(RrdReader(self.path))
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")  # a mark without a footer: rerun would look through the whole file
+                return _recordings(RrdReader(self.path))
         except Exception as error:  # noqa: BLE001 - whatever rerun raises
             self._distrust_footer(error)
             return []

@@ -102,7 +102,8 @@ class Contents:
 
     @property
     def recording_id(self) -> str:
-        return self.store.recording_id if self.meta is None else self.meta.recording_id
+        """The run's own where it says so, else rerun's."""
+        return (self.meta.recording_id if self.meta is not None else "") or self.store.recording_id
 
     @property
     def is_ours(self) -> bool:
@@ -203,7 +204,7 @@ class Reading:
         for chunk in chunks:
             entity = chunk.entity_path.removeprefix("/")
             if keep_places and entity in self._places:
-                seqs = _seqs(chunk.to_record_batch())
+                seqs = frame_numbers(chunk.to_record_batch())
                 if len(seqs):
                     self._places[entity].add(block, int(seqs.min()), int(seqs.max()))
             if entity == entities.RECORD:
@@ -291,16 +292,17 @@ def _gathered(manifest: Manifest, messages: Sequence[int]) -> list[Block]:
     return [*blocks, tuple(spans)] if spans else blocks
 
 
-def _seqs(batch: Any) -> IntArray:
+def frame_numbers(batch: Any) -> IntArray:
+    """(rows,) of a batch; empty where it isn't on the timeline of frames, the least number where a row isn't."""
     if "frame" not in batch.schema.names:
         return np.empty(0, np.int64)
-    return batch.column("frame").drop_null().cast("int64").to_numpy(zero_copy_only=False)
+    return batch.column("frame").cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
 
 
 def _seqs_with(batch: Any, component: str) -> IntArray:
     """Frames in which a component holds something."""
-    if component not in batch.schema.names:
+    seqs = frame_numbers(batch)
+    if component not in batch.schema.names or not len(seqs):
         return np.empty(0, np.int64)
-    seqs = batch.column("frame").to_pylist() if "frame" in batch.schema.names else [None] * batch.num_rows
-    counts = batch.column(component).value_lengths().to_pylist()
-    return np.array([s for s, count in zip(seqs, counts, strict=True) if s is not None and count], np.int64)
+    counts = batch.column(component).value_lengths().fill_null(0).to_numpy(zero_copy_only=False)
+    return seqs[(counts > 0) & (seqs > np.iinfo(np.int64).min)]

@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from gripmon.records import FrameRecord, Origin, State, Verdict, schema_name
+from gripmon.records import FrameRecord, Meta, Origin, State, Verdict, schema_name
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 
@@ -19,8 +19,11 @@ _UNKNOWN: dict[type[msgspec.Struct], dict[str, Any]] = {
         "smoothed": None, "drift": None, "reference_id": "", "revision": -1, "rms_px": None, "jaw_opening_m": None,
         "corners": (), "alerts": (),
     },
+    Meta: {
+        "name": "", "recording_id": "", "robot": "unknown", "camera": "unknown", "gripper": "unknown",
+        "version": "unknown", "file_number": 0, "started_ns": 0, "image_policy": "unknown", "has_truth": False,
+    },
 }  # fmt: skip
-_TEXTS = {"name": "", "robot": "unknown", "camera": "unknown", "gripper": "unknown", "version": "unknown"}
 
 
 def read(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
@@ -46,7 +49,7 @@ def _with_unknowns(text: str | bytes, kind: type[_T], reason: str) -> tuple[_T, 
     fields["schema"] = schema
     if kind is FrameRecord and fields.get("verdict") not in set(Verdict):
         fields["verdict"] = Verdict.UNKNOWN
-    for name, value in _UNKNOWN.get(kind, _TEXTS).items():
+    for name, value in _UNKNOWN.get(kind, {}).items():
         fields.setdefault(name, value)
     try:
         record = msgspec.convert(fields, type=kind)

@@ -76,9 +76,10 @@ def _distinct(paths: Iterator[Path], faults: list[str]) -> list[Path]:
         except OSError as error:
             faults.append(f"{path}: {error.strerror}; not used")
             continue
-        first = known.setdefault((status.st_dev, status.st_ino), path)
-        if first is not path:
-            faults.append(f"{path}: is the same file as {first}; read once")
+        key = status.st_dev, status.st_ino
+        if key in known:
+            faults.append(f"{path}: is the same file as {known[key]}; read once")
+        known.setdefault(key, path)
     return list(known.values())
 
 

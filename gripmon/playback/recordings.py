@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from gripmon.playback import entities
 from gripmon.playback.container import Block
-from gripmon.playback.contents import Contents
+from gripmon.playback.contents import Contents, frame_numbers
 from gripmon.playback.lenient import read
 from gripmon.playback.merging import Merged, merge
 from gripmon.playback.table import FrameTable, IntArray
@@ -193,7 +193,7 @@ class Recording:
         for number, contents in enumerate(self._parts):
             for block in contents.places[entity].find(seq) if entity in contents.places else ():
                 for batch in self._batches(number, block).get(entity, ()):
-                    rows = np.flatnonzero(batch.column("frame").to_numpy(zero_copy_only=False) == seq)
+                    rows = np.flatnonzero(frame_numbers(batch) == seq)
                     if len(rows):
                         return _Row(batch, int(rows[0]))
         return None
@@ -210,7 +210,8 @@ class Recording:
             except OSError:
                 chunks = []
             for chunk in chunks:
-                found.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk.to_record_batch())
+                if not chunk.is_static:
+                    found.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk.to_record_batch())
             self._kept[key] = found
             if len(self._kept) > _BLOCKS_KEPT:
                 self._kept.popitem(last=False)
