@@ -58,6 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
 def expectation(config: Config) -> dict[str, Any]:
     """What the calibration expects to see, as plain values for JSON: metres, radians, px."""
     settings, gripper, view = config.settings, config.gripper, config.view()
+    metrics = settings.metrics
     return {
         "config": str(config.path),
         "robot": settings.robot,
@@ -85,6 +86,7 @@ def expectation(config: Config) -> dict[str, Any]:
         "accuracy": expected.accuracy(config),
         "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         "recording": settings.recording.directory if settings.recording.enabled else None,
+        "metrics": f"http://{metrics.address}:{metrics.port}/metrics" if metrics.enabled else None,
     }
 
 
@@ -251,6 +253,7 @@ def _as_text(report: dict[str, Any]) -> str:
         "source": f"{source['kind']}: {'NOT REACHABLE: ' if source['reachable'] is False else ''}{source['detail']}",
         "Zenoh": _zenoh_line(report["keys"], report["zenoh"]),
         "recording": report["recording"] or "off",
+        "metrics": report["metrics"] or "off",
     }
     lines = [f"{report['config']}: sound"]
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
