@@ -6,9 +6,21 @@ import argparse
 import os
 import sys
 
-from benchmarks import accuracy, causes, drift, frames_in, latency, recalibration, recovery, series, smoothing, wire
+from benchmarks import (
+    accuracy,
+    causes,
+    drift,
+    frames_in,
+    latency,
+    recalibration,
+    record,
+    recovery,
+    series,
+    smoothing,
+    wire,
+)
 
-_BENCHMARKS = (accuracy, causes, drift, frames_in, latency, recalibration, recovery, series, smoothing, wire)
+_BENCHMARKS = (accuracy, causes, drift, frames_in, latency, recalibration, record, recovery, series, smoothing, wire)
 
 
 def main() -> int:

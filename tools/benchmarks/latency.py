@@ -95,13 +95,14 @@ def measure(plan: Plan) -> dict[str, Any]:
     return results
 
 
-def render(size: tuple[int, int], count: int, path: Path) -> None:
+def render(size: tuple[int, int], count: int, path: Path, **how: float) -> None:
+    """Frames of the benchmarks' scene into a file; ``how`` as :func:`benchmarks.scene.render` takes it."""
     from tqdm import tqdm
 
     from benchmarks import scene
 
     with tqdm(total=count, desc=f"render {size[0]}x{size[1]}", unit="frame", file=sys.stderr, disable=None) as bar:
-        scene.render(size, count, bar.update).save(path)
+        scene.render(size, count, bar.update, **how).save(path)
 
 
 def in_new_process(function: Callable[..., _T], *arguments: Any) -> _T:

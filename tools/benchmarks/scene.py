@@ -84,14 +84,14 @@ def config_for(size: Size) -> Config:
     return dataclasses.replace(config, settings=settings, camera=make_camera(lens))
 
 
-def render(size: Size, count: int, step: Callable[[], object] = lambda: None) -> Ring:
-    """A ring of ``count`` frames; ``step`` is called after each (for a progress bar)."""
+def render(size: Size, count: int, step: Callable[[], object] = lambda: None, *, creep_m: float = _CREEP_M) -> Ring:
+    """A ring of ``count`` frames in which the mount creeps; ``step`` is called after each (for a progress bar)."""
     config = config_for(size)
     scenario = Scenario(
         name="benchmark",
         duration_s=count / FPS,
         fps=FPS,
-        mount=(Creep(law="linear", time_s=count / FPS, tcp_shift_m=(_CREEP_M, 0.5 * _CREEP_M)),),
+        mount=(Creep(law="linear", time_s=count / FPS, tcp_shift_m=(creep_m, 0.5 * creep_m)),),
         background=Background(kind="printed", boxes=45, cables=14, contrast=0.9, speed_m_per_s=0.12),
     )
     simulator = Simulator(config.camera, config.gripper, from_record(config.reference.cam_T_grip), scenario, seed=1)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from gripmon.config import Config
-from gripmon.recording import Notes, Trace, open_recorder
+from gripmon.recording import Notes, ProcessRecorder, Trace, open_recorder
 from gripmon.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
 
 
 class SwitchedRecorder:
-    """The product's recorder with its default settings while ``on``; nothing is offered to it while off."""
+    """The product's recorder while ``on``, with its default settings but for ``changes``; idle while off."""
 
-    def __init__(self, config: Config, directory: Path) -> None:
+    def __init__(self, config: Config, directory: Path, **changes: Any) -> None:
         self.on = False
-        self._inner = open_recorder(
-            msgspec.structs.replace(config.settings.recording, min_free_bytes=0),
+        self._offered = 0
+        inner = open_recorder(
+            msgspec.structs.replace(config.settings.recording, min_free_bytes=0, **changes),
             robot=config.settings.robot,
             camera_name=config.settings.camera_name,
             camera=config.camera,
@@ -25,10 +27,25 @@ class SwitchedRecorder:
             reference=config.reference,
             directory=directory,
         )
+        assert isinstance(inner, ProcessRecorder)
+        self._inner = inner
 
     @property
     def dropped(self) -> int:
         return self._inner.dropped
+
+    @property
+    def images_dropped(self) -> int:
+        return self._inner.images_dropped
+
+    @property
+    def waiting(self) -> int:
+        """Frames that were taken and are not yet written."""
+        return self._offered - self._inner.frames_written - self._inner.dropped
+
+    @property
+    def process_id(self) -> int | None:
+        return self._inner.process_id
 
     @property
     def failure(self) -> str | None:
@@ -36,6 +53,7 @@ class SwitchedRecorder:
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         if self.on:
+            self._offered += 1
             self._inner.offer(frame, record, trace, notes)
 
     def alert(self, record: AlertRecord) -> None:

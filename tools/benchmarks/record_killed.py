@@ -1,0 +1,92 @@
+"""``kill -9`` of a daemon and its recording process at random moments: what the file then lacks."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.scene import FPS
+
+_DAEMON = Path(__file__).parent / "recorded_daemon.py"
+_START_WITHIN_S = 60.0
+_FRAMES = 100_000  # nobody gets that far
+
+
+@dataclass(frozen=True)
+class Plan:
+    """So many kills, each at a random moment of the span, counted from the first frame."""
+
+    size: tuple[int, int] = (768, 576)
+    ring: int = 30
+    tries: int = 50
+    span_s: tuple[float, float] = (1.0, 6.0)
+    seed: int = 1
+
+
+def measure(path: Path, plan: Plan) -> dict[str, Any]:
+    """Loss of each try, s, and how many files rerun's own reader opens."""
+    draw = random.Random(plan.seed)
+    tries = [_kill_once(path, draw.uniform(*plan.span_s), draw.random() < 0.5) for _ in range(plan.tries)]
+    return {"tries": tries, "span_s": plan.span_s}
+
+
+def _kill_once(path: Path, after_s: float, daemon_first: bool) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory(prefix="gripmon-bench-") as directory:
+        command = [sys.executable, str(_DAEMON), str(path), directory, str(_FRAMES)]
+        daemon = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        assert daemon.stdout is not None
+        try:
+            word, worker = daemon.stdout.readline().decode().split()
+            if word != "recording" or not daemon.stdout.readline():
+                raise RuntimeError("the daemon did not start")
+            _wait_for_a_file(Path(directory))
+            time.sleep(after_s)
+            pids = [daemon.pid, int(worker)]
+            for pid in pids if daemon_first else reversed(pids):
+                os.kill(pid, signal.SIGKILL)
+            delivered = int(daemon.stdout.read().split(b"\n")[-2])
+        finally:
+            daemon.kill()
+            daemon.communicate()
+        opened, newest = read_back(Path(directory))
+    return {
+        "after_s": after_s,
+        "delivered": delivered,
+        "in_file": newest,
+        "opened": opened,
+        "loss_s": (delivered - newest) / FPS,
+    }
+
+
+def _wait_for_a_file(directory: Path) -> None:
+    """The recording process takes a second or two to start: what a kill costs until then isn't the question."""
+    end_s = time.monotonic() + _START_WITHIN_S
+    while not any(directory.glob("*.rrd")):
+        if time.monotonic() > end_s:
+            raise RuntimeError("no recording began")
+        time.sleep(0.01)
+
+
+def read_back(directory: Path) -> tuple[bool, int]:
+    """Whether rerun's own reader opens every file, and the newest frame in them; -1 without any."""
+    from rerun.chunk import RrdReader
+
+    newest, opened = -1, True
+    for path in sorted(directory.glob("*.rrd")):
+        try:
+            frames = 0
+            for chunk in RrdReader(path).stream().filter(content="/record").to_chunks():
+                seqs = chunk.to_record_batch().column("frame").to_pylist()
+                newest, frames = max(newest, *seqs), frames + len(seqs)
+            opened = opened and frames > 0
+        except Exception:  # noqa: BLE001  whatever it says, it doesn't open
+            opened = False
+    return opened, newest

@@ -1,0 +1,44 @@
+"""A daemon that records, in a process of its own: RING DIRECTORY FRAMES.
+
+Says ``recording PID`` (of its recording process) on standard output, then the number of each frame whose transform has
+been published; what it has said, it has delivered, whatever becomes of it.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import cv2
+
+from benchmarks import harness, scene
+from benchmarks.switched import SwitchedRecorder
+from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+
+
+class _Said:
+    """A publisher whose receiver is whoever reads our output."""
+
+    def transform(self, record: FrameRecord) -> None:
+        os.write(1, b"%d\n" % record.seq)
+
+    def state(self, record: StateRecord) -> None: ...
+    def alert(self, record: AlertRecord) -> None: ...
+    def reference(self, record: ReferenceRecord) -> None: ...
+    def close(self) -> None: ...
+
+
+def main(ring_path: str, directory: str, frames: str) -> None:
+    cv2.setNumThreads(1)
+    ring = scene.Ring.load(Path(ring_path))
+    height_px, width_px = ring.images.shape[1:]
+    config = scene.config_for((width_px, height_px))
+    recorder = SwitchedRecorder(config, Path(directory))
+    recorder.on = True
+    os.write(1, b"recording %d\n" % (recorder.process_id or 0))
+    harness.run_loop(config, harness.RingSource(ring, int(frames), paced=True), _Said(), recorder)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
