@@ -10,7 +10,6 @@ from gripmon import __version__
 from gripmon.cli import (
     certificates,
     check,
-    correct,
     demo,
     export,
     feed,
@@ -25,22 +24,7 @@ from gripmon.cli import (
 )
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 
-_COMMANDS = (
-    demo,
-    run,
-    watch,
-    send,
-    router,
-    schema,
-    feed,
-    replay,
-    export,
-    correct,
-    simulate,
-    check,
-    teach,
-    certificates,
-)
+_COMMANDS = (demo, run, watch, send, router, schema, feed, replay, export, simulate, check, teach, certificates)
 
 # To be set before NumPy and OpenCV are imported; what the user has set stays.
 _ENVIRONMENT = {

@@ -1,0 +1,372 @@
+"""A camera from views of a flat target: focal lengths, principal point, lens, with covariance and honest doubts.
+
+Many views: Zhang, "A flexible new technique for camera calibration", 2000, refined over everything at once.  One view
+of a plane: as Tsai ("A versatile camera calibration technique", 1987) with principal point and aspect held fixed,
+which is what the self-viewing method does; see :func:`calibrate_single_view`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.calibration.bundle import DEGENERATE, Bundle, BundleProblem
+from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
+from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.camera import LensSettings, make_camera
+from gripmon.records import Array
+
+FEWEST_POINTS = 8
+"""In a view; a plane's pose needs four."""
+FOCAL_STARTS = np.geomspace(0.25, 8.0, 31)
+"""Focal lengths over the image's width that are tried: fields of view from 127 to 7 degrees."""
+DOUBTFUL_FOCAL = 0.01
+"""Relative standard deviation of the focal length from which the views are said not to support it; and the one from
+which there is no calibration."""
+USELESS_FOCAL = 0.2
+COVERED = 0.6
+"""Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
+LARGEST_RMS_SHARE = 0.02
+"""Root mean square residual over the image's width beyond which no model of ours fits at all."""
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsResult:
+    """A calibrated camera.
+
+    ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; the rest was held fixed.  One a view:
+    ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
+    and ``used`` (n,).  ``criterion``: Bayes' information criterion of each model that was tried, the smallest is best.
+    """
+
+    model: ModelName
+    camera: LensSettings
+    parameters: tuple[str, ...]
+    covariance: Array
+    cam_T_plate: tuple[Array, ...]
+    pose_covariance: tuple[Array, ...]
+    residuals_px: tuple[Array, ...]
+    used: tuple[NDArray[np.bool_], ...]
+    rms_px: float
+    warnings: tuple[str, ...] = ()
+    criterion: dict[str, float] | None = None
+    cross_validated_rms_px: float | None = None
+
+
+def calibrate(
+    sightings: Sequence[Sighting], model: ModelName, *, fixed: frozenset[str] = frozenset()
+) -> IntrinsicsResult:
+    """A camera from views of a plane, all of one size; parameters named in ``fixed`` keep their start (the principal
+    point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.
+
+    Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
+    no convergence, or a lens that can't be meant.
+    """
+    size = _one_size(sightings)
+    lens_model = LensModel(model, *size)
+    names, free, bundle, held = _supported(lens_model, sightings, fixed)
+    camera = lens_model.settings(bundle.parameters)
+    p = free.shape[1]
+    poses = range(len(sightings))
+    result = IntrinsicsResult(
+        model=model,
+        camera=camera,
+        parameters=names,
+        covariance=bundle.covariance[:p, :p],
+        cam_T_plate=bundle.cam_T_plate,
+        pose_covariance=tuple(bundle.covariance[p + 6 * k : p + 6 * k + 6, p + 6 * k : p + 6 * k + 6] for k in poses),
+        residuals_px=bundle.residuals_px,
+        used=bundle.used,
+        rms_px=bundle.rms_px,
+        criterion={model: _bayes(bundle, p)},
+    )
+    return replace(result, warnings=(*held, *_warnings(result, bundle, sightings, size)))
+
+
+def calibrate_best(
+    sightings: Sequence[Sighting],
+    models: Sequence[ModelName],
+    *,
+    fixed: frozenset[str] = frozenset(),
+    step: Callable[[], None] = lambda: None,
+) -> IntrinsicsResult:
+    """The one of several models with the smallest information criterion (Schwarz, "Estimating the dimension of a
+    model", 1978); models that can't be fitted drop out, and :class:`CalibrationError` if all do.
+    """
+    best: IntrinsicsResult | None = None
+    criterion: dict[str, float] = {}
+    reasons = []
+    for model in models:
+        try:
+            result = calibrate(sightings, model, fixed=fixed)
+        except CalibrationError as error:
+            reasons.append(f"{model}: {error}")
+        else:
+            criterion[model] = (result.criterion or {})[model]
+            if best is None or criterion[model] < criterion[best.model]:
+                best = result
+        step()
+    if best is None:
+        raise CalibrationError(reasons[0].partition(": ")[2])
+    return replace(best, criterion=criterion)
+
+
+def calibrate_single_view(sighting: Sighting, model: ModelName = "paper") -> IntrinsicsResult:
+    """Focal length, lens and the plate's pose from one view of a plane, principal point at the image's centre and
+    square pixels: what the self-viewing method's off-line step starts with (Tsai's single-view coplanar calibration).
+
+    The plate must be tilted against the image, by 30 degrees or so: parallel to it, focal length and distance are one
+    unknown.  Raises :class:`CalibrationError` then.
+    """
+    names = parameter_names(model)
+    fixed = {"cx_px", "cy_px", "aspect"} | set(names[5:])  # one view can't tell more of a lens than one number
+    return calibrate([sighting], model, fixed=frozenset(fixed))
+
+
+def cross_validate(
+    sightings: Sequence[Sighting],
+    model: ModelName,
+    *,
+    fixed: frozenset[str] = frozenset(),
+    folds: int = 5,
+    step: Callable[[], None] = lambda: None,
+) -> float | None:
+    """Root mean square residual (px) of views that had no part in the calibration, which keep only a pose of their own
+    to fit; None with fewer than four views.
+    """
+    if len(sightings) < 4:
+        return None
+    folds = min(folds, len(sightings))
+    squares, count = 0.0, 0
+    for fold in range(folds):
+        others = [s for k, s in enumerate(sightings) if k % folds != fold]
+        try:
+            camera = calibrate(others, model, fixed=fixed)
+        except CalibrationError:
+            step()
+            continue
+        lens_model, parameters = LensModel(model, *_one_size(sightings)), lens_vector(camera.camera)
+        for sighting in sightings[fold::folds]:
+            pose = plate_pose_start(lens_model, parameters, sighting)
+            bundle = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0))).solve(parameters, [pose])
+            residuals = bundle.residuals_px[0][bundle.used[0]]
+            squares, count = squares + float(np.square(residuals).sum()), count + residuals.size
+        step()
+    return math.sqrt(squares / count) if count else None
+
+
+def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
+    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes), the camera
+    being exact; and the fit that it comes from.  Raises :class:`CalibrationError`.
+    """
+    if len(sighting) < 4:
+        raise CalibrationError(f"{len(sighting)} points of the plate; at least 4")
+    lens_model, parameters = LensModel(model_of(camera), camera.width_px, camera.height_px), lens_vector(camera)
+    start = plate_pose_start(lens_model, parameters, sighting)
+    bundle = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0))).solve(parameters, [start])
+    return bundle.cam_T_plate[0], bundle.covariance, bundle
+
+
+def model_of(camera: LensSettings) -> ModelName:
+    """The calibration's name of a camera's model.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+    tag = camera.__struct_config__.tag
+    if tag == "brown_conrady":
+        count = len(camera.coefficients)  # type: ignore[union-attr]
+        if count > 5:
+            raise CalibrationError(f"a lens with {count} coefficients; with 4 or 5")
+        return "brown_conrady" if count == 4 else "brown_conrady_5"
+    return "paper" if tag == "paper" else "fisheye"
+
+
+def plate_pose_start(lens_model: LensModel, parameters: Array, sighting: Sighting) -> Array:
+    """``cam_T_plate`` (4, 4) in closed form, from ideal coordinates (Collins and Bartoli, "Infinitesimal plane-based
+    pose estimation", 2014).  :class:`CalibrationError` where the lens doesn't map the points or they lie on a line.
+    """
+    xy = lens_model.camera(parameters).undistort(sighting.uv_px)
+    good = np.isfinite(xy).all(axis=1)
+    if good.sum() < 4:
+        raise CalibrationError("the start is outside of what the lens model maps")
+    # Centred and scaled, as the solver wants it.
+    middle = sighting.plate_m[good].mean(axis=0)
+    points = sighting.plate_m[good] - middle
+    spread = np.linalg.svd(points[:, :2], compute_uv=False)
+    if spread[1] < 1e-3 * spread[0]:
+        raise CalibrationError("all points of the plate lie on a line; points that span an area")
+    # Only the first of the two solutions: the other one is worse.
+    found, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, np.ascontiguousarray(xy[good]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not found:
+        raise CalibrationError("the plate's pose can't be found")
+    out = np.eye(4)
+    out[:3, :3] = cv2.Rodrigues(turns[0])[0]
+    out[:3, 3] = shifts[0].ravel() - out[:3, :3] @ middle
+    return out
+
+
+def _supported(
+    lens_model: LensModel, sightings: Sequence[Sighting], fixed: frozenset[str]
+) -> tuple[tuple[str, ...], Array, Bundle, tuple[str, ...]]:
+    """The fit with as many of the lens's terms as give one that can be meant all over the image: where no point lies,
+    the highest ones bend it at will.  Names of the free parameters, what they change, the fit, and what was held.
+    """
+    held: list[str] = []
+    for name in (*reversed(parameter_names(lens_model.name)[5:]), ""):
+        names, free = _free(lens_model.name, fixed | set(held))
+        bundle = _solve(BundleProblem(lens_model, sightings, free), lens_model, sightings)
+        _check_fit(lens_model, bundle, free)
+        try:
+            make_camera(lens_model.settings(bundle.parameters))
+            break
+        except ValueError as error:
+            if not name:
+                raise CalibrationError(f"the fit ends at a camera that can't be meant ({error})") from None
+        held.append(name)
+    said = f"held at 0, as the views don't support more of a lens: {', '.join(held)}"
+    return names, free, bundle, (said,) if held else ()
+
+
+def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Sighting]) -> Bundle:
+    """From the best of several focal lengths: the closed forms for them fail with strong lenses and single views."""
+    starts = []
+    for share in FOCAL_STARTS.tolist():
+        parameters = lens_model.without_distortion(share * lens_model.width_px)
+        try:
+            poses = [plate_pose_start(lens_model, parameters, s) for s in sightings]
+        except (CalibrationError, cv2.error):
+            continue
+        camera = lens_model.camera(parameters)
+        errors = [
+            np.linalg.norm(s.uv_px - camera.project(s.plate_m @ T[:3, :3].T + T[:3, 3]), axis=1)
+            for s, T in zip(sightings, poses, strict=True)
+        ]
+        cost = float(np.mean([np.median(np.where(np.isfinite(e), e, 1e6)) for e in errors]))
+        starts.append((cost, share, parameters, poses))
+    if not starts:
+        raise CalibrationError("no focal length fits the views; images of one camera and the right target")
+    # Where lens and focal length trade places the best start may lead astray: its neighbours get their chance.
+    starts.sort(key=lambda start: start[:2])
+    best: Bundle | None = None
+    failure = CalibrationError(DEGENERATE)
+    for _, _, parameters, poses in starts[:3]:
+        try:
+            bundle = problem.solve(parameters, poses)
+        except CalibrationError as error:
+            failure = error
+            continue
+        if best is None or _merit(bundle) < _merit(best):
+            best = bundle
+        if best.scale < 1.5:
+            break
+    if best is None:
+        raise failure
+    return best
+
+
+def _merit(bundle: Bundle) -> tuple[float, float]:
+    used = np.concatenate(bundle.used)
+    return float(np.count_nonzero(~used)), bundle.rms_px
+
+
+def _free(model: ModelName, fixed: frozenset[str]) -> tuple[tuple[str, ...], Array]:
+    """Names of the free parameters, and what they change (k, p)."""
+    names = parameter_names(model)
+    unknown = fixed - set(names) - {"aspect"}
+    if unknown:
+        raise CalibrationError(f"{sorted(unknown)[0]} is no parameter of {model}; one of {', '.join(names)} or aspect")
+    columns, kept = [], []
+    for i, name in enumerate(names):
+        if name in fixed or (name == "fy_px" and "aspect" in fixed):
+            continue
+        column = np.zeros(len(names))
+        column[i] = 1.0
+        if name == "fx_px" and "aspect" in fixed:
+            column[1] = 1.0
+        columns.append(column)
+        kept.append(name)
+    return tuple(kept), np.stack(columns, axis=1) if columns else np.zeros((len(names), 0))
+
+
+def _one_size(sightings: Sequence[Sighting]) -> tuple[int, int]:
+    if not sightings:
+        raise CalibrationError("no view shows the target; at least one image of it")
+    sizes = {s.size_px: s.name for s in sightings}
+    if len(sizes) > 1:
+        (a, name_a), (b, name_b) = list(sizes.items())[:2]
+        raise CalibrationError(
+            f"{name_a} has {a[0]} x {a[1]} px and {name_b} {b[0]} x {b[1]} px; images of one camera, in one size"
+        )
+    for sighting in sightings:
+        if len(sighting) < FEWEST_POINTS:
+            raise CalibrationError(f"{sighting.name} shows {len(sighting)} points; at least {FEWEST_POINTS}")
+    return sightings[0].size_px
+
+
+def _check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
+    """Refuse what is no calibration."""
+    if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
+        raise CalibrationError(
+            f"no camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of one camera, and "
+            "the target as it was described"
+        )
+    moves_focal = np.flatnonzero(free[0])
+    if len(moves_focal):
+        share = math.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]]) / bundle.parameters[0]
+        if share > USELESS_FOCAL:
+            raise CalibrationError(DEGENERATE)
+
+
+def _warnings(
+    result: IntrinsicsResult, bundle: Bundle, sightings: Sequence[Sighting], size: tuple[int, int]
+) -> tuple[str, ...]:
+    """What the views can't support, in words."""
+    out = []
+    sigma = dict(zip(result.parameters, np.sqrt(result.covariance.diagonal()).tolist(), strict=True))
+    focal = sigma.get("fx_px", 0.0)
+    if focal > DOUBTFUL_FOCAL * result.camera.fx_px:
+        out.append(
+            f"the focal length is uncertain by {100.0 * focal / result.camera.fx_px:.1f} %: views tilted by 20 to 45 "
+            "degrees to different sides determine it"
+        )
+    for i, name in enumerate(n for n in result.parameters if n.startswith(("coefficients", "kappa"))):
+        value = lens_vector(result.camera)[4 + i]
+        if abs(value) < 2.0 * sigma[name] and not math.isclose(value, 0.0):
+            out.append(f"{name} is not told from 0 ({value:.3g} ± {sigma[name]:.2g}): a model with fewer parameters")
+    half_px = 0.5 * np.array(size)
+    reach = max(float(np.linalg.norm((s.uv_px - half_px), axis=1).max()) for s in sightings)
+    if reach < COVERED * float(np.linalg.norm(half_px)):
+        out.append(
+            f"no point lies farther than {100.0 * reach / float(np.linalg.norm(half_px)):.0f} % of the way from the "
+            "image's centre to its corners: beyond, the lens is extrapolated"
+        )
+    lost = sum(int((~u).sum()) for u in bundle.used)
+    total = sum(len(u) for u in bundle.used)
+    if lost > 0.1 * total:
+        out.append(f"{lost} of {total} points don't fit and were left out: is the target flat, and described rightly?")
+    return tuple(out)
+
+
+def _bayes(bundle: Bundle, free: int) -> float:
+    """Bayes' criterion for normal errors of unknown size; coordinates count over all points, wrong ones at the cost of
+    an outlier's size, so that a model doesn't win by leaving points out.
+    """
+    squares = 0.0
+    count = 0
+    for residual, used in zip(bundle.residuals_px, bundle.used, strict=True):
+        bound = 25.0 * bundle.rms_px**2
+        squares += float(np.minimum(np.where(np.isfinite(residual), np.square(residual), bound), bound).sum())
+        count += 2 * len(used)
+    parameters = free + 6 * len(bundle.used)
+    return count * math.log(squares / count) + parameters * math.log(count)
+
+
+def lens_vector(camera: LensSettings) -> Array:
+    """A camera's parameters as :class:`LensModel` has them."""
+    pinhole = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
+    lens = getattr(camera, "coefficients", None)
+    return np.array([*pinhole, *(lens if lens is not None else (camera.kappa_per_px2,))])  # type: ignore[union-attr]

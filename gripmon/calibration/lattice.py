@@ -1,0 +1,141 @@
+"""Points of an image that lie on a square lattice seen in perspective: which ones, and where on the lattice.
+
+Grown from a seed, point by point, by what the neighbours that are known already predict; so a part of a plate is
+enough, whatever lies on it, and lens distortion doesn't matter.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gripmon.records import Array
+
+NEAR = 0.25
+"""A point is the one that was predicted if it lies within this part of the step."""
+SEEDS = 60
+"""How many starting points are tried."""
+_NEIGHBOURS = 8
+_STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
+Index = tuple[int, int]
+
+
+def find_lattice(points_px: Array) -> dict[Index, int]:
+    """Lattice coordinates (column, row) -> index of the point, of the largest lattice among points (n, 2); x and y of
+    the lattice turn as those of the image do.  Empty if there is none of at least 3 x 3.
+    """
+    if len(points_px) < 9:
+        return {}
+    tree = cKDTree(points_px)
+    best: dict[Index, int] = {}
+    tried: set[int] = set()
+    middle = np.median(points_px, axis=0)
+    for seed in np.argsort(np.linalg.norm(points_px - middle, axis=1)).tolist():
+        if seed in tried or len(tried) > SEEDS:
+            continue
+        tried.add(seed)
+        for basis in _bases(points_px, tree, seed):
+            grown = _grow(points_px, tree, seed, basis)
+            if len(grown) > len(best):
+                best = grown
+        tried.update(best.values())
+        if len(best) > 0.5 * len(points_px):
+            break
+    best = _consistent(points_px, best)
+    columns, rows = extent(best)
+    return best if min(columns, rows) >= 3 and len(best) >= 9 else {}
+
+
+def extent(lattice: dict[Index, int]) -> tuple[int, int]:
+    """Columns and rows that a lattice spans."""
+    if not lattice:
+        return 0, 0
+    cells = np.array(list(lattice))
+    size = cells.max(axis=0) - cells.min(axis=0) + 1
+    return int(size[0]), int(size[1])
+
+
+def _bases(points: Array, tree: cKDTree, seed: int) -> list[tuple[Array, Array]]:
+    """Pairs of steps from a point to neighbours that the opposite neighbours confirm; the shortest first."""
+    count = min(_NEIGHBOURS + 1, len(points))
+    _, near = tree.query(points[seed], count)
+    steps = [points[k] - points[seed] for k in np.atleast_1d(near)[1:].tolist()]
+    confirmed = [s for s in steps if _near(tree, points[seed] - s, float(np.hypot(*s))) is not None]
+    out = []
+    for a, b in itertools.combinations(confirmed, 2):
+        turning = float(a[0] * b[1] - a[1] * b[0])
+        if abs(turning) < 0.2 * float(np.hypot(*a) * np.hypot(*b)):
+            continue
+        if turning < 0.0:
+            a, b = b, a
+        corner = points[seed] + a + b
+        if _near(tree, corner, min(float(np.hypot(*a)), float(np.hypot(*b)))) is not None:
+            out.append((a, b))
+    return sorted(out, key=lambda pair: float(pair[0] @ pair[0] + pair[1] @ pair[1]))[:3]
+
+
+def _near(tree: cKDTree, where: Array, step_px: float) -> int | None:
+    distance, index = tree.query(where)
+    return int(index) if distance < NEAR * step_px else None
+
+
+def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array]) -> dict[Index, int]:
+    found: dict[Index, int] = {(0, 0): seed}
+    taken = {seed}
+    local: dict[Index, Array] = {(0, 0): np.stack(basis)}
+    queue = deque([(0, 0)])
+    while queue:
+        at = queue.popleft()
+        here = points[found[at]]
+        for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+            to = (at[0] + sign, at[1]) if axis == 0 else (at[0], at[1] + sign)
+            if to in found:
+                continue
+            behind = (at[0] - sign, at[1]) if axis == 0 else (at[0], at[1] - sign)
+            step = here - points[found[behind]] if behind in found else sign * local[at][axis]
+            index = _near(tree, here + step, float(np.hypot(*step)))
+            if index is None or index in taken:
+                continue
+            found[to] = index
+            taken.add(index)
+            moved = local[at].copy()
+            moved[axis] = sign * (points[index] - here)
+            # The other step changes slowly: the neighbour's, where it is known.
+            local[to] = _own_steps(points, found, to, moved)
+            queue.append(to)
+    return found
+
+
+def _own_steps(points: Array, found: dict[Index, int], at: Index, otherwise: Array) -> Array:
+    out = otherwise.copy()
+    for dx, dy in _STEPS:
+        neighbour = (at[0] + dx, at[1] + dy)
+        if neighbour in found:
+            out[0 if dx else 1] = (points[found[neighbour]] - points[found[at]]) * (dx + dy)
+    return out
+
+
+def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
+    """Without points that lie off the middle of their neighbours on a line: what merely lay near the prediction."""
+    out = dict(lattice)
+    for at, index in lattice.items():
+        for axis in (0, 1):
+            before = (at[0] - 1, at[1]) if axis == 0 else (at[0], at[1] - 1)
+            after = (at[0] + 1, at[1]) if axis == 0 else (at[0], at[1] + 1)
+            if before in lattice and after in lattice:
+                low, high = points[lattice[before]], points[lattice[after]]
+                off = np.hypot(*(points[index] - 0.5 * (low + high)))
+                if off > 0.12 * float(np.hypot(*(high - low))):
+                    out.pop(at, None)
+    return out
+
+
+def as_arrays(lattice: dict[Index, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Cells (n, 2), from 0 on, and indices (n,) of a lattice, by rows."""
+    cells = np.array(sorted(lattice, key=lambda cell: (cell[1], cell[0])), dtype=np.intp).reshape(-1, 2)
+    indices = np.array([lattice[int(c), int(r)] for c, r in cells], dtype=np.intp)
+    return cells - (cells.min(axis=0) if len(cells) else 0), indices

@@ -1,0 +1,121 @@
+"""Camera models as functions of their parameters: what a calibration estimates, with derivatives.
+
+The maps themselves are those of :mod:`gripmon.camera`, so that what is calibrated is what is later used; here they get
+derivatives by their parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gripmon.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens
+from gripmon.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
+from gripmon.records import Array
+
+ModelName = Literal["paper", "brown_conrady", "brown_conrady_5", "fisheye"]
+MODELS: tuple[ModelName, ...] = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
+PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
+_COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "paper": ("kappa_per_px2",),
+    "brown_conrady": tuple(f"coefficients.{i}" for i in range(4)),
+    "brown_conrady_5": tuple(f"coefficients.{i}" for i in range(5)),
+    "fisheye": tuple(f"coefficients.{i}" for i in range(4)),
+}
+
+
+def parameter_names(model: ModelName) -> tuple[str, ...]:
+    """Names of all of a model's parameters in the order of its vector: keys of its settings."""
+    return (*PINHOLE, *_COEFFICIENTS[model])
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """A model at an image size.  Parameter vectors are (k,): focal lengths, principal point (px), lens (see
+    :func:`parameter_names`; kappa in 1/px², the rest without unit).
+    """
+
+    name: ModelName
+    width_px: int
+    height_px: int
+
+    def settings(self, parameters: Array) -> LensSettings:
+        """The camera with these parameters, as files hold it; nothing is checked."""
+        fx, fy, cx, cy, *lens = parameters.tolist()
+        size = {"width_px": self.width_px, "height_px": self.height_px}
+        if self.name == "paper":
+            return PaperLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, kappa_per_px2=lens[0], **size)
+        if self.name == "fisheye":
+            return FisheyeLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
+        return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
+
+    def camera(self, parameters: Array) -> Camera:
+        """The same, ready to project; unlike :func:`gripmon.camera.make_camera` it refuses nothing, as an estimate on
+        its way may pass through absurd values.  Points outside the lens's domain project to NaN.
+        """
+        return Camera(self.settings(parameters), self._map(parameters))
+
+    def without_distortion(self, focal_px: float) -> Array:
+        """Parameters (k,) of a lens with this focal length, axis through the image's centre, nothing bent (the fisheye:
+        equidistant).
+        """
+        parameters = np.zeros(len(parameter_names(self.name)))
+        parameters[:4] = focal_px, focal_px, 0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)
+        return parameters
+
+    def project(self, parameters: Array, points_cam_m: Array) -> tuple[Array, Array, Array]:
+        """Points (n, 3) in the camera frame -> pixels (n, 2), their derivatives by the parameters (n, 2, k) and by the
+        points (n, 2, 3); NaN outside the lens's domain.
+        """
+        camera = self.camera(parameters)
+        uv_px, by_point = camera.project_with_jacobian(points_cam_m)
+        fx, fy = parameters[:2]
+        q = (uv_px - parameters[2:4]) / parameters[:2]
+        xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
+        by_lens = self._by_lens(parameters, xy, q)
+        by_parameters = np.zeros((len(q), 2, len(parameters)))
+        by_parameters[:, 0, 0], by_parameters[:, 1, 1] = q[:, 0], q[:, 1]
+        by_parameters[:, 0, 2] = by_parameters[:, 1, 3] = 1.0
+        by_parameters[:, 0, 4:] = fx * by_lens[:, 0]
+        by_parameters[:, 1, 4:] = fy * by_lens[:, 1]
+        if self.name == "paper":
+            # kappa is per pixel: in normalised coordinates the lens bends by kappa fx², so fx acts through it, too.
+            by_parameters[:, :, 0] += by_parameters[:, :, 4] * (2.0 * parameters[4] / fx)
+        return uv_px, by_parameters, by_point
+
+    def _map(self, parameters: Array) -> LensMap:
+        lens = tuple(parameters[4:].tolist())
+        if self.name == "paper":
+            return PaperMap(lens[0] * float(parameters[0]) ** 2)
+        return FisheyeMap(lens) if self.name == "fisheye" else BrownMap(lens)
+
+    def _by_lens(self, parameters: Array, xy: Array, q: Array) -> Array:
+        """Derivatives (n, 2, k - 4) of distorted normalised coordinates ``q`` (n, 2) by the lens's parameters."""
+        if self.name == "paper":
+            # xy = q (1 + k |q|²) stays as it is: J dq + q |q|² dk = 0, J the Jacobian of that map.
+            qx, qy = q.T
+            s2 = qx * qx + qy * qy
+            k = parameters[4] * parameters[0] ** 2
+            j00, j01, j11 = 1.0 + k * (s2 + 2.0 * qx * qx), 2.0 * k * qx * qy, 1.0 + k * (s2 + 2.0 * qy * qy)
+            per_det = -s2 * parameters[0] ** 2 / (j00 * j11 - j01 * j01)
+            by_kappa: Array = np.stack([j11 * qx - j01 * qy, j00 * qy - j01 * qx], axis=1) * per_det[:, None]
+            return by_kappa[:, :, None]
+        x, y = xy.T
+        r2 = x * x + y * y
+        if self.name == "fisheye":
+            r = np.sqrt(r2 + 1e-300)
+            theta = np.arctan(r)
+            powers = theta[:, None] ** np.array([3, 5, 7, 9])
+            out: Array = (xy / r[:, None])[:, :, None] * powers[:, None, :]
+            return out
+        columns: Sequence[Array] = [
+            xy * r2[:, None],
+            xy * (r2 * r2)[:, None],
+            np.stack([2.0 * x * y, r2 + 2.0 * y * y], axis=1),
+            np.stack([r2 + 2.0 * x * x, 2.0 * x * y], axis=1),
+            xy * (r2**3)[:, None],
+        ]
+        return np.stack(columns[: len(parameters) - 4], axis=2)

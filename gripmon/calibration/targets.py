@@ -1,0 +1,102 @@
+"""Flat calibration targets, as they are described on a command line or in a file."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
+
+_Count = Annotated[int, Meta(ge=2, le=200)]
+_Length = Annotated[float, Meta(gt=0.0, le=2.0)]
+_MARKED = 3.0
+"""A spacing beyond this many metres was meant in millimetres."""
+
+
+class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="chequerboard"):
+    """Squares in two colours; ``columns`` and ``rows`` count the *inner* corners, as OpenCV and ROS do."""
+
+    columns: _Count
+    rows: _Count
+    square_m: _Length
+
+
+class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="charuco"):
+    """A chequerboard with ArUco marks in white squares; ``columns`` and ``rows`` count *squares*, as OpenCV does."""
+
+    columns: _Count
+    rows: _Count
+    square_m: _Length
+    marker_m: _Length
+    dictionary: str = "DICT_4X4_250"
+
+
+class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="circles"):
+    """Discs on a square lattice, such as the self-viewing method's 8 x 8; dark on light or the reverse."""
+
+    columns: _Count
+    rows: _Count
+    spacing_m: _Length
+    diameter_m: _Length
+
+
+Target = Chequerboard | Charuco | CircleGrid
+_FORMS: dict[str, str] = {
+    "chequerboard": "chequerboard:COLUMNSxROWS:SQUARE (inner corners, m), e.g. chequerboard:9x6:0.025",
+    "charuco": "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m), e.g. charuco:8x6:0.03:0.022:DICT_4X4_250",
+    "circles": "circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), e.g. circles:8x8:0.008:0.004",
+}
+
+
+def parse_target(text: str) -> Target:
+    """A target from a command line.  ValueError: what is wrong; what would be right."""
+    kind, *parts = text.split(":")
+    if kind not in _FORMS:
+        raise ValueError(f"'{kind}' is no target; {' or '.join(_FORMS.values())}")
+    right = _FORMS[kind]
+    lengths = {"chequerboard": (2, 2), "charuco": (3, 4), "circles": (3, 3)}[kind]
+    if not lengths[0] <= len(parts) <= lengths[1]:
+        raise ValueError(f"'{text}' has {len(parts)} parts after its kind; {right}")
+    try:
+        columns, rows = (int(n) for n in parts[0].lower().split("x"))
+        numbers = [float(p) for p in parts[1 : 2 if kind == "chequerboard" else 3]]
+    except ValueError:
+        raise ValueError(f"'{text}' can't be read; {right}") from None
+    keys: dict[str, tuple[str, ...]] = {
+        "chequerboard": ("square_m",), "charuco": ("square_m", "marker_m"), "circles": ("spacing_m", "diameter_m")
+    }  # fmt: skip
+    fields = {"kind": kind, "columns": columns, "rows": rows, **dict(zip(keys[kind], numbers, strict=True))}
+    if len(parts) == 4:
+        fields["dictionary"] = parts[3]
+    return checked(fields, text, right)
+
+
+def checked(fields: dict[str, object], text: str, right: str) -> Target:
+    """A target from its fields.  ValueError as :func:`parse_target`'s."""
+    if max((v for k, v in fields.items() if k.endswith("_m") and isinstance(v, float)), default=0.0) > _MARKED:
+        raise ValueError(
+            f"'{text}' is {fields.get('square_m', fields.get('spacing_m'))} m wide (millimetres?); {right}"
+        )
+    try:
+        target: Target = msgspec.convert(fields, Target)
+    except msgspec.ValidationError as error:
+        raise ValueError(f"'{text}': {error}; {right}") from None
+    inner, outer = {
+        "chequerboard": (0.0, 1.0), "charuco": ("marker_m", "square_m"), "circles": ("diameter_m", "spacing_m")
+    }[str(fields["kind"])]  # fmt: skip
+    if isinstance(inner, str) and not getattr(target, inner) < getattr(target, str(outer)):
+        raise ValueError(f"'{text}': {inner} is not below {outer}; {right}")
+    return target
+
+
+def name_of(target: Target) -> str:
+    """The target as :func:`parse_target` reads it."""
+    size = f"{target.columns}x{target.rows}"
+    if isinstance(target, Chequerboard):
+        return f"chequerboard:{size}:{target.square_m:g}"
+    if isinstance(target, CircleGrid):
+        return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
+    return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
+
+
+TargetKind = Literal["chequerboard", "charuco", "circles"]
