@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 from pathlib import Path
 
@@ -15,6 +16,13 @@ TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 CODE = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 
 
+def _options_of(parser: argparse.ArgumentParser, words: list[str]) -> set[str]:
+    """Of a command, or of the one below it that the first word names."""
+    below = parser._subparsers._group_actions[0].choices if parser._subparsers else {}  # type: ignore[union-attr]
+    chosen = below[words[0]] if words and words[0] in below else parser
+    return {option for action in chosen._actions for option in action.option_strings}
+
+
 def test_commands_and_their_options_exist():
     parser = build_parser()
     subcommands = parser._subparsers._group_actions[0].choices  # type: ignore[union-attr]
@@ -22,7 +30,7 @@ def test_commands_and_their_options_exist():
     used = re.findall(r"gripmon ([a-z]+)((?: [^`\n|]*)?)", shell)
     assert {command for command, _ in used} == set(subcommands)
     for command, rest in used:
-        known = {option for action in subcommands[command]._actions for option in action.option_strings}
+        known = _options_of(subcommands[command], rest.split())
         assert set(re.findall(r"--[a-z-]+", rest.split("#")[0])) <= known, command
 
 

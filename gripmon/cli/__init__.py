@@ -8,6 +8,7 @@ import sys
 
 from gripmon import __version__
 from gripmon.cli import (
+    calibrate,
     certificates,
     check,
     demo,
@@ -24,7 +25,22 @@ from gripmon.cli import (
 )
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 
-_COMMANDS = (demo, run, watch, send, router, schema, feed, replay, export, simulate, check, teach, certificates)
+_COMMANDS = (
+    demo,
+    run,
+    watch,
+    send,
+    router,
+    schema,
+    feed,
+    replay,
+    export,
+    simulate,
+    check,
+    calibrate,
+    teach,
+    certificates,
+)
 
 # To be set before NumPy and OpenCV are imported; what the user has set stays.
 _ENVIRONMENT = {

@@ -1,0 +1,120 @@
+"""Files in and out, as all methods of ``gripmon calibrate`` handle them."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    import msgspec
+
+    from gripmon.calibration.targets import Target
+    from gripmon.records import Image
+
+
+def image_paths(texts: Sequence[str]) -> list[Path]:
+    """The images that are meant, folders for all images in them, in natural order; what isn't there, or is there
+    twice, ends the command with exit code 2.
+    """
+    from gripmon.sources.folder import IMAGE_SUFFIXES, natural_key
+
+    paths: list[Path] = []
+    for path in map(Path, texts):
+        if not path.is_dir():
+            paths.append(path)
+            continue
+        inside = sorted(
+            (p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()),
+            key=lambda p: natural_key(p.name),
+        )
+        if not inside:
+            raise common.CommandFailedError(f"{path}: no image in this folder; e.g. *.png, *.jpg", common.EXIT_USAGE)
+        paths += inside
+    return paths
+
+
+def read_images(paths: Sequence[Path]) -> list[Image]:
+    """All of them; one that can't be read, or is the same as another, ends the command with exit code 2."""
+    from gripmon.sources.folder import read_image
+
+    images: list[Image] = []
+    seen: dict[bytes, Path] = {}
+    for path in paths:
+        image, fault = read_image(path)
+        if image is None:
+            raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+        # The same image twice would make every uncertainty too small.
+        first = seen.setdefault(image.tobytes(), path)
+        if first is not path:
+            raise common.CommandFailedError(f"{path}: is the same image as {first}; each image once", common.EXIT_USAGE)
+        images.append(image)
+    return images
+
+
+def target_of(text: str, option: str = "--target") -> Target:
+    """The target of a command line; a fault ends the command with exit code 2."""
+    from gripmon.calibration.targets import parse_target
+
+    try:
+        return parse_target(text)
+    except ValueError as error:
+        raise common.CommandFailedError(f"{option}: {error}", common.EXIT_USAGE) from None
+
+
+def check_output(path: Path, *, force: bool, option: str = "--out") -> None:
+    """End the command with exit code 2, before any work, if a file can't be written or is there already."""
+    common.make_directory(path.parent, option)
+    if path.is_dir():
+        raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+    if path.exists() and not force:
+        raise common.CommandFailedError(
+            f"{option} {path}: is there already; another file, or --force to replace it", common.EXIT_USAGE
+        )
+
+
+def check_picture(path: Path, *, force: bool, option: str = "--picture") -> None:
+    """As :func:`check_output`, for a picture."""
+    check_output(path, force=force, option=option)
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise common.CommandFailedError(f"{option} {path}: has no known ending; .png or .jpg", common.EXIT_USAGE)
+
+
+def write_document(document: msgspec.Struct, path: Path, option: str = "--out") -> None:
+    """Write it as YAML, whole or not at all."""
+    import msgspec
+
+    from gripmon.config.yaml_file import as_yaml
+
+    _write(path, as_yaml(msgspec.to_builtins(document)).encode(), option)
+
+
+def write_picture(picture: Image, path: Path, option: str = "--picture") -> None:
+    """Write it, whole or not at all, in the format that the file's name ends in."""
+    import cv2
+
+    _, data = cv2.imencode(path.suffix, picture)
+    _write(path, data.tobytes(), option)
+
+
+def command_line(method: str, positional: Sequence[str], options: dict[str, Any]) -> str:
+    """What a file's provenance calls the command; options that are None or False were not given."""
+    words = ["gripmon", "calibrate", method, *positional]
+    for option, value in options.items():
+        if value is True:
+            words.append(option)
+        elif value is not None and value is not False:
+            words += [option, str(value)]
+    return shlex.join(words)
+
+
+def _write(path: Path, data: bytes, option: str) -> None:
+    from gripmon.atomic import write_atomically
+
+    try:
+        write_atomically(path, data)
+    except OSError as error:
+        raise common.not_writable(path, error, option) from None
