@@ -11,12 +11,13 @@ noise-free data give exact results.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibration.laser.planar_start import planar_start
 from gripmon.calibration.laser.setup import LaserSetup, origin_axes
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import make_transform
@@ -58,7 +59,9 @@ def orientation_groups(base_T_ee: Array, tolerance_rad: float = SAME_ORIENTATION
     return [np.array(group, dtype=np.intp) for group in groups]
 
 
-def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None) -> LaserSetup:
+def solve(
+    xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, planar: bool = False
+) -> LaserSetup:
     """All steps: ideal image points (n, 2) (step 1 has undistorted them) and poses (n, 4, 4) -> the whole set-up.
 
     Raises :class:`CalibrationError` that names the degenerate case: too few orientations, shifts in a plane, a plane
@@ -71,7 +74,14 @@ def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None
             f"{len(usable)} orientation(s) with at least {FEWEST_SHIFTS} spots each; at least {FEWEST_ORIENTATIONS}, "
             "which the end-effector is shifted at without turning"
         )
-    normal = plane_normal([o.matrix for o in usable])
+    if planar:
+        start = planar_start(
+            xy, [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable], [o.members for o in usable]
+        )
+        normal = start.normal
+        usable = [replace(o, matrix=m) for o, m in zip(usable, start.matrices, strict=True)]
+    else:
+        normal = plane_normal([o.matrix for o in usable])
     candidates = [beam_candidates(o.matrix, normal) for o in usable]
     chosen = consistent_beams(candidates)
     cam_R_base = mean_rotation([c.cam_R_base for c in chosen])
