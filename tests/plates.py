@@ -52,7 +52,7 @@ def points_of(target: Target) -> Array:
 
 
 def pose(target: Target, centre_m: Sequence[float], tilt_rad: Sequence[float], roll_rad: float = 0.0) -> Array:
-    """``cam_T_plate`` (4, 4) with the target's middle at ``centre_m`` (camera frame), rolled, then tilted about x, y."""
+    """``cam_T_plate`` (4, 4), its middle at ``centre_m`` (camera frame), rolled, then tilted about x, y."""
     out = np.eye(4)
     out[:3, :3] = exp_rotation(np.array([*tilt_rad, 0.0])) @ exp_rotation(np.array([0.0, 0.0, roll_rad]))
     out[:3, 3] = np.asarray(centre_m) - out[:3, :3] @ points_of(target).mean(axis=0)

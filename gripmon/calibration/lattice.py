@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections import deque
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,17 @@ _STEPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 Index = tuple[int, int]
 
 
-def find_lattice(points_px: Array) -> dict[Index, int]:
+class Kin(Protocol):
+    """What points know of each other beyond where they are."""
+
+    def neighbours(self, a: int, b: int, step_px: Array) -> bool:
+        """Whether point b, which lies a step (2,) from a, can be the next one on the lattice."""
+
+    def basis(self, at: int, a_px: Array, b_px: Array) -> bool:
+        """Whether two steps from a point can be those of a *square* lattice."""
+
+
+def find_lattice(points_px: Array, kin: Kin) -> dict[Index, int]:
     """Lattice coordinates (column, row) -> index of the point, of the largest lattice among points (n, 2); x and y of
     the lattice turn as those of the image do.  Empty if there is none of at least 3 x 3.
     """
@@ -33,21 +44,48 @@ def find_lattice(points_px: Array) -> dict[Index, int]:
     tree = cKDTree(points_px)
     best: dict[Index, int] = {}
     tried: set[int] = set()
+    count = 0
     middle = np.median(points_px, axis=0)
     for seed in np.argsort(np.linalg.norm(points_px - middle, axis=1)).tolist():
-        if seed in tried or len(tried) > SEEDS:
+        if seed in tried:
             continue
-        tried.add(seed)
-        for basis in _bases(points_px, tree, seed):
-            grown = _grow(points_px, tree, seed, basis)
+        bases = _bases(points_px, tree, seed, kin)
+        count += bool(bases)
+        for basis in bases:
+            grown = _grow(points_px, tree, seed, basis, kin)
+            tried.update(grown.values())
             if len(grown) > len(best):
                 best = grown
-        tried.update(best.values())
-        if len(best) > 0.5 * len(points_px):
+        if len(best) > 0.5 * len(points_px) or count >= SEEDS:
             break
     best = _consistent(points_px, best)
     columns, rows = extent(best)
     return best if min(columns, rows) >= 3 and len(best) >= 9 else {}
+
+
+def trimmed(lattice: dict[Index, int], columns: int, rows: int) -> dict[Index, int]:
+    """Without sparse outermost lines as long as it is larger than ``columns`` x ``rows``, either way round: those are
+    points beside the target that happen to lie well.
+    """
+    out = dict(lattice)
+    while out:
+        seen = extent(out)
+        excess = min(
+            ((seen[0] - columns, seen[1] - rows), (seen[0] - rows, seen[1] - columns)),
+            key=lambda e: max(e[0], 0) + max(e[1], 0),
+        )
+        lines: list[tuple[int, int, int]] = []
+        for axis in (0, 1):
+            if excess[axis] > 0:
+                places = [cell[axis] for cell in out]
+                lines += [(places.count(place), axis, place) for place in (min(places), max(places))]
+        if not lines:
+            return out
+        fewest, axis, place = min(lines)
+        if fewest >= 0.5 * len(out) / seen[axis]:
+            return out
+        out = {cell: index for cell, index in out.items() if cell[axis] != place}
+    return out
 
 
 def extent(lattice: dict[Index, int]) -> tuple[int, int]:
@@ -59,16 +97,20 @@ def extent(lattice: dict[Index, int]) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def _bases(points: Array, tree: cKDTree, seed: int) -> list[tuple[Array, Array]]:
+def _bases(points: Array, tree: cKDTree, seed: int, kin: Kin) -> list[tuple[Array, Array]]:
     """Pairs of steps from a point to neighbours that the opposite neighbours confirm; the shortest first."""
     count = min(_NEIGHBOURS + 1, len(points))
     _, near = tree.query(points[seed], count)
-    steps = [points[k] - points[seed] for k in np.atleast_1d(near)[1:].tolist()]
-    confirmed = [s for s in steps if _near(tree, points[seed] - s, float(np.hypot(*s))) is not None]
+    confirmed = []
+    for k in np.atleast_1d(near)[1:].tolist():
+        step = points[k] - points[seed]
+        back = _near(tree, points[seed] - step, float(np.hypot(*step)))
+        if back is not None and kin.neighbours(seed, k, step) and kin.neighbours(seed, back, -step):
+            confirmed.append(step)
     out = []
     for a, b in itertools.combinations(confirmed, 2):
         turning = float(a[0] * b[1] - a[1] * b[0])
-        if abs(turning) < 0.2 * float(np.hypot(*a) * np.hypot(*b)):
+        if abs(turning) < 0.2 * float(np.hypot(*a) * np.hypot(*b)) or not kin.basis(seed, a, b):
             continue
         if turning < 0.0:
             a, b = b, a
@@ -83,7 +125,7 @@ def _near(tree: cKDTree, where: Array, step_px: float) -> int | None:
     return int(index) if distance < NEAR * step_px else None
 
 
-def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array]) -> dict[Index, int]:
+def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array], kin: Kin) -> dict[Index, int]:
     found: dict[Index, int] = {(0, 0): seed}
     taken = {seed}
     local: dict[Index, Array] = {(0, 0): np.stack(basis)}
@@ -98,7 +140,7 @@ def _grow(points: Array, tree: cKDTree, seed: int, basis: tuple[Array, Array]) -
             behind = (at[0] - sign, at[1]) if axis == 0 else (at[0], at[1] - sign)
             step = here - points[found[behind]] if behind in found else sign * local[at][axis]
             index = _near(tree, here + step, float(np.hypot(*step)))
-            if index is None or index in taken:
+            if index is None or index in taken or not kin.neighbours(found[at], index, points[index] - here):
                 continue
             found[to] = index
             taken.add(index)
