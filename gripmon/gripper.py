@@ -18,6 +18,7 @@ import yaml
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from gripmon.provenance import Provenance
 from gripmon.records import Array
 
 LARGEST_EXTENT_M = 1.0
@@ -85,6 +86,12 @@ class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     edges: dict[str, EdgeModel]
     jaw: JawModel | None = None
     faces: tuple[FaceModel, ...] = ()
+    provenance: Provenance | None = None
+
+
+def contents_of(model: GripperModel) -> dict[str, Any]:
+    """What a gripper file says of the gripper, for digests: all but where the file comes from."""
+    return {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ import msgspec
 
 from gripmon.atomic import remove_leftovers, write_atomically
 from gripmon.camera import LensSettings
-from gripmon.gripper import GripperModel
+from gripmon.gripper import GripperModel, contents_of
 from gripmon.records import MonitorState, ReferenceRecord
 from gripmon.references import state_fault
 
@@ -111,7 +111,11 @@ def default_path(robot: str, camera: str) -> Path:
 def calibration_of(lens: LensSettings, gripper: GripperModel, reference: ReferenceRecord) -> Calibration:
     """Digests of the values, not of the files: a comment more or less changes nothing."""
     start = msgspec.structs.replace(reference, revision=0, stamp_ns=0)
-    values = (lens, gripper, msgspec.structs.asdict(start))  # the reference without the name of its message
+    values = (
+        lens,
+        contents_of(gripper),
+        msgspec.structs.asdict(start),
+    )  # the reference without the name of its message
     return Calibration(*(hashlib.sha256(msgspec.json.encode(part)).hexdigest()[:16] for part in values))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -80,9 +80,12 @@ def render(
     look: Look = Look(),
     *,
     covers: Sequence[Cover] = (),
+    solid: Callable[[Array, Array], Array] | None = None,
     seed: int = 0,
 ) -> Image:
-    """An image (H, W) of 8 bit."""
+    """An image (H, W) of 8 bit.  ``solid`` takes ideal coordinates (n, 2) and what is seen there, (n,) grey values, and
+    gives what is seen with something in front.
+    """
     rng, ss = np.random.default_rng(seed), look.supersampling
     xy = _rays(settings, ss)
     normal = cam_T_plate[:3, 2]
@@ -93,6 +96,8 @@ def render(
         x = depth * (xy @ rotation[:2, 0] + rotation[2, 0]) - offset[0]
         y = depth * (xy @ rotation[:2, 1] + rotation[2, 1]) - offset[1]
         grey = np.where(depth > 0.0, _grey(target, look, x, y), 120.0)
+    if solid is not None:
+        grey = solid(xy, grey)
     grey = np.nan_to_num(grey, nan=0.0).reshape(settings.height_px * ss, settings.width_px * ss).astype(np.float32)
     if look.mirrored:
         grey = np.ascontiguousarray(grey[:, ::-1])

@@ -6,12 +6,14 @@ Everything that can be wrong is found here, before anything starts, and said in 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import gripmon
 from gripmon.camera import Camera, make_camera
+from gripmon.config.calibrated import CalibrationFiles, with_sections
+from gripmon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
@@ -33,7 +35,16 @@ from gripmon.wire import Joining
 if TYPE_CHECKING:
     from gripmon.simulator import Scenario
 
-__all__ = ["Config", "ConfigError", "Settings", "builtin_config", "check_network", "load_config", "load_scenario"]
+__all__ = [
+    "Config",
+    "ConfigError",
+    "Settings",
+    "builtin_config",
+    "check_network",
+    "load_config",
+    "load_scenario",
+    "read_gripper",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +58,7 @@ class Config:
     gripper_path: Path
     reference: ReferenceRecord
     taught: TaughtModel | None = None
+    calibrated: CalibrationFiles = field(default_factory=CalibrationFiles)
 
     @property
     def taught_edges(self) -> TaughtEdges | None:
@@ -108,15 +120,16 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
     ``with_taught=False`` leaves out the taught model, for those who teach anew.
     """
+    values, calibrated = with_sections(path, read_yaml(path))
     try:
-        settings = to_settings(read_yaml(path), Settings)
+        settings = to_settings(values, Settings)
     except SettingsError as error:
         raise _error(path, error.fault) from None
-    camera = _camera(path, settings)
+    camera = _camera(path, settings, calibrated)
     gripper_path = path.parent / settings.gripper
     gripper = _gripper(path, gripper_path)
-    reference = _reference(path, settings)
-    config = Config(path, settings, camera, gripper, gripper_path, reference)
+    reference = _reference(path, settings, gripper, calibrated)
+    config = Config(path, settings, camera, gripper, gripper_path, reference, calibrated=calibrated)
     fault = (
         monitor_fault(settings.monitor)
         or order_fault(settings)
@@ -159,11 +172,11 @@ def _error(path: Path, fault: Fault) -> ConfigError:
     return ConfigError(path, fault.key, fault.wrong, fault.right)
 
 
-def _camera(path: Path, settings: Settings) -> Camera:
+def _camera(path: Path, settings: Settings, calibrated: CalibrationFiles) -> Camera:
     try:
         return make_camera(settings.camera)
     except ValueError as error:
-        raise ConfigError(path, "", f"camera.{error}") from None
+        raise ConfigError(calibrated.paths.get("camera", path), "", f"camera.{error}") from None
 
 
 def _gripper(path: Path, gripper_path: Path) -> Gripper:
@@ -171,6 +184,11 @@ def _gripper(path: Path, gripper_path: Path) -> Gripper:
         raise ConfigError(
             path, "gripper", f"there is no file {gripper_path}", "a gripper file, its path relative to this file"
         )
+    return read_gripper(gripper_path)
+
+
+def read_gripper(gripper_path: Path) -> Gripper:
+    """Read and check a gripper file.  Raises :class:`ConfigError`."""
     try:
         model = to_settings(read_yaml(gripper_path), GripperModel)
         # Before anything is made of them: points in millimetres break most other rules, too.
@@ -189,13 +207,17 @@ def _gripper(path: Path, gripper_path: Path) -> Gripper:
         raise ConfigError(gripper_path, "", str(error)) from None
 
 
-def _reference(path: Path, settings: Settings) -> ReferenceRecord:
-    cam_T_grip = reference_transform(settings.reference)
-    if isinstance(cam_T_grip, Fault):
-        raise _error(path, cam_T_grip)
-    covariance = covariance_of(settings.reference)
-    if isinstance(covariance, Fault):
-        raise _error(path, covariance)
+def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: CalibrationFiles) -> ReferenceRecord:
+    file = calibrated.paths.get("reference", path)
+    fault = None if calibrated.hand_eye is None else calibrated_mismatch(calibrated.hand_eye, settings.camera, gripper)
+    if fault is not None:
+        raise _error(file, fault)
+    cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
+    for found in (cam_T_grip, covariance):
+        if isinstance(found, Fault):
+            key = found.key if file is path else found.key.removeprefix("reference.")
+            raise _error(file, found._replace(key=key))
+    assert not isinstance(cam_T_grip, Fault) and not isinstance(covariance, Fault)
     transform = to_record(cam_T_grip)
     name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
     return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)

@@ -28,7 +28,9 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
 
     Raises OSError for a file that is there no more.
     """
-    named = {"gripper": config.gripper_path, **({} if config.taught is None else {"taught": _taught_path(config)})}
+    named = {"gripper": config.gripper_path, **config.calibrated.paths}
+    if config.taught is not None:
+        named["taught"] = _taught_path(config)
     values: dict[str, Any] = msgspec.to_builtins(config.settings)
     values = {key: value for key, value in values.items() if key not in _LEFT_OUT and value is not None}
     values["source"] = _NO_SOURCE

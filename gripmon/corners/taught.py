@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from gripmon.camera import Camera, LensSettings
 from gripmon.corners.profiles import EdgeSettings
 from gripmon.geometry import from_record, invert, rotation_angle, to_record
-from gripmon.gripper import Gripper
+from gripmon.gripper import Gripper, contents_of
 from gripmon.records import Array, Transform
 
 LARGEST_OFFSET_M = 0.02
@@ -126,8 +126,8 @@ class Mismatch(NamedTuple):
 
 
 def gripper_digest(gripper: Gripper) -> str:
-    """SHA-256 of everything that a gripper file says; comments, order and spelling of numbers don't count."""
-    return hashlib.sha256(msgspec.json.encode(gripper.model, order="sorted")).hexdigest()
+    """SHA-256 of what a gripper file says of the gripper; comments, order and spelling of numbers don't count."""
+    return hashlib.sha256(msgspec.json.encode(contents_of(gripper.model), order="sorted")).hexdigest()
 
 
 def identity(

@@ -1,0 +1,173 @@
+"""Several images of a gripper on a calibration plate together, and what a person should know of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.stats import chi2
+
+from gripmon.calibration.plane import Coincidence, corners_of, lengths_of
+from gripmon.calibration.plane_equations import FEWEST_CORNERS
+from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.records import Array
+
+DOUBTED = 1e-3
+"""Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
+BESIDE_STEPS = 2.0
+"""Steps of the pattern beyond the points that were seen from which a corner is said to be off the plate."""
+OTHER_WAY_RAD = np.pi / 2.0
+_ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneCalibration:
+    """``cam_T_grip`` (4, 4) from all images, with ``covariance`` (6, 6) as in :class:`Coincidence`; ``corners_m`` (c,
+    3) with ``lengths_covariance`` (s, s) of what was inferred (see :func:`lengths_of`; s = 0 for a known gripper).
+    ``consistency_p``: probability of images that differ as much; None of one.  ``warnings``: what to doubt, in words.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    corners_m: Array
+    lengths_covariance: Array
+    images: tuple[Coincidence, ...]
+    consistency_p: float | None
+    warnings: tuple[str, ...]
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square residual on the plate, x and y each."""
+        return float(np.sqrt(np.mean(np.square(np.concatenate([i.residuals_m for i in self.images])))))
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square residual in the images, u and v each."""
+        return float(np.sqrt(np.mean(np.square(np.concatenate([i.residuals_px for i in self.images])))))
+
+
+def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
+    """The weighted mean of all images on the manifold, pose and inferred lengths jointly.
+
+    Weights are the images' own covariances; what the camera, or the plate's print, is off by comes into all of them
+    and doesn't average out.  Where the images differ by more than their covariances allow, the mean's is enlarged by
+    as much (Birge, "The calculation of errors by the method of least squares", 1932), and that is a warning.
+    :class:`CalibrationError` for inferred grippers of different corners.
+    """
+    if inferred and len({i.corners.names for i in images}) > 1:
+        raise CalibrationError("the images show different corners; for a gripper that is inferred the same in all")
+    information = [_inverse(i.own @ i.own.T) for i in images]
+    total = np.linalg.inv(np.sum(information, axis=0))
+    gains = [total @ i for i in information]
+    cam_T_grip = images[0].cam_T_grip
+    lengths = lengths_of(images[0].corners_m) if inferred else np.zeros(0)
+    for _ in range(_ROUNDS):
+        away = [_away(image, cam_T_grip, lengths) for image in images]
+        mean = np.sum([g @ a for g, a in zip(gains, away, strict=True)], axis=0)
+        cam_T_grip, lengths = perturb(cam_T_grip, mean[:6]), lengths + mean[6:]
+    away = [_away(image, cam_T_grip, lengths) for image in images]
+    size = float(sum(a @ i @ a for a, i in zip(away, information, strict=True)))
+    freedom = len(total) * (len(images) - 1)
+    consistency_p = float(chi2.sf(size, freedom)) if freedom else None
+    warnings = list(_of_images(images, inferred))
+    if consistency_p is not None and consistency_p < DOUBTED:
+        total = total * (size / freedom)
+        farthest = max(zip(images, away, strict=True), key=lambda both: float(np.linalg.norm(both[1][:3])))
+        warnings.append(
+            f"the images contradict each other (probability {consistency_p:.1g}), most of all "
+            f"{farthest[0].sighting.name}, {1e3 * float(np.linalg.norm(farthest[1][:3])):.2f} mm off: the camera moved "
+            f"between them, or the gripper didn't stand on the plate; uncertainty x {np.sqrt(size / freedom):.1f}"
+        )
+    common = np.sum([g @ _padded(i.common, images) for g, i in zip(gains, images, strict=True)], axis=0)
+    covariance = total + common @ common.T
+    return PlaneCalibration(
+        cam_T_grip,
+        0.5 * (covariance + covariance.T)[:6, :6],
+        corners_of(lengths) if inferred else images[0].corners_m,
+        covariance[6:, 6:],
+        tuple(images),
+        consistency_p,
+        tuple(dict.fromkeys(warnings)),
+    )
+
+
+def against(cam_T_grip: Array, rough_cam_T_grip: Array) -> str | None:
+    """What is wrong with a calibration beside a rough one that is known, in words."""
+    turned = float(np.linalg.norm(perturbation_between(rough_cam_T_grip, cam_T_grip)[3:]))
+    if turned <= OTHER_WAY_RAD:
+        return None
+    return (
+        f"the gripper is turned by {np.degrees(turned):.0f} degrees against the rough calibration; corners by their "
+        "right names (fingers, or near and far, have changed places), an image that isn't upside down"
+    )
+
+
+def _away(image: Coincidence, cam_T_grip: Array, lengths: Array) -> Array:
+    """(6 + s,) from a pose and lengths to those of an image."""
+    pose = perturbation_between(cam_T_grip, image.cam_T_grip)
+    return np.concatenate([pose, lengths_of(image.corners_m) - lengths]) if len(lengths) else pose
+
+
+def _padded(common: Array, images: Sequence[Coincidence]) -> Array:
+    """The camera's errors are the last columns, in all images alike; before them come the plate's, if there are any."""
+    most = max(image.common.shape[1] for image in images)
+    return np.pad(common, ((0, 0), (most - common.shape[1], 0)))
+
+
+def _inverse(covariance: Array) -> Array:
+    """Of a matrix whose rows have different units."""
+    scale = np.sqrt(covariance.diagonal())
+    return np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
+
+
+def _of_images(images: Sequence[Coincidence], inferred: bool) -> list[str]:
+    out = []
+    for image in images:
+        name = f"{image.sighting.name}: " if image.sighting.name else ""
+        out += [name + text for text in doubts(image, inferred)]
+    return out
+
+
+def doubts(image: Coincidence, inferred: bool) -> list[str]:
+    """What of one image is to be doubted, in words."""
+    out = []
+    names = image.corners.names
+    if len(names) == FEWEST_CORNERS:
+        out.append(f"two corners only ({', '.join(names)}): nothing but their distance checks them")
+    if image.p_value < DOUBTED:
+        worst = int(np.linalg.norm(image.residuals_m, axis=1).argmax())
+        size_mm = 1e3 * float(np.linalg.norm(image.residuals_m[worst]))
+        what = "make no rectangle" if inferred else "don't fit the gripper file"
+        out.append(
+            f"the corners {what} (probability {image.p_value:.1g}), most of all {names[worst]}, {size_mm:.3f} mm off: "
+            "another jaw opening, another target, a bent finger, or fingertips that don't stand on the plate"
+        )
+    if image.apart_p is not None and image.apart_p < DOUBTED:
+        out.append(_apart_text(image))
+    beside = [n for n, off in zip(names, _beside(image.sighting, image.plate_xy_m), strict=True) if off]
+    if beside:
+        out.append(f"off the part of the plate that is seen: {', '.join(beside)}; the gripper amid the pattern")
+    return out
+
+
+def _apart_text(image: Coincidence) -> str:
+    assert image.tilt_rad is not None and image.gap_m is not None and image.apart_sigma is not None
+    tilt, sigma = np.degrees(image.tilt_rad), np.degrees(image.apart_sigma[:2])
+    return (
+        f"the fingertips don't stand on the plate (probability {image.apart_p:.1g}): tilted by {tilt[0]:+.2f} +- "
+        f"{sigma[0]:.2f} and {tilt[1]:+.2f} +- {sigma[1]:.2f} degrees about x and y, {1e3 * image.gap_m:+.3f} +- "
+        f"{1e3 * image.apart_sigma[2]:.3f} mm above it"
+    )
+
+
+def _beside(sighting: Sighting, plate_xy_m: Array) -> list[bool]:
+    """Which points lie clearly beside the pattern that is seen."""
+    seen = sighting.plate_m[:, :2]
+    apart = np.linalg.norm(seen[:, None] - seen[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    step_m = float(np.median(apart.min(axis=1)))
+    hull = cv2.convexHull((seen / step_m).astype(np.float32))
+    return [cv2.pointPolygonTest(hull, (x / step_m, y / step_m), True) < -BESIDE_STEPS for x, y in plate_xy_m.tolist()]

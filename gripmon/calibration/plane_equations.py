@@ -1,0 +1,254 @@
+"""The equations of the Plane Coincidence Constraint: from ideal image points and the plate's pose to ``cam_T_grip``.
+
+The contact plane of the fingertips is the plate's x-y plane (self-viewing method, equations (5) to (7)):
+
+    cam_T_grip = cam_T_plate plate_T_grip                                          (5)
+    plate_T_grip = [[q1, -q2, 0, sx], [q2, q1, 0, sy], [0, 0, 1, -h], [0, 0, 0, 1]]   (6)
+    q1² + q2² = 1                                                                  (7)
+
+with both z axes into the plate.  h is the height of the contact plane in the gripper's frame; the paper's, 0, if its
+origin lies between the fingertips.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import Camera
+from gripmon.geometry import perturb, perturbation_between, skew
+from gripmon.records import Array
+
+FEWEST_CORNERS = 2
+INFERRED_FROM = 4
+LARGEST_MISFIT = 0.1
+"""Part of the corners' spread up to which residuals still mean inaccuracy, not another gripper."""
+SMALLEST_SPREAD_M = 1e-5
+NO_RECTANGLE = "the innermost corners are no rectangle; two corners on each of two parallel fingertips, by their names"
+_ITERATIONS = 4
+_SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
+"""Of x and y of the innermost corners."""
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A gripper on a plate: ``corners_m`` (c, 3), given or inferred, ``residuals_m`` (c, 2) on the plate in the
+    gripper's axes, ``apart`` (3,): tilt about the gripper's x and y (rad) and gap (m, the gripper nearer to the camera
+    than the plate) with which the corners are best explained without the plate; None where it can't be told.
+    """
+
+    cam_T_grip: Array
+    corners_m: Array
+    residuals_m: Array
+    apart: Array | None
+
+
+def stand(
+    camera: Camera,
+    cam_T_plate: Array,
+    uv_px: Array,
+    covariance_px: Array,
+    corners_m: Array | None,
+    contact_m: float = 0.0,
+) -> Standing:
+    """All steps for one image: ``uv_px`` (c, 2) with ``covariance_px`` (c, 2, 2), which weighs; the gripper's
+    ``corners_m`` (c, 3), whose contact plane lies at z = ``contact_m``, or None to infer them (see
+    :func:`infer_rectangle`; all are contact points then).  Raises :class:`CalibrationError`.
+    """
+    xy, slopes = camera.undistort_with_jacobian(uv_px)
+    if not np.isfinite(xy).all():
+        raise CalibrationError("a corner lies outside of what the lens maps; corners in the image")
+    heights = np.zeros(len(xy)) if corners_m is None else corners_m[:, 2] - contact_m
+    plate_xy = back_project(cam_T_plate, xy, heights)
+    variance = slopes @ covariance_px @ slopes.transpose(0, 2, 1)
+    weight = _on_plate(cam_T_plate, xy, plate_xy, heights, variance)
+    if corners_m is None:
+        sides, start = infer_rectangle(plate_xy)
+        q, shift, sides = _refine_rectangle(plate_xy, weight, sides, start)
+        known = np.concatenate([(plate_xy - shift) @ _turn(q), np.zeros((len(xy), 1))], axis=1)
+        rectangle = 0.5 * _SIGNS * sides
+        residuals = np.zeros((len(xy), 2))  # what lies outside the rectangle is as it shows
+        residuals[:INFERRED_FROM] = known[:INFERRED_FROM, :2] - rectangle
+        known[:INFERRED_FROM, :2] = rectangle
+        if _spread(residuals[:INFERRED_FROM]) > LARGEST_MISFIT * _spread(rectangle):
+            raise CalibrationError(NO_RECTANGLE)
+    else:
+        known = corners_m
+        q, shift = coincide_linear(corners_m, plate_xy)
+        _check_shape(corners_m, plate_xy, q, shift)
+        q, shift = _refine(plate_xy, weight, corners_m, q, shift)
+        residuals = (plate_xy - shift) @ _turn(q) - corners_m[:, :2]
+    plate_T_grip = np.eye(4)
+    plate_T_grip[:2, :2], plate_T_grip[:2, 3], plate_T_grip[2, 3] = _turn(q), shift, -contact_m
+    cam_T_grip = cam_T_plate @ plate_T_grip
+    apart = None if corners_m is None else _apart(cam_T_grip, xy, variance, corners_m)
+    return Standing(cam_T_grip, known, residuals, apart)
+
+
+def back_project(cam_T_plate: Array, xy: Array, z_plate_m: Array) -> Array:
+    """Points (c, 2) of the plate's frame at the heights ``z_plate_m`` (c,) that ideal image points ``xy`` (c, 2) show.
+
+    Equation (8), with r the rotation and t the translation of ``cam_T_plate``, X/f = x, Y/f = y:
+
+        [r11 r12 -x; r21 r22 -y; r31 r32 -1] [x_W y_W z_C]ᵀ = -[t1 + r13 z_W; t2 + r23 z_W; t3 + r33 z_W]
+
+    Raises :class:`CalibrationError` where a line of sight runs along the plate.
+    """
+    count = len(xy)
+    matrix = np.empty((count, 3, 3))
+    matrix[:, :, 0], matrix[:, :, 1] = cam_T_plate[:3, 0], cam_T_plate[:3, 1]
+    matrix[:, :2, 2], matrix[:, 2, 2] = -xy, -1.0
+    side = -(cam_T_plate[:3, 3] + z_plate_m[:, None] * cam_T_plate[:3, 2])
+    if (np.abs(np.linalg.det(matrix)) < 1e-6).any():
+        raise CalibrationError("a line of sight runs along the plate; a camera that looks onto it")
+    found = np.linalg.solve(matrix, side[:, :, None])[:, :, 0]
+    if (found[:, 2] <= 0.0).any():
+        raise CalibrationError("a corner lies beyond the plate's horizon; corners on the plate")
+    return found[:, :2]
+
+
+def coincide_linear(corners_m: Array, plate_xy_m: Array) -> tuple[Array, Array]:
+    """``(q1, q2)`` of unit length and ``(sx, sy)`` by linear least squares over n >= 2 corners, equations (9), (10):
+
+        [x_G -y_G 1 0] [q1 q2 sx sy]ᵀ = x_W                                        (9)
+        [y_G  x_G 0 1] [q1 q2 sx sy]ᵀ = y_W                                        (10)
+
+    then (q1, q2) scaled to unit length, (7).  :class:`CalibrationError` for fewer corners, or corners that coincide.
+    """
+    if len(corners_m) < FEWEST_CORNERS:
+        raise CalibrationError(f"{len(corners_m)} corner; at least {FEWEST_CORNERS}, which lie apart")
+    x, y = corners_m[:, 0], corners_m[:, 1]
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    matrix = np.concatenate([np.stack([x, -y, one, zero], axis=1), np.stack([y, x, zero, one], axis=1)])
+    if min(_spread(corners_m[:, :2]), _spread(plate_xy_m)) < SMALLEST_SPREAD_M:
+        raise CalibrationError("the corners coincide; corners that lie apart")
+    solution = np.linalg.lstsq(matrix, plate_xy_m.T.ravel(), rcond=None)[0]
+    length = float(np.hypot(*solution[:2]))
+    if length < 1e-6:
+        raise CalibrationError("the corners don't fit the gripper at all (mirrored, or named wrongly?)")
+    q = solution[:2] / length
+    # With unit length the best shift is another one: the centres coincide.
+    return q, (plate_xy_m - corners_m[:, :2] @ _turn(q).T).mean(axis=0)
+
+
+def _check_shape(corners_m: Array, plate_xy: Array, q: Array, shift: Array) -> None:
+    """Refuse corners that aren't this gripper's, with what they may be instead."""
+    spread = _spread(corners_m[:, :2])
+    misfit = _spread(plate_xy - shift - corners_m[:, :2] @ _turn(q).T)
+    if misfit <= LARGEST_MISFIT * spread:
+        return
+    mirrored = corners_m * np.array([1.0, -1.0, 1.0])
+    other_q, other_shift = coincide_linear(mirrored, plate_xy)
+    if _spread(plate_xy - other_shift - mirrored[:, :2] @ _turn(other_q).T) < 0.3 * misfit:
+        raise CalibrationError(
+            "the corners are mirrored; an image that isn't flipped, and corners by their right names"
+        )
+    raise CalibrationError(
+        f"the corners don't fit the gripper: they lie {1e3 * misfit:.2g} mm from its own, which reach "
+        f"{1e3 * spread:.3g} mm; the gripper, jaw opening and target as they were, corners by their right names"
+    )
+
+
+def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
+    """Sides (2,) along x and y, and ``(q1, q2, sx, sy)``, of the rectangle whose corners the first four points are, in
+    the order of :func:`calibrate_plane`; by means of opposite sides.  :class:`CalibrationError` for what is none.
+    """
+    a, b, c, d = plate_xy_m[:INFERRED_FROM]
+    across, along = 0.5 * ((c - a) + (d - b)), 0.5 * ((b - a) + (d - c))
+    sides = np.array([np.hypot(*across), np.hypot(*along)])
+    if sides.min() < 1e-4:
+        raise CalibrationError("the innermost corners coincide; two on each finger")
+    # With z into the plate, y lies a quarter turn clockwise of x for who looks at it: x cross y is z.
+    turning = float(across[0] * along[1] - across[1] * along[0]) / float(sides.prod())
+    if turning < -0.5:
+        raise CalibrationError(
+            "the innermost corners are mirrored: fingers or corners have each other's names, or the image is mirrored"
+        )
+    if turning < 0.9:
+        raise CalibrationError(NO_RECTANGLE)
+    direction = across / sides[0] + np.array([along[1], -along[0]]) / sides[1]
+    q = direction / np.hypot(*direction)
+    return sides, np.concatenate([q, plate_xy_m[:INFERRED_FROM].mean(axis=0)])
+
+
+def _refine(plate_xy: Array, weight: Array, corners_m: Array, q: Array, shift: Array) -> tuple[Array, Array]:
+    """The rotation and shift with the least weighted residuals (Gauss-Newton; ``weight`` (c, 2, 2) whitens)."""
+    for _ in range(_ITERATIONS):
+        turned = corners_m[:, :2] @ _turn(q).T
+        rows = np.zeros((len(corners_m), 2, 3))
+        rows[:, 0, 0], rows[:, 1, 0] = -turned[:, 1], turned[:, 0]
+        rows[:, 0, 1] = rows[:, 1, 2] = 1.0
+        step = _least_squares(weight, rows, plate_xy - turned - shift)
+        q, shift = _turn(_unit(step[0])) @ q, shift + step[1:]
+    return q, shift
+
+
+def _refine_rectangle(plate_xy: Array, weight: Array, sides: Array, start: Array) -> tuple[Array, Array, Array]:
+    """The same with the rectangle's sides unknown, from its four corners."""
+    q: Array = start[:2]
+    shift: Array = start[2:]
+    points, weight = plate_xy[:INFERRED_FROM], weight[:INFERRED_FROM]
+    for _ in range(_ITERATIONS):
+        turned = (0.5 * _SIGNS * sides) @ _turn(q).T
+        rows = np.zeros((INFERRED_FROM, 2, 5))
+        rows[:, 0, 0], rows[:, 1, 0] = -turned[:, 1], turned[:, 0]
+        rows[:, 0, 1] = rows[:, 1, 2] = 1.0
+        rows[:, :, 3], rows[:, :, 4] = 0.5 * _SIGNS[:, :1] * q, 0.5 * _SIGNS[:, 1:] * np.array([-q[1], q[0]])
+        step = _least_squares(weight, rows, points - turned - shift)
+        q, shift, sides = _turn(_unit(step[0])) @ q, shift + step[1:3], sides + step[3:]
+    return q, shift, sides
+
+
+def _apart(cam_T_grip: Array, xy: Array, variance: Array, corners_m: Array) -> Array | None:
+    """Tilt and gap with which the corners, no plate considered, are best explained; None where they don't tell."""
+    if len(corners_m) < 4 or np.linalg.svd(corners_m - corners_m.mean(axis=0), compute_uv=False)[1] < 1e-4:
+        return None
+    whiten = np.linalg.inv(np.linalg.cholesky(variance))
+    free: Array = np.zeros(6)
+    for _ in range(_ITERATIONS):
+        # Moved in its own axes: shift, then turn.
+        moved = perturb(np.eye(4), free)
+        points = (corners_m @ moved[:3, :3].T + moved[:3, 3]) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+        x, y, z = points.T
+        by_point = np.zeros((len(xy), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+        by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
+        turned = corners_m @ moved[:3, :3].T
+        by_motion = np.concatenate([np.broadcast_to(np.eye(3), (len(xy), 3, 3)), -skew(turned)], axis=2)
+        rows = by_point @ cam_T_grip[:3, :3] @ by_motion
+        free = perturbation_between(
+            np.eye(4), perturb(moved, _least_squares(whiten, rows, xy - points[:, :2] / points[:, 2:]))
+        )
+    return np.array([free[3], free[4], -free[2]])
+
+
+def _on_plate(cam_T_plate: Array, xy: Array, plate_xy: Array, heights: Array, variance: Array) -> Array:
+    """(c, 2, 2) that whiten errors on the plate which come from ``variance`` (c, 2, 2) of ideal coordinates."""
+    points = np.concatenate([plate_xy, heights[:, None]], axis=1) @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
+    z = points[:, 2, None, None]
+    # d(xy)/d(plate x, y), inverted.
+    by_plate = (cam_T_plate[:2, :2] - xy[:, :, None] * cam_T_plate[2, :2]) / z
+    slope = np.linalg.inv(by_plate)
+    return np.linalg.inv(np.linalg.cholesky(slope @ variance @ slope.transpose(0, 2, 1)))
+
+
+def _least_squares(whiten: Array, rows: Array, values: Array) -> Array:
+    a = (whiten @ rows).reshape(-1, rows.shape[2])
+    b = np.einsum("nij,nj->ni", whiten, values).ravel()
+    out: Array = np.linalg.lstsq(a, b, rcond=None)[0]
+    return out
+
+
+def _turn(q: Array) -> Array:
+    return np.array([[q[0], -q[1]], [q[1], q[0]]])
+
+
+def _unit(angle_rad: float) -> Array:
+    return np.array([np.cos(angle_rad), np.sin(angle_rad)])
+
+
+def _spread(xy_m: Array) -> float:
+    """Root mean square distance from the middle."""
+    return float(np.sqrt(np.mean(np.sum(np.square(xy_m - xy_m.mean(axis=0)), axis=1))))

@@ -1,0 +1,91 @@
+"""Files of ``gripmon calibrate`` that a configuration names where it may also have a section: camera and reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+
+from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
+from gripmon.camera import LensSettings
+from gripmon.config.errors import ConfigError
+from gripmon.config.typed import Fault, SettingsError, to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.corners.taught import gripper_digest
+from gripmon.gripper import Gripper
+
+_T = TypeVar("_T")
+_WHAT = {
+    "camera": "a file of gripmon calibrate intrinsics",
+    "reference": "a file of gripmon calibrate plane",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationFiles:
+    """``paths``: the files by key of the configuration; ``hand_eye``: what the reference's says."""
+
+    paths: dict[str, Path] = field(default_factory=dict)
+    hand_eye: HandEyeCalibration | None = None
+
+
+def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], CalibrationFiles]:
+    """The configuration's values with the sections that the files stand for.  Raises :class:`ConfigError`."""
+    values, paths, hand_eye = dict(values), {}, None
+    if isinstance(values.get("camera"), str):
+        paths["camera"] = _file(path, "camera", values["camera"])
+        values["camera"] = msgspec.to_builtins(read_camera(paths["camera"]).camera)
+    if isinstance(values.get("reference"), str):
+        paths["reference"] = _file(path, "reference", values["reference"])
+        hand_eye = read_hand_eye(paths["reference"])
+        transform = msgspec.to_builtins(hand_eye.cam_T_grip)
+        values["reference"] = {"cam_T_grip": transform, "covariance": list(hand_eye.covariance)}
+    return values, CalibrationFiles(paths, hand_eye)
+
+
+def read_camera(path: Path) -> CameraCalibration:
+    """A calibrated camera.  Raises :class:`ConfigError`."""
+    calibration = _read(path, CameraCalibration)
+    count = len(calibration.parameters)
+    if len(calibration.covariance) != count * count:
+        wrong = f"has {len(calibration.covariance)} values for {count} parameters"
+        raise ConfigError(path, "covariance", wrong, f"{count * count} values, row by row")
+    return calibration
+
+
+def read_hand_eye(path: Path) -> HandEyeCalibration:
+    """A hand/eye calibration.  Raises :class:`ConfigError`."""
+    return _read(path, HandEyeCalibration)
+
+
+def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Gripper) -> Fault | None:
+    """Why a hand/eye calibration isn't one of this camera and this gripper."""
+    if hand_eye.camera != camera:
+        return Fault("camera", "isn't the configuration's camera", "the hand/eye calibration made with the same camera")
+    if hand_eye.gripper.sha256 != gripper_digest(gripper):
+        same = " with other contents" if hand_eye.gripper.name == gripper.name else ""
+        wrong = f"is {hand_eye.gripper.name}{same}, the configuration has {gripper.name}"
+        return Fault("gripper", wrong, "the hand/eye calibration made with the same gripper file")
+    return None
+
+
+def _file(path: Path, key: str, name: str) -> Path:
+    there = path.parent / name
+    if not there.is_file():
+        raise ConfigError(
+            path, key, f"there is no file {there}", f"{_WHAT[key]}, its path relative to this file, or a section"
+        )
+    return there
+
+
+def _read(path: Path, kind: type[_T]) -> _T:
+    values = read_yaml(path)
+    tag = kind.__struct_config__.tag  # type: ignore[attr-defined]
+    if values.get("schema") != tag:
+        raise ConfigError(path, "schema", f"is {values.get('schema')!r}", str(tag))
+    try:
+        return to_settings(values, kind)
+    except SettingsError as error:
+        raise ConfigError(path, error.fault.key, error.fault.wrong, error.fault.right) from None
