@@ -47,8 +47,9 @@ class _Metric:
     expected: float
 
     def neighbours(self, a: int, b: int, step_px: Array) -> bool:
-        length = float(np.hypot(*(self.roots[a] @ step_px)))
-        return 0.5 * self.expected < length < 1.5 * self.expected
+        # By both discs: a lens may show one much larger than the other.
+        one, other = (float(np.hypot(*(self.roots[k] @ step_px))) for k in (a, b))
+        return 0.65 * self.expected < (one * other) ** 0.5 < 1.45 * self.expected
 
     def basis(self, at: int, a_px: Array, b_px: Array) -> bool:
         a, b = self.roots[at] @ a_px, self.roots[at] @ b_px
@@ -60,7 +61,7 @@ def find_discs(grey: Grey, columns: int, rows: int, spacing_per_diameter: float)
     else what was found instead; empty if there is none.
     """
     if max(grey.shape) > LARGE_PX:
-        half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        half: Grey = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)  # type: ignore[assignment]
         found = _search(half, columns, rows, spacing_per_diameter)
         if found and _fits(found[0], columns, rows):
             return [

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibration.bundle import DEGENERATE, Bundle, BundleProblem
+from gripmon.calibration.doubts import check_fit, doubts_of
 from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.camera import LensSettings, make_camera
@@ -25,14 +26,6 @@ FEWEST_POINTS = 8
 """In a view; a plane's pose needs four."""
 FOCAL_STARTS = np.geomspace(0.25, 8.0, 31)
 """Focal lengths over the image's width that are tried: fields of view from 127 to 7 degrees."""
-DOUBTFUL_FOCAL = 0.01
-"""Relative standard deviation of the focal length from which the views are said not to support it; and the one from
-which there is no calibration."""
-USELESS_FOCAL = 0.2
-COVERED = 0.6
-"""Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
-LARGEST_RMS_SHARE = 0.02
-"""Root mean square residual over the image's width beyond which no model of ours fits at all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +49,19 @@ class IntrinsicsResult:
     warnings: tuple[str, ...] = ()
     criterion: dict[str, float] | None = None
     cross_validated_rms_px: float | None = None
+
+    @property
+    def view_rms_px(self) -> tuple[float, ...]:
+        """Root mean square of each view's residuals that were used, u and v each."""
+        return tuple(
+            float(np.sqrt(np.mean(np.square(r[u])))) if u.any() else math.inf
+            for r, u in zip(self.residuals_px, self.used, strict=True)
+        )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters by name, those that were held, too."""
+        return dict(zip(parameter_names(self.model), lens_vector(self.camera).tolist(), strict=True))
 
 
 def calibrate(
@@ -85,7 +91,7 @@ def calibrate(
         rms_px=bundle.rms_px,
         criterion={model: _bayes(bundle, p)},
     )
-    return replace(result, warnings=(*held, *_warnings(result, bundle, sightings, size)))
+    return replace(result, warnings=(*held, *doubts_of(result, sightings)))
 
 
 def calibrate_best(
@@ -116,7 +122,9 @@ def calibrate_best(
     return replace(best, criterion=criterion)
 
 
-def calibrate_single_view(sighting: Sighting, model: ModelName = "paper") -> IntrinsicsResult:
+def calibrate_single_view(
+    sighting: Sighting, model: ModelName = "paper", *, fixed: frozenset[str] = frozenset()
+) -> IntrinsicsResult:
     """Focal length, lens and the plate's pose from one view of a plane, principal point at the image's centre and
     square pixels: what the self-viewing method's off-line step starts with (Tsai's single-view coplanar calibration).
 
@@ -124,8 +132,8 @@ def calibrate_single_view(sighting: Sighting, model: ModelName = "paper") -> Int
     unknown.  Raises :class:`CalibrationError` then.
     """
     names = parameter_names(model)
-    fixed = {"cx_px", "cy_px", "aspect"} | set(names[5:])  # one view can't tell more of a lens than one number
-    return calibrate([sighting], model, fixed=frozenset(fixed))
+    held = {"cx_px", "cy_px", "aspect"} | set(names[5:])  # one view can't tell more of a lens than one number
+    return calibrate([sighting], model, fixed=fixed | held)
 
 
 def cross_validate(
@@ -219,7 +227,7 @@ def _supported(
     for name in (*reversed(parameter_names(lens_model.name)[5:]), ""):
         names, free = _free(lens_model.name, fixed | set(held))
         bundle = _solve(BundleProblem(lens_model, sightings, free), lens_model, sightings)
-        _check_fit(lens_model, bundle, free)
+        check_fit(lens_model, bundle, free, sightings)
         try:
             make_camera(lens_model.settings(bundle.parameters))
             break
@@ -305,50 +313,6 @@ def _one_size(sightings: Sequence[Sighting]) -> tuple[int, int]:
         if len(sighting) < FEWEST_POINTS:
             raise CalibrationError(f"{sighting.name} shows {len(sighting)} points; at least {FEWEST_POINTS}")
     return sightings[0].size_px
-
-
-def _check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
-    """Refuse what is no calibration."""
-    if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
-        raise CalibrationError(
-            f"no camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of one camera, and "
-            "the target as it was described"
-        )
-    moves_focal = np.flatnonzero(free[0])
-    if len(moves_focal):
-        share = math.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]]) / bundle.parameters[0]
-        if share > USELESS_FOCAL:
-            raise CalibrationError(DEGENERATE)
-
-
-def _warnings(
-    result: IntrinsicsResult, bundle: Bundle, sightings: Sequence[Sighting], size: tuple[int, int]
-) -> tuple[str, ...]:
-    """What the views can't support, in words."""
-    out = []
-    sigma = dict(zip(result.parameters, np.sqrt(result.covariance.diagonal()).tolist(), strict=True))
-    focal = sigma.get("fx_px", 0.0)
-    if focal > DOUBTFUL_FOCAL * result.camera.fx_px:
-        out.append(
-            f"the focal length is uncertain by {100.0 * focal / result.camera.fx_px:.1f} %: views tilted by 20 to 45 "
-            "degrees to different sides determine it"
-        )
-    for i, name in enumerate(n for n in result.parameters if n.startswith(("coefficients", "kappa"))):
-        value = lens_vector(result.camera)[4 + i]
-        if abs(value) < 2.0 * sigma[name] and not math.isclose(value, 0.0):
-            out.append(f"{name} is not told from 0 ({value:.3g} ± {sigma[name]:.2g}): a model with fewer parameters")
-    half_px = 0.5 * np.array(size)
-    reach = max(float(np.linalg.norm((s.uv_px - half_px), axis=1).max()) for s in sightings)
-    if reach < COVERED * float(np.linalg.norm(half_px)):
-        out.append(
-            f"no point lies farther than {100.0 * reach / float(np.linalg.norm(half_px)):.0f} % of the way from the "
-            "image's centre to its corners: beyond, the lens is extrapolated"
-        )
-    lost = sum(int((~u).sum()) for u in bundle.used)
-    total = sum(len(u) for u in bundle.used)
-    if lost > 0.1 * total:
-        out.append(f"{lost} of {total} points don't fit and were left out: is the target flat, and described rightly?")
-    return tuple(out)
 
 
 def _bayes(bundle: Bundle, free: int) -> float:

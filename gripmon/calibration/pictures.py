@@ -24,7 +24,7 @@ def to_grey(image: Image) -> Grey:
     grey = np.nan_to_num(np.ascontiguousarray(grey, np.float32), posinf=0.0, neginf=0.0)
     top = float(np.percentile(grey[::4, ::4], 99.5))
     if top > 0.0 and (image.dtype != np.uint8 or top < _DIM):
-        grey *= np.float32(_TOP / top)
+        grey = (grey * (_TOP / top)).astype(np.float32)
     return np.minimum(grey, np.float32(255.0))
 
 

@@ -7,6 +7,8 @@ about the point gives its place, its covariance from the image's noise, and tell
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +40,7 @@ def centres_of_symmetry(grey: Grey, start: Array, radius_px: Array, noise: float
     grey, corner = _cropped(grey, start, int(2.0 * LARGEST_RADIUS_PX) + 4)
     start = start - corner
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
-    slopes = [cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
+    slopes: list[Any] = [cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=0.125) for order in ((1, 0), (0, 1))]
     # Other interpolation than by splines shifts the corners by up to 0.04 px, depending on where in a pixel they are.
     levels: Array = spline_filter(smooth, order=3, output=np.float64)
     reach = int(np.ceil(radius_px.max(initial=1.0)))

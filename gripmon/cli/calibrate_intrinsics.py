@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
+import sys
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +14,12 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.calibration.intrinsics import IntrinsicsResult
+    from gripmon.calibration.lens_models import ModelName
     from gripmon.calibration.sighting import Sighting
     from gripmon.calibration.targets import Target
 
 MODELS = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
+_FOLDS = 5
 
 _DESCRIPTION = """\
 Calibrate a camera from images of a flat target, each of which may show a part of it: focal lengths,
@@ -25,8 +30,9 @@ self-viewing method."""
 
 _EXAMPLES = """\
   gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
-  gripmon calibrate intrinsics plate/ --target charuco:8x6:0.03:0.022:DICT_4X4_250 --model auto --out camera.yaml
-  gripmon calibrate intrinsics one.png --target circles:8x8:0.008:0.004 --model paper --out camera.yaml
+  gripmon calibrate intrinsics plate/ --target charuco:8x6:0.03:0.022:DICT_4X4_250 --model auto \\
+      --out camera.yaml --picture maps.png
+  gripmon calibrate intrinsics one.png --target circles:8x8:0.008:0.004 --out camera.yaml
 
 exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why:
 nothing is written then"""
@@ -60,53 +66,88 @@ def add_parser(methods: Any) -> None:
         "may be given several times",
     )
     parser.add_argument("--out", required=True, metavar="FILE.yaml", help="file to write")
+    parser.add_argument(
+        "--picture", metavar="FILE.png", help="also draw the residuals over the image, and how each view fits"
+    )
     parser.add_argument("--force", action="store_true", help="replace files that are there")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of text; px, the lens's own units")
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Images that show the target, and why the others don't."""
+
+    sightings: list[Sighting]
+    not_found: dict[str, str]
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate intrinsics``."""
+    import cv2
+
+    from gripmon.calibration.maps import draw_maps
     from gripmon.calibration.sighting import CalibrationError
 
-    out = Path(arguments.out)
+    cv2.setNumThreads(1)
+    out, picture = Path(arguments.out), arguments.picture and Path(arguments.picture)
     files.check_output(out, force=arguments.force)
+    if picture:
+        files.check_picture(picture, force=arguments.force)
     target = files.target_of(arguments.target)
+    _check_fixed(arguments)
     paths = files.image_paths(arguments.images)
-    sightings = _sightings(paths, target)
+    views = _looked_at(paths, target)
     try:
-        result = _calibrated(sightings, arguments)
+        result = _calibrated(views.sightings, arguments)
     except CalibrationError as error:
         raise common.CommandFailedError(f"calibrate intrinsics: {error}") from None
-    files.write_document(_document(result, sightings, target, paths, arguments), out)
-    print(f"written: {out}")
+    result = replace(result, warnings=(*result.warnings, *_about_target(views.sightings, target)))
+    document = _document(result, views.sightings, target, paths, arguments)
+    if picture:
+        files.write_picture(draw_maps(result, views.sightings), picture)
+    files.write_document(document, out)
+    print(json.dumps(_values(result, views, out), indent=2) if arguments.json else _summary(result, views, out))
     return common.EXIT_DONE
 
 
-def _sightings(paths: list[Path], target: Target) -> list[Sighting]:
-    import sys
+def _check_fixed(arguments: argparse.Namespace) -> None:
+    from gripmon.calibration.lens_models import MODELS as ALL
+    from gripmon.calibration.lens_models import parameter_names
 
+    models = [m for m in ALL if arguments.model in (m, "auto") or (arguments.model is None and m != "fisheye")]
+    known = list(dict.fromkeys(name for model in models for name in parameter_names(model)))
+    for name in arguments.fix:
+        if name not in (*known, "aspect"):
+            raise common.CommandFailedError(
+                f"--fix {name}: is no parameter of the model; {', '.join(known)} or aspect", common.EXIT_USAGE
+            )
+
+
+def _looked_at(paths: list[Path], target: Target) -> _Views:
+    """The target in all images; ends the command where none shows it, or where they can't be of one camera."""
     from gripmon.calibration.detection import detect
     from gripmon.calibration.sighting import NotFound
 
-    images = files.read_images(paths)
-    found: list[Sighting] = []
+    views = _Views([], {})
     with common.progress_bar(len(paths), "image") as step:
-        for path, image in zip(paths, images, strict=True):
-            sight = detect(image, target, str(path))
+        for path, image in files.images_of(paths):
+            try:
+                sight = detect(image, target, str(path))
+            except ValueError as error:
+                raise common.CommandFailedError(f"--target: {error}", common.EXIT_USAGE) from None
             if isinstance(sight, NotFound):
-                print(f"{path}: {sight.reason}", file=sys.stderr)
+                views.not_found[str(path)] = sight.reason
             else:
-                found.append(sight)
+                views.sightings.append(sight)
             step()
-    if not found:
-        raise common.CommandFailedError(f"none of {len(paths)} images shows the target {arguments_text(target)}")
-    return found
-
-
-def arguments_text(target: Target) -> str:
-    """The target as it is given."""
-    from gripmon.calibration.targets import name_of
-
-    return name_of(target)
+    for name, reason in views.not_found.items():
+        print(f"{name}: {reason}", file=sys.stderr)
+    if not views.sightings:
+        reasons = set(views.not_found.values())
+        why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
+        count = "the image doesn't show" if len(paths) == 1 else f"none of {len(paths)} images shows"
+        raise common.CommandFailedError(f"calibrate intrinsics: {count} the target{why}")
+    return views
 
 
 def _calibrated(sightings: list[Sighting], arguments: argparse.Namespace) -> IntrinsicsResult:
@@ -115,10 +156,34 @@ def _calibrated(sightings: list[Sighting], arguments: argparse.Namespace) -> Int
 
     fixed = frozenset(arguments.fix)
     if len(sightings) == 1:
-        return intrinsics.calibrate_single_view(sightings[0], arguments.model or "paper")
-    if arguments.model == "auto":
-        return intrinsics.calibrate_best(sightings, ALL, fixed=fixed)
-    return intrinsics.calibrate(sightings, arguments.model or "brown_conrady", fixed=fixed)
+        model: ModelName = "paper" if arguments.model in (None, "auto") else arguments.model
+        return intrinsics.calibrate_single_view(sightings[0], model, fixed=fixed)
+    steps = (len(ALL) if arguments.model == "auto" else 1) + min(_FOLDS, len(sightings)) * (len(sightings) > 3)
+    with common.progress_bar(steps, "fit") as step:
+        if arguments.model == "auto":
+            result = intrinsics.calibrate_best(sightings, ALL, fixed=fixed, step=step)
+        else:
+            result = intrinsics.calibrate(sightings, arguments.model or "brown_conrady", fixed=fixed)
+            step()
+        crossed = intrinsics.cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
+    return replace(result, cross_validated_rms_px=crossed)
+
+
+def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
+    """Whether it may have been described as larger than it is: on a lattice without marks nothing else tells."""
+    from gripmon.calibration.targets import Charuco
+
+    if isinstance(target, Charuco):
+        return []
+    step_m = getattr(target, "square_m", None) or getattr(target, "spacing_m", 1.0)
+    spans = [s.plate_m[:, :2].max(axis=0) - s.plate_m[:, :2].min(axis=0) for s in sightings]
+    seen = sorted((round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)), reverse=True)
+    if seen[0] < max(target.columns, target.rows) and len(sightings) > 1:
+        whole = f"{target.columns} x {target.rows}"
+        return [
+            f"no image shows more than {seen[0]} x {seen[1]} of the target's {whole} points: is it described rightly?"
+        ]
+    return []
 
 
 def _document(
@@ -129,9 +194,11 @@ def _document(
     arguments: argparse.Namespace,
 ) -> Any:
     from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+    from gripmon.calibration.targets import name_of
     from gripmon.provenance import provenance_of
 
-    options = {"--target": arguments.target, "--model": arguments.model, "--out": arguments.out}
+    options = {"--target": arguments.target, "--model": arguments.model, "--fix": arguments.fix}
+    options |= {"--out": arguments.out, "--picture": arguments.picture, "--force": arguments.force}
     return CameraCalibration(
         camera=result.camera,
         parameters=result.parameters,
@@ -141,8 +208,63 @@ def _document(
             views=len(sightings),
             points=sum(int(u.sum()) for u in result.used),
             outliers=sum(int((~u).sum()) for u in result.used),
+            cross_validated_rms_px=result.cross_validated_rms_px,
         ),
-        target=arguments_text(target),
+        target=name_of(target),
         warnings=result.warnings,
         provenance=provenance_of(files.command_line("intrinsics", arguments.images, options), paths),
     )
+
+
+def _sigmas(result: IntrinsicsResult) -> dict[str, float | None]:
+    found = dict(zip(result.parameters, result.covariance.diagonal() ** 0.5, strict=True))
+    return {name: float(found[name]) if name in found else None for name in result.values}
+
+
+def _values(result: IntrinsicsResult, views: _Views, out: Path) -> dict[str, Any]:
+    sigmas = _sigmas(result)
+    return {
+        "out": str(out),
+        "model": result.model,
+        "parameters": {name: {"value": value, "sigma": sigmas[name]} for name, value in result.values.items()},
+        "rms_px": result.rms_px,
+        "cross_validated_rms_px": result.cross_validated_rms_px,
+        "criterion": result.criterion,
+        "views": [
+            {"image": s.name, "points": len(s), "left_out": int((~used).sum()), "rms_px": rms, "note": s.note}
+            for s, used, rms in zip(views.sightings, result.used, result.view_rms_px, strict=True)
+        ],
+        "not_found": [{"image": name, "reason": reason} for name, reason in views.not_found.items()],
+        "warnings": list(result.warnings),
+    }
+
+
+def _summary(result: IntrinsicsResult, views: _Views, out: Path) -> str:
+    sigmas = _sigmas(result)
+    lines = [f"{'parameter':<15} {'value':>14} {'±':>11}"]
+    for name, value in result.values.items():
+        sigma = sigmas[name]
+        # A tied one has no deviation of its own: fy_px is fx_px with square pixels.
+        said = "held" if sigma is None else f"{sigma:.2g}"
+        lines.append(f"{name:<15} {value:>14.6g} {said:>11}")
+    lost = sum(int((~u).sum()) for u in result.used)
+    total = sum(len(s) for s in views.sightings)
+    images = len(views.sightings) + len(views.not_found)
+    fit = f"{len(views.sightings)} of {images} images, {total} points, {lost} left out; rms {result.rms_px:.3f} px"
+    if result.cross_validated_rms_px is not None:
+        fit += f", {result.cross_validated_rms_px:.3f} px in images that had no part in the fit"
+    lines.append(fit)
+    if len(views.sightings) == 1:
+        lines.append(
+            "from a single image: principal point at the image's centre, square pixels, one number of the lens"
+        )
+    if result.criterion is not None and len(result.criterion) > 1:
+        least = min(result.criterion.values())
+        lines.append("model            information criterion above the best")
+        lines += [
+            f"{name:<16} {value - least:>8.1f}"
+            for name, value in sorted(result.criterion.items(), key=lambda item: item[1])
+        ]
+    lines += [f"warning: {warning}" for warning in result.warnings]
+    lines.append(f"written: {out}")
+    return "\n".join(lines)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,22 +38,32 @@ def image_paths(texts: Sequence[str]) -> list[Path]:
     return paths
 
 
-def read_images(paths: Sequence[Path]) -> list[Image]:
-    """All of them; one that can't be read, or is the same as another, ends the command with exit code 2."""
+def images_of(paths: Sequence[Path]) -> Iterator[tuple[Path, Image]]:
+    """Each with its path, all of one size; one that can't be read, or is the same as another, ends the command with
+    exit code 2.
+    """
     from gripmon.sources.folder import read_image
 
-    images: list[Image] = []
     seen: dict[bytes, Path] = {}
+    size: tuple[int, ...] | None = None
     for path in paths:
+        if path.is_dir():
+            raise common.CommandFailedError(f"{path}: is a folder; an image file", common.EXIT_USAGE)
         image, fault = read_image(path)
         if image is None:
             raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
         # The same image twice would make every uncertainty too small.
-        first = seen.setdefault(image.tobytes(), path)
+        first = seen.setdefault(hashlib.sha256(image.tobytes()).digest(), path)
         if first is not path:
             raise common.CommandFailedError(f"{path}: is the same image as {first}; each image once", common.EXIT_USAGE)
-        images.append(image)
-    return images
+        if size is not None and image.shape[:2] != size:
+            raise common.CommandFailedError(
+                f"{path}: has {image.shape[1]} x {image.shape[0]} px and {paths[0]} {size[1]} x {size[0]} px; images "
+                "of one camera, in one size",
+                common.EXIT_USAGE,
+            )
+        size = image.shape[:2]
+        yield path, image
 
 
 def target_of(text: str, option: str = "--target") -> Target:
@@ -106,6 +117,8 @@ def command_line(method: str, positional: Sequence[str], options: dict[str, Any]
     for option, value in options.items():
         if value is True:
             words.append(option)
+        elif isinstance(value, list):
+            words += [word for one in value for word in (option, str(one))]
         elif value is not None and value is not False:
             words += [option, str(value)]
     return shlex.join(words)

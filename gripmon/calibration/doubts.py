@@ -1,0 +1,96 @@
+"""When a calibration isn't one, and what of it the views can't support: in words, for a person."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gripmon.calibration.bundle import DEGENERATE, Bundle
+from gripmon.calibration.lens_models import LensModel
+from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.records import Array
+
+if TYPE_CHECKING:
+    from gripmon.calibration.intrinsics import IntrinsicsResult
+
+DOUBTFUL_FOCAL = 0.01
+"""Relative standard deviation of the focal length from which the views are said not to support it; and the one from
+which there is no calibration."""
+USELESS_FOCAL = 0.2
+COVERED = 0.6
+"""Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
+LARGE_RMS_SHARE = 0.0007
+"""Root mean square residual over the image's width from which it is said to be large; and the one from which no camera
+of the model fits at all."""
+LARGEST_RMS_SHARE = 0.003
+STRANGE = 0.5
+"""Part of a view's points that fit, below which it is no view of the same target by the same camera."""
+
+
+def check_fit(lens_model: LensModel, bundle: Bundle, free: Array, sightings: Sequence[Sighting]) -> None:
+    """Refuse what is no calibration: :class:`CalibrationError`."""
+    if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
+        raise CalibrationError(
+            f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "
+            "one camera and focus, the target as it was described, or another model"
+        )
+    for sighting, used in zip(sightings, bundle.used, strict=True):
+        if len(sightings) > 1 and used.mean() < STRANGE:
+            raise CalibrationError(
+                f"{sighting.name}: {int((~used).sum())} of {len(used)} points contradict the other images; images of "
+                "one camera and focus: leave it out"
+            )
+    moves_focal = np.flatnonzero(free[0])
+    if len(moves_focal):
+        share = math.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]]) / bundle.parameters[0]
+        if share > USELESS_FOCAL:
+            raise CalibrationError(DEGENERATE)
+
+
+def doubts_of(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> tuple[str, ...]:
+    """What the views can't support; one line each."""
+    return (*_parameters(result), *_views(result, sightings))
+
+
+def _parameters(result: IntrinsicsResult) -> list[str]:
+    out = []
+    values = result.values
+    sigma = dict(zip(result.parameters, np.sqrt(result.covariance.diagonal()).tolist(), strict=True))
+    focal = sigma.get("fx_px", 0.0)
+    if focal > DOUBTFUL_FOCAL * result.camera.fx_px:
+        out.append(
+            f"the focal length is uncertain by {100.0 * focal / result.camera.fx_px:.1f} %: views tilted by 20 to 45 "
+            "degrees to different sides determine it"
+        )
+    lens = [n for n in result.parameters if n.startswith(("coefficients", "kappa"))]
+    untold = [n for n in lens if abs(values[n]) < 2.0 * sigma[n]]
+    return out + [
+        f"{n} is not told from 0 ({values[n]:.3g} ± {sigma[n]:.2g}): a model with fewer parameters" for n in untold
+    ]
+
+
+def _views(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> list[str]:
+    out = []
+    half_px = 0.5 * np.array([result.camera.width_px, result.camera.height_px])
+    reach = max(float(np.linalg.norm(s.uv_px - half_px, axis=1).max()) for s in sightings)
+    if reach < COVERED * float(np.linalg.norm(half_px)):
+        out.append(
+            f"no point lies farther than {100.0 * reach / float(np.linalg.norm(half_px)):.0f} % of the way from the "
+            "image's centre to its corners: beyond, the lens is extrapolated"
+        )
+    lost = sum(int((~u).sum()) for u in result.used)
+    total = sum(len(u) for u in result.used)
+    if lost > 0.1 * total:
+        out.append(f"{lost} of {total} points don't fit and were left out: is the target flat, and described rightly?")
+    if result.rms_px > LARGE_RMS_SHARE * result.camera.width_px:
+        out.append(
+            f"residuals of {result.rms_px:.2g} px are large: is the target flat, the focus fixed, the model right?"
+        )
+    rms = result.view_rms_px
+    for sighting, value in zip(sightings, rms, strict=True):
+        if value > 3.0 * float(np.median(rms)) and value > 0.1:
+            out.append(f"{sighting.name} fits badly: {value:.2g} px, the others {float(np.median(rms)):.2g} px")
+    return out
