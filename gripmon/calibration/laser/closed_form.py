@@ -17,15 +17,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.laser.planar_start import planar_start
-from gripmon.calibration.laser.setup import LaserSetup, origin_axes
+from gripmon.calibration.laser.setup import LaserSetup, basis, origin_axes
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import make_transform
 from gripmon.records import Array
 
 FEWEST_SHIFTS = 6
 """Spots of an orientation: twelve equations for the eleven unknowns of its matrix."""
-FEWEST_ORIENTATIONS = 2
+FEWEST_ORIENTATIONS = 3
+"""Two differ by a turn about one axis."""
+LEAST_TURN_RAD = 5e-3
+"""How far a direction of the end-effector has to turn, root mean square over the orientations."""
+ON_A_LINE = 3e-3
+"""Second singular value over the first below which image points are said to lie on a line."""
 FLAT = 1e-3
 """Third singular value over the first below which shifts are said to lie in a plane."""
 SAME_ORIENTATION_RAD = 2e-3
@@ -59,50 +63,82 @@ def orientation_groups(base_T_ee: Array, tolerance_rad: float = SAME_ORIENTATION
     return [np.array(group, dtype=np.intp) for group in groups]
 
 
-def solve(
-    xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, planar: bool = False
-) -> LaserSetup:
-    """All steps: ideal image points (n, 2) (step 1 has undistorted them) and poses (n, 4, 4) -> the whole set-up.
+def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None) -> LaserSetup:
+    """All steps as printed: ideal image points (n, 2) (step 1 has undistorted them) and poses (n, 4, 4) -> the set-up.
 
-    Raises :class:`CalibrationError` that names the degenerate case: too few orientations, shifts in a plane, a plane
-    through the camera, a beam along the plane.
+    :func:`gripmon.calibration.laser.common_plane.solve` is the better one with noise.  Raises
+    :class:`CalibrationError` that names the degenerate case: too few orientations, shifts in a plane, turned about one
+    axis, a plane through the camera, a beam along the plane.
     """
-    groups = orientation_groups(base_T_ee) if groups is None else groups
-    usable = [_orientation(xy, base_T_ee, members) for members in groups if len(members) >= FEWEST_SHIFTS]
-    if len(usable) < FEWEST_ORIENTATIONS:
-        raise CalibrationError(
-            f"{len(usable)} orientation(s) with at least {FEWEST_SHIFTS} spots each; at least {FEWEST_ORIENTATIONS}, "
-            "which the end-effector is shifted at without turning"
-        )
-    if planar:
-        start = planar_start(
-            xy, [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable], [o.members for o in usable]
-        )
-        normal = start.normal
-        usable = [replace(o, matrix=m) for o, m in zip(usable, start.matrices, strict=True)]
-    else:
-        normal = plane_normal([o.matrix for o in usable])
-    candidates = [beam_candidates(o.matrix, normal) for o in usable]
-    chosen = consistent_beams(candidates)
+    check_spots(xy)
+    usable = [
+        replace(o, matrix=spot_matrix(xy[o.members], base_T_ee[o.members, :3, 3] - o.centre_m))
+        for o in usable_orientations(base_T_ee, groups, FEWEST_SHIFTS)
+    ]
+    normal = plane_normal([o.matrix for o in usable])
+    chosen = consistent_beams([beam_candidates(o.matrix, normal) for o in usable])
     cam_R_base = mean_rotation([c.cam_R_base for c in chosen])
     direction = beam_in_hand([c.beam_cam for c in chosen], [o.base_R_ee for o in usable], cam_R_base)
-    point, shift, scales = positions(usable, [c.beam_cam for c in chosen], cam_R_base, direction)
+    point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction)
     distance = plane_distance(usable, scales, normal, base_T_ee)
     if distance < 0.0:
         normal, distance = -normal, -distance
     return LaserSetup(make_transform(cam_R_base, shift), normal, distance, point, direction)
 
 
-def _orientation(xy: Array, base_T_ee: Array, members: NDArray[np.intp]) -> Orientation:
-    shifts = base_T_ee[members, :3, 3]
-    centre = shifts.mean(axis=0)
-    spread = np.linalg.svd(shifts - centre, compute_uv=False)
-    if spread[2] < FLAT * spread[0]:
+def check_spots(xy: Array) -> None:
+    """Refuse ideal image points (n, 2) that lie on one line."""
+    if len(xy) < 3:
+        raise CalibrationError(f"{len(xy)} spot(s); at least {2 * FEWEST_SHIFTS}, better 50")
+    spread = np.linalg.svd(xy - np.median(xy, axis=0), compute_uv=False)
+    if spread[1] < ON_A_LINE * spread[0] or spread[0] < 1e-12:
         raise CalibrationError(
-            "the shifts at one orientation lie in a plane or on a line; shifts along three directions, e.g. x, y and z"
+            "all spots lie on one line in the image: the plane goes through the camera, or the shifts move the spot "
+            "along one line only; a plane seen from above, and shifts that move the spot across the image, too"
         )
-    rotation = Rotation.from_matrix(base_T_ee[members, :3, :3]).mean().as_matrix()
-    return Orientation(members, rotation, centre, spot_matrix(xy[members], shifts - centre))
+
+
+def usable_orientations(
+    base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None, fewest: int = FEWEST_SHIFTS
+) -> list[Orientation]:
+    """Orientations with enough shifts that span space; their matrices are still empty.
+
+    Raises :class:`CalibrationError` for too few of them, and for ones turned about a single axis.
+    """
+    groups = orientation_groups(base_T_ee) if groups is None else groups
+    large = [members for members in groups if len(members) >= fewest]
+    if len(large) < FEWEST_ORIENTATIONS:
+        raise CalibrationError(
+            f"{len(large)} orientation(s) with at least {fewest} spots each, of {len(groups)} in all; at least "
+            f"{FEWEST_ORIENTATIONS}, better five, and at each of them the end-effector is shifted without being turned"
+        )
+    usable = []
+    for members in large:
+        shifts = base_T_ee[members, :3, 3]
+        spread = np.linalg.svd(shifts - shifts.mean(axis=0), compute_uv=False)
+        if spread[2] >= FLAT * spread[0] and spread[0] > 0.0:
+            rotation = mean_rotation(list(base_T_ee[members, :3, :3]))
+            usable.append(Orientation(members, rotation, shifts.mean(axis=0), np.empty((3, 4))))
+    if len(usable) < FEWEST_ORIENTATIONS:
+        raise CalibrationError(
+            f"the shifts lie in a plane or on a line at {len(large) - len(usable)} of {len(large)} orientations; at "
+            f"least {FEWEST_ORIENTATIONS} orientations with shifts along three directions, e.g. x, y and z"
+        )
+    _check_turns(np.stack([o.base_R_ee for o in usable]))
+    return usable
+
+
+def _check_turns(base_R_ee: Array) -> None:
+    """Rotations (M, 3, 3) that leave a direction of the end-effector where it is can't tell how far along it the laser
+    sits: a shift of the base does the same.
+    """
+    turns = (base_R_ee - base_R_ee.mean(axis=0)).reshape(-1, 3)
+    moved = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(base_R_ee))
+    if moved[2] < LEAST_TURN_RAD:
+        raise CalibrationError(
+            f"{len(base_R_ee)} orientations, turned about one axis only: where the laser sits along it stays unknown; "
+            "at least three orientations, turned about at least two axes"
+        )
 
 
 def spot_matrix(xy: Array, shifts_m: Array) -> Array:
@@ -160,7 +196,7 @@ def beam_candidates(matrix: Array, normal: Array) -> tuple[BeamCandidate, BeamCa
     in the plane its eigenvalues are lambda² and lambda² (1 + |v|²), with v along the larger one's axis, of unknown
     sign.  (The print's equation (25) has lost its scale; this is the same with ũᵀ n = 1.)
     """
-    a, b = _plane_axes(normal)
+    a, b = basis(normal)
     plane = np.stack([a, b])
     motion = plane @ matrix[:, :3]
     values, axes = np.linalg.eigh(motion @ motion.T)
@@ -209,27 +245,35 @@ def beam_in_hand(beams_cam: Sequence[Array], base_R_ee: Sequence[Array], cam_R_b
 
 
 def positions(
-    orientations: Sequence[Orientation], beams_cam: Sequence[Array], cam_R_base: Array, direction_ee: Array
+    orientations: Sequence[Orientation],
+    base_T_ee: Array,
+    cam_R_base: Array,
+    direction_ee: Array,
+    *,
+    one_plane: bool = False,
 ) -> tuple[Array, Array, Array]:
     """Step 7, equations (32) and (33): the laser's point (3,) in the end-effector, the base's place (3,) in the camera
     frame, and each orientation's scale (M,), all together:
 
-        u_m x (C_R_B (B_R_E p + t_m) + C_t_B - s_m T_m) = 0
+        u_m x (C_R_B (B_R_E p + t) + C_t_B - s_m H_m [w 1]) = 0
 
-    with T_m the last column of the orientation's matrix, which is the spot of its central pose up to s_m.
+    for every pose of each orientation, t its position and w its shift from the central one.  With ``one_plane`` all
+    matrices have the same scale.  What the matrices say of a spot takes the spot's place, so that wrong spots that had
+    no part in them have none here.
     """
     axes = list(origin_axes(direction_ee))
-    count = len(orientations)
+    count = 1 if one_plane else len(orientations)
     rows, sides = [], []
-    for m, (orientation, _) in enumerate(zip(orientations, beams_cam, strict=True)):
+    for m, (orientation, shifts_m) in enumerate(zip(orientations, _shifts_of(orientations, base_T_ee), strict=True)):
         turned = cam_R_base @ orientation.base_R_ee
         across = np.cross(np.eye(3), turned @ direction_ee)  # u x ..., up to a sign that both sides share
-        block = np.zeros((3, 5 + count))
-        block[:, :2] = across @ turned[:, axes]
-        block[:, 2:5] = across
-        block[:, 5 + m] = -across @ orientation.matrix[:, 3]
-        rows.append(block)
-        sides.append(-across @ (cam_R_base @ orientation.centre_m))
+        spots = np.concatenate([shifts_m, np.ones((len(shifts_m), 1))], axis=1) @ orientation.matrix.T
+        block = np.zeros((len(shifts_m), 3, 5 + count))
+        block[:, :, :2] = across @ turned[:, axes]
+        block[:, :, 2:5] = across
+        block[:, :, 5 + min(m, count - 1)] = -spots @ across.T
+        rows.append(block.reshape(-1, 5 + count))
+        sides.append((-(shifts_m + orientation.centre_m) @ (across @ cam_R_base).T).ravel())
     matrix = np.concatenate(rows)
     sizes = np.linalg.norm(matrix, axis=0)
     singular = np.linalg.svd(matrix / sizes, compute_uv=False)
@@ -241,24 +285,21 @@ def positions(
     solution = np.linalg.lstsq(matrix / sizes, np.concatenate(sides), rcond=None)[0] / sizes
     point = np.zeros(3)
     point[axes] = solution[:2]
-    return point, solution[2:5], solution[5:]
+    scales: Array = np.broadcast_to(solution[5:], (len(orientations),)) if one_plane else solution[5:]
+    return point, solution[2:5], scales
 
 
 def plane_distance(orientations: Sequence[Orientation], scales: Array, normal: Array, base_T_ee: Array) -> float:
     """Step 8, equation (34): the mean of nᵀ p over all spots (m)."""
     distances = []
-    for orientation, scale in zip(orientations, scales, strict=True):
-        shifts = base_T_ee[orientation.members, :3, 3] - orientation.centre_m
+    for orientation, scale, shifts in zip(orientations, scales, _shifts_of(orientations, base_T_ee), strict=True):
         spots = scale * np.concatenate([shifts, np.ones((len(shifts), 1))], axis=1) @ orientation.matrix.T
         distances.append(spots @ normal)
     return float(np.mean(np.concatenate(distances)))
 
 
-def _plane_axes(normal: Array) -> tuple[Array, Array]:
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    a = np.cross(normal, helper)
-    a /= np.linalg.norm(a)
-    return a, np.cross(normal, a)
+def _shifts_of(orientations: Sequence[Orientation], base_T_ee: Array) -> list[Array]:
+    return [base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
 
 
 def _rotation_of(rows: Array, turned: Array) -> Array:

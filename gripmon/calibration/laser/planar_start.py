@@ -28,6 +28,8 @@ SUBSET = 5
 MOST_SUBSETS = 60
 BELIEVED = 0.6
 """Part of an orientation's spots that are believed at first."""
+OUTLIER = 4.0
+"""Residual, in robust standard deviations, beyond which a spot has no part in its orientation's fit."""
 _STEPS = 20
 
 
@@ -74,9 +76,10 @@ class _Group:
 
 
 def planar_start(
-    xy: Array, shifts_m: Sequence[Array], members: Sequence[NDArray[np.intp]], seed: int = 0
+    xy: Array, shifts_m: Sequence[Array], members: Sequence[NDArray[np.intp]], *, robust: bool = True, seed: int = 0
 ) -> PlanarStart:
-    """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3).
+    """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3).  Without
+    ``robust`` all spots are believed.
 
     Raises :class:`CalibrationError` where no plane before the camera explains the spots.
     """
@@ -88,12 +91,18 @@ def planar_start(
     normals = normals[(rays @ normals.T > 0.02).all(axis=0)]
     if not len(normals):
         raise CalibrationError("no plane before the camera carries all spots; spots and camera of one set-up")
-    costs = np.sum([group.trimmed(normals)[0] for group in groups], axis=0)
-    normal = normals[int(costs.argmin())]
-    good = _believed(groups, normal)
-    for _ in range(3):
-        normal = _descend(groups, normal, good, rays)
+    if robust:
+        costs = np.sum([group.trimmed(normals)[0] for group in groups], axis=0)
+        normal = normals[int(costs.argmin())]
         good = _believed(groups, normal)
+    else:
+        good = [np.ones(len(group.rays), dtype=bool) for group in groups]
+        costs = np.array([sum(np.square(g.residuals(n, p)[1]).sum() for g, p in zip(groups, good, strict=True))
+                          for n in normals])  # fmt: skip
+        normal = normals[int(costs.argmin())]
+    for _ in range(3 if robust else 1):
+        normal = _descend(groups, normal, good, rays)
+        good = _consistent(groups, normal, good) if robust else good
     matrices = []
     for group, part in zip(groups, good, strict=True):
         fit, _ = group.residuals(normal, part)
@@ -117,12 +126,23 @@ def _believed(groups: Sequence[_Group], normal: Array) -> list[NDArray[np.bool_]
     # Subsets fit themselves too well: the scale comes from the upper middle of what is believed.
     scale = float(np.quantile(np.concatenate(sizes), BELIEVED)) + 1e-12
     out = []
-    for group, size in zip(groups, sizes, strict=True):
+    for size in sizes:
         part = size <= 2.5 * scale
         if part.sum() < SUBSET:
             part = size <= np.sort(size)[SUBSET - 1]
         out.append(part)
     return out
+
+
+def _consistent(groups: Sequence[_Group], normal: Array, good: Sequence[NDArray[np.bool_]]) -> list[NDArray[np.bool_]]:
+    """Spots near what the fits of the good ones predict, by their median residual over all orientations."""
+    sizes = [np.linalg.norm(g.residuals(normal, part)[1], axis=1) for g, part in zip(groups, good, strict=True)]
+    believed = np.concatenate([size[part] for size, part in zip(sizes, good, strict=True)])
+    unknowns = 8 * len(groups) + 2
+    # A fit takes its unknowns' share of the noise away.
+    left = np.sqrt(max(1.0 - unknowns / (2.0 * len(believed)), 0.1))
+    limit = OUTLIER * float(np.median(believed)) / 1.1774 / left + 1e-12
+    return [size <= limit if (size <= limit).sum() >= SUBSET else part for size, part in zip(sizes, good, strict=True)]
 
 
 def _descend(groups: Sequence[_Group], normal: Array, good: Sequence[NDArray[np.bool_]], rays: Array) -> Array:
@@ -161,8 +181,10 @@ def _half_sphere() -> Array:
     for ring in range(1, RINGS + 1):
         tilt = WIDEST_TILT_RAD * ring / RINGS
         count = max(6, round(2.0 * np.pi * np.sin(tilt) * RINGS / WIDEST_TILT_RAD))
-        for angle in 2.0 * np.pi * np.arange(count) / count:
-            out.append(np.array([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.cos(tilt)]))
+        angle = 2.0 * np.pi * np.arange(count) / count
+        out += list(
+            np.stack([np.sin(tilt) * np.cos(angle), np.sin(tilt) * np.sin(angle), np.full(count, np.cos(tilt))], 1)
+        )
     return np.array(out)
 
 
@@ -170,9 +192,7 @@ def _subsets(design: Array, rng: np.random.Generator) -> NDArray[np.intp]:
     """(b, SUBSET) spots whose shifts span space; drawn at random where there are too many."""
     count = len(design)
     total = list(itertools.combinations(range(count), SUBSET)) if count <= 10 else []
-    drawn = np.array(
-        total or [rng.choice(count, SUBSET, replace=False) for _ in range(4 * MOST_SUBSETS)], dtype=np.intp
-    )
+    drawn = np.array(total, dtype=np.intp) if total else rng.random((4 * MOST_SUBSETS, count)).argsort()[:, :SUBSET]
     spread = np.linalg.svd(design[drawn], compute_uv=False)
     drawn = drawn[spread[:, 3] > 0.1 * spread[:, 0]] if (spread[:, 3] > 0.1 * spread[:, 0]).any() else drawn[:1]
     return drawn[rng.permutation(len(drawn))[:MOST_SUBSETS]]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.geometry import perturb
+from gripmon.geometry import perturb, skew
 from gripmon.records import Array
 
 PARAMETERS = (
@@ -90,7 +90,7 @@ def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
     slopes = np.zeros((len(spots), 3, len(PARAMETERS)))
     slopes[:, :, :3] = project
     # Turning the base turns origin and direction: the spot's lever counts from the camera's end of cam_T_base.
-    slopes[:, :, 3:6] = -project @ _skews(spots - setup.cam_T_base[:3, 3])
+    slopes[:, :, 3:6] = -project @ skew(spots - setup.cam_T_base[:3, 3])
     a, b = basis(n)
     for column, tilt in ((6, a), (7, b)):
         slopes[:, :, column] = -u * ((spots @ tilt) / steep)[:, None]
@@ -102,6 +102,24 @@ def spots_on_plane(setup: LaserSetup, base_T_ee: Array) -> tuple[Array, Array]:
     for column, axis in zip((11, 12), origin_axes(setup.direction_ee), strict=True):
         slopes[:, :, column] = np.einsum("nij,nj->ni", project, cam_R_ee[:, :, axis])
     return spots, slopes
+
+
+def pose_slopes(setup: LaserSetup, base_T_ee: Array) -> Array:
+    """Derivatives (n, 3, 6) of :func:`spots_on_plane` by a perturbation (position, then rotation; base axes) of each
+    sample's own pose: what an arm's inaccuracy does to the spot, camera frame.
+    """
+    origin, u = laser_lines(setup, base_T_ee)
+    steep = u @ setup.normal_cam
+    steep = np.where(np.abs(steep) > 1e-9, steep, np.nan)
+    along = (setup.distance_m - origin @ setup.normal_cam) / steep
+    project = np.eye(3) - u[:, :, None] * setup.normal_cam / steep[:, None, None]
+    cam_R_base = setup.cam_T_base[:3, :3]
+    # The spot's lever about the end-effector's origin, base axes: laser's point and beam together.
+    lever = base_T_ee[:, :3, :3] @ setup.point_ee_m + along[:, None] * (base_T_ee[:, :3, :3] @ setup.direction_ee)
+    slopes = np.empty((len(base_T_ee), 3, 6))
+    slopes[:, :, :3] = project @ cam_R_base
+    slopes[:, :, 3:] = -project @ cam_R_base @ skew(lever)
+    return slopes
 
 
 def spots_on_rays(setup: LaserSetup, xy: Array) -> tuple[Array, Array]:
@@ -136,12 +154,3 @@ def spots_between(setup: LaserSetup, base_T_ee: Array, xy: Array) -> tuple[Array
     flat = origin - u * np.einsum("ni,ni->n", origin, u)[:, None]
     slopes = (flat[:, :2] - 2.0 * depth[:, None] * across[:, :2]) / size[:, None]
     return depth[:, None] * rays, np.linalg.norm(left, axis=1), slopes
-
-
-def _skews(points: Array) -> Array:
-    """(n, 3) -> (n, 3, 3), the matrices of the cross products."""
-    out = np.zeros((len(points), 3, 3))
-    x, y, z = points.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
-    return out

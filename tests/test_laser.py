@@ -1,0 +1,449 @@
+"""The laser-pointer method: its geometry, each step of its closed form, degenerate set-ups by name, its refinement."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from laser_scenes import PAPER_LENS, paper_setup, sampled
+from scipy.spatial.transform import Rotation
+from scipy.stats import f as fisher_f
+
+from gripmon.calibration.laser import closed_form, common_plane
+from gripmon.calibration.laser.planar_start import planar_start
+from gripmon.calibration.laser.refinement import refine
+from gripmon.calibration.laser.setup import (
+    PARAMETERS,
+    LaserSetup,
+    basis,
+    laser_lines,
+    origin_axes,
+    pose_slopes,
+    spots_between,
+    spots_on_plane,
+    spots_on_rays,
+)
+from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
+from gripmon.calibration.lens_models import LensModel
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.geometry import invert, make_transform, perturb, perturbation_between
+
+STEP = 1e-6
+
+
+def scene(seed=1, **options):
+    rng = np.random.default_rng(seed)
+    return sampled(paper_setup(rng), rng, **options)
+
+
+def ideal(data):
+    return data.camera.undistort(data.uv_px)
+
+
+def numeric(function, count, step=STEP):
+    """Central differences of a function of a small change (count,), stacked behind."""
+    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(count)]
+    return np.stack(columns, axis=-1)
+
+
+def sides(setup):
+    """A laser line's moment and direction, which don't depend on which of its points is given."""
+    return np.concatenate([setup.direction_ee, np.cross(setup.point_ee_m, setup.direction_ee)])
+
+
+def assert_same(found, truth, tolerance=1e-9):
+    assert np.abs(found.cam_T_base - truth.cam_T_base).max() < tolerance
+    assert np.abs(found.normal_cam - truth.normal_cam).max() < tolerance
+    assert abs(found.distance_m - truth.distance_m) < tolerance
+    assert np.abs(sides(found) - sides(truth)).max() < tolerance
+
+
+# ---- the three predictions
+
+
+def test_the_three_predictions_meet_in_one_spot_that_lies_on_plane_line_and_ray():
+    data = scene()
+    spots, _ = spots_on_plane(data.truth, data.base_T_ee)
+    assert np.abs(spots @ data.truth.normal_cam - data.truth.distance_m).max() < 1e-12
+    origin, u = laser_lines(data.truth, data.base_T_ee)
+    assert np.abs(np.cross(spots - origin, u)).max() < 1e-12
+    xy = spots[:, :2] / spots[:, 2:]
+    assert np.abs(spots_on_rays(data.truth, xy)[0] - spots).max() < 1e-12
+    between, apart, _ = spots_between(data.truth, data.base_T_ee, xy)
+    assert np.abs(between - spots).max() < 1e-12
+    assert apart.max() < 1e-12
+
+
+def test_a_moved_plane_shows_where_line_and_ray_meet_and_a_moved_camera_in_the_distance_between_them():
+    data = scene()
+    xy = ideal(data)
+    lower = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, data.truth.distance_m + 0.01,
+                       data.truth.point_ee_m, data.truth.direction_ee)  # fmt: skip
+    assert spots_between(lower, data.base_T_ee, xy)[1].max() < 1e-12  # no plane in it
+    moved = data.truth.moved(np.array([0.0, 0.005, 0.0, 0.0, 0.0, 0.0] + [0.0] * 7))
+    assert np.median(spots_between(moved, data.base_T_ee, xy)[1]) > 5e-4
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_jacobians_of_the_predictions_are_those_of_central_differences(seed):
+    data = scene(seed)
+    setup, poses = data.truth, data.base_T_ee
+    slopes = spots_on_plane(setup, poses)[1]
+    assert np.abs(slopes - numeric(lambda d: spots_on_plane(setup.moved(d), poses)[0], 13)).max() < 1e-7
+    by_pose = numeric(lambda d: spots_on_plane(setup, np.stack([perturb(T, d) for T in poses]))[0], 6)
+    assert np.abs(pose_slopes(setup, poses) - by_pose).max() < 1e-7
+    # Off the truth, so that line and ray don't meet.
+    xy = ideal(data) + np.random.default_rng(seed).normal(0.0, 3e-3, data.uv_px.shape)
+    on_rays = numeric(lambda d: spots_on_rays(setup, xy + d)[0], 2)
+    assert np.abs(spots_on_rays(setup, xy)[1] - on_rays).max() < 1e-7
+    depths = numeric(lambda d: spots_between(setup, poses, xy + d)[0][:, 2], 2)
+    assert np.abs(spots_between(setup, poses, xy)[2] - depths).max() < 1e-7 * max(1.0, float(np.abs(depths).max()))
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.1, 0.2, 0.97)])
+def test_a_laser_along_an_axis_has_its_point_in_the_plane_across(direction):
+    unit = np.array(direction) / np.linalg.norm(direction)
+    axes = origin_axes(unit)
+    assert int(np.argmax(np.abs(unit))) not in axes
+    a, b = basis(unit)
+    assert np.allclose(np.cross(a, b), unit)
+
+
+# ---- the closed form as printed, step by step
+
+
+def true_orientations(data):
+    """Orientations with matrices that come from the truth, at scales of their own."""
+    out, scales, rng = [], [], np.random.default_rng(5)
+    setup = data.truth
+    for members in closed_form.orientation_groups(data.base_T_ee):
+        centre = data.base_T_ee[members, :3, 3].mean(axis=0)
+        base_R_ee = data.base_T_ee[members[0], :3, :3]
+        pose = make_transform(base_R_ee, centre)[None]
+        spot, u = spots_on_plane(setup, pose)[0][0], laser_lines(setup, pose)[1][0]
+        motion = (np.eye(3) - np.outer(u, setup.normal_cam) / (u @ setup.normal_cam)) @ setup.cam_T_base[:3, :3]
+        scales.append(rng.uniform(0.3, 3.0))
+        matrix = np.concatenate([motion, spot[:, None]], axis=1) / scales[-1]
+        out.append(closed_form.Orientation(members, base_R_ee, centre, matrix))
+    return out, np.array(scales)
+
+
+def test_orientations_are_found_from_the_poses():
+    data = scene(orientations=6)
+    shuffled = np.random.default_rng(0).permutation(60)
+    groups = closed_form.orientation_groups(data.base_T_ee[shuffled])
+    assert sorted(len(g) for g in groups) == [10] * 6
+    for group in groups:
+        assert len(set(data.group[shuffled[group]])) == 1
+
+
+def test_step_2_the_matrix_of_an_orientation():
+    data = scene()
+    for orientation, _ in zip(*true_orientations(data), strict=True):
+        shifts = data.base_T_ee[orientation.members, :3, 3] - orientation.centre_m
+        found = closed_form.spot_matrix(ideal(data)[orientation.members], shifts)
+        truth = orientation.matrix / np.linalg.norm(orientation.matrix[:, 3])
+        assert np.abs(found - truth).max() < 1e-9 * np.abs(truth).max()
+
+
+def test_step_3_the_plane_normal():
+    data = scene()
+    orientations, _ = true_orientations(data)
+    assert np.abs(closed_form.plane_normal([o.matrix for o in orientations]) - data.truth.normal_cam).max() < 1e-9
+
+
+def test_step_4_one_of_two_beams_is_the_true_one_and_brings_the_rotation():
+    data = scene()
+    orientations, _ = true_orientations(data)
+    for orientation in orientations:
+        u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
+        pair = closed_form.beam_candidates(orientation.matrix, data.truth.normal_cam)
+        right = min(pair, key=lambda c: float(np.abs(np.cross(c.beam_cam, u)).max()))
+        assert np.abs(np.cross(right.beam_cam, u)).max() < 1e-9
+        assert np.abs(right.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
+    chosen = closed_form.consistent_beams(
+        [closed_form.beam_candidates(o.matrix, data.truth.normal_cam) for o in orientations]
+    )
+    assert all(np.abs(c.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9 for c in chosen)
+
+
+def test_step_5_the_mean_rotation():
+    truth = Rotation.random(rng=np.random.default_rng(3))
+    around = [truth * Rotation.from_rotvec(sign * 0.1 * e) for e in np.eye(3) for sign in (1.0, -1.0)]
+    assert np.abs(closed_form.mean_rotation([r.as_matrix() for r in around]) - truth.as_matrix()).max() < 1e-9
+
+
+def test_step_6_the_beam_in_the_hand():
+    data = scene()
+    cam_R_base = data.truth.cam_T_base[:3, :3]
+    rotations = [o.base_R_ee for o in true_orientations(data)[0]]
+    beams = [cam_R_base @ R @ data.truth.direction_ee for R in rotations]
+    found = closed_form.beam_in_hand(beams, rotations, cam_R_base)
+    assert np.abs(found - data.truth.direction_ee).max() < 1e-9
+
+
+def test_steps_7_and_8_positions_scales_and_the_plane_distance():
+    data = scene()
+    orientations, scales = true_orientations(data)
+    point, shift, found = closed_form.positions(
+        orientations, data.base_T_ee, data.truth.cam_T_base[:3, :3], data.truth.direction_ee
+    )
+    assert np.abs(point - data.truth.point_ee_m).max() < 1e-9  # the paper's point lies in the y-z plane, too
+    assert np.abs(shift - data.truth.cam_T_base[:3, 3]).max() < 1e-9
+    assert np.abs(found - scales).max() < 1e-9
+    distance = closed_form.plane_distance(orientations, scales, data.truth.normal_cam, data.base_T_ee)
+    assert abs(distance - data.truth.distance_m) < 1e-9
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("method", [closed_form.solve, common_plane.solve])
+def test_the_whole_closed_form_is_exact_without_noise(method, seed):
+    data = scene(seed, orientations=3 + seed)
+    assert_same(method(ideal(data), data.base_T_ee), data.truth)
+
+
+def test_beams_along_other_axes_choose_another_origin_plane():
+    rng = np.random.default_rng(8)
+    for direction in ([0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]):
+        paper = paper_setup(rng)
+        u = np.array(direction)
+        point = np.array([0.02, -0.03, 0.05]) * (1.0 - u)
+        truth = LaserSetup(paper.cam_T_base, paper.normal_cam, paper.distance_m, point, u)
+        data = sampled(truth, rng)
+        for method in (closed_form.solve, common_plane.solve):
+            assert_same(method(ideal(data), data.base_T_ee), truth)
+
+
+# ---- the better closed form
+
+
+def test_the_common_planes_start_is_exact_and_its_motions_give_rotation_beams_and_distance():
+    data = scene(2)
+    orientations, _ = true_orientations(data)
+    shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
+    start = planar_start(ideal(data), shifts, [o.members for o in orientations])
+    assert np.abs(start.normal - data.truth.normal_cam).max() < 1e-9
+    turn = common_plane.turn_from_motions([m[:, :3] for m in start.matrices], start.normal)
+    assert np.abs(turn.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
+    assert abs(turn.distance_m - data.truth.distance_m) < 1e-9
+    for beam, orientation in zip(turn.beams_cam, orientations, strict=True):
+        u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
+        assert np.abs(np.cross(beam, u)).max() < 1e-9
+
+
+def translation_error(setup, truth):
+    found, right = invert(setup.cam_T_base)[:3, 3], invert(truth.cam_T_base)[:3, 3]
+    return np.linalg.norm(found - right) / np.linalg.norm(right)
+
+
+def test_with_noise_the_common_plane_is_far_better_than_the_printed_closed_form():
+    printed, common = [], []
+    for seed in range(10):
+        data = scene(seed, orientations=9)
+        noisy = data.uv_px + np.random.default_rng(seed).normal(0.0, 0.5, data.uv_px.shape)
+        xy = data.camera.undistort(noisy)
+        printed.append(translation_error(closed_form.solve(xy, data.base_T_ee), data.truth))
+        common.append(translation_error(common_plane.solve(xy, data.base_T_ee, robust=False), data.truth))
+    assert np.mean(common) < 0.5 * np.mean(printed)
+
+
+def test_wrong_spots_that_destroy_the_printed_closed_form_leave_a_start_that_refines_to_the_truth():
+    for seed, share in ((1, 0.05), (2, 0.1), (3, 0.2), (4, 0.3)):
+        data = scene(seed, orientations=9)
+        rng = np.random.default_rng(seed)
+        uv = data.uv_px + rng.normal(0.0, 0.5, data.uv_px.shape)
+        wrong = rng.permutation(len(uv)) < share * len(uv)
+        uv[wrong] += rng.choice([-1.0, 1.0], (wrong.sum(), 2)) * rng.uniform(10.0, 60.0, (wrong.sum(), 2))
+        start = common_plane.solve(data.camera.undistort(uv), data.base_T_ee)
+        found = refine(SpotProblem(data.camera, data.base_T_ee, uv), start)
+        assert not found.used[wrong].any()
+        assert found.used[~wrong].mean() > 0.95
+        assert translation_error(found.setup, data.truth) < 0.01
+        assert 0.4 < found.scale < 0.6
+
+
+# ---- degenerate set-ups, by name
+
+
+def refused(data, poses=None, uv=None):
+    poses = data.base_T_ee if poses is None else poses
+    uv = data.uv_px if uv is None else uv
+    texts = []
+    for method in (closed_form.solve, common_plane.solve):
+        with pytest.raises(CalibrationError) as error:
+            method(data.camera.undistort(uv), poses)
+        texts.append(str(error.value))
+    return texts
+
+
+def replayed(data, poses):
+    """The same set-up with other poses."""
+    uv = data.camera.project(spots_on_plane(data.truth, poses)[0])
+    return poses, uv
+
+
+def test_one_orientation_only():
+    data = scene(orientations=1)
+    for text in refused(data):
+        assert text.startswith("1 orientation(s) with at least 6 spots each, of 1 in all")
+
+
+def test_too_few_spots_at_each_orientation():
+    data = scene(orientations=6)
+    few = np.concatenate([np.flatnonzero(data.group == g)[:5] for g in range(6)])
+    for text in refused(data, data.base_T_ee[few], data.uv_px[few]):
+        assert text.startswith("0 orientation(s)")
+
+
+def test_shifts_in_a_plane():
+    data = scene(orientations=5)
+    poses = data.base_T_ee.copy()
+    for g in range(5):
+        first = poses[data.group == g][0]
+        flat = poses[data.group == g, :3, 3] - first[:3, 3]
+        poses[data.group == g, :3, 3] = first[:3, 3] + flat * [1.0, 1.0, 0.0]
+    for text in refused(data, *replayed(data, poses)):
+        assert text.startswith("the shifts lie in a plane or on a line at 5 of 5 orientations")
+
+
+def test_turned_about_one_axis_only():
+    data = scene(4, orientations=1)
+    first = data.base_T_ee[0]
+    groups = []
+    for angle in (-0.3, -0.15, 0.0, 0.15, 0.3):
+        turn = Rotation.from_rotvec([0.0, angle, 0.0]).as_matrix()
+        groups += [make_transform(turn @ first[:3, :3], pose[:3, 3]) for pose in data.base_T_ee]
+    poses, uv = replayed(data, np.stack(groups))
+    for text in refused(data, poses, uv):
+        assert "turned about one axis only" in text
+
+
+def test_a_plane_through_the_camera_puts_all_spots_on_a_line():
+    rng = np.random.default_rng(3)
+    data = scene(orientations=5)
+    uv = np.stack([np.linspace(50.0, 600.0, 50), 240.0 + 0.2 * np.linspace(50.0, 600.0, 50)], axis=1)
+    uv = uv[rng.permutation(50)]
+    for text in refused(data, uv=uv):
+        assert "all spots lie on one line in the image: the plane goes through the camera" in text
+
+
+def test_a_beam_that_meets_the_plane_at_the_same_angle_everywhere_is_named():
+    normal = np.array([0.0, 0.1, 0.99]) / np.linalg.norm([0.0, 0.1, 0.99])
+    motion = np.eye(3) - np.outer(normal, normal)
+    with pytest.raises(CalibrationError, match="same angle at every orientation"):
+        common_plane.turn_from_motions([motion, motion, motion], normal)
+
+
+def test_poses_the_wrong_way_round_are_refused_or_fit_nothing():
+    data = scene(orientations=5)
+    inverted = np.stack([invert(T) for T in data.base_T_ee])
+    with pytest.raises(CalibrationError):
+        common_plane.solve(ideal(data), inverted)
+
+
+# ---- refinement
+
+
+def noisy(seed, sigma_px=0.5, **options):
+    data = scene(seed, **options)
+    return data, data.uv_px + np.random.default_rng(seed + 1000).normal(0.0, sigma_px, data.uv_px.shape)
+
+
+def test_rows_of_the_problem_are_those_of_central_differences_lens_and_prior_included():
+    data = scene(3)
+    model = LensModel("brown_conrady", 640, 480)
+    values = np.array([543.0, 545.0, 322.0, 238.0, -0.1, 0.02, 1e-3, -5e-4])
+    lens = LensPrior(model, values, (0, 1, 2, 3, 4), np.diag([1.0, 1.0, 2.0, 2.0, 1e-4]))
+    covariance = np.tile([[0.3, 0.1], [0.1, 0.2]], (50, 1, 1))
+    problem = SpotProblem(model.camera(values), data.base_T_ee, data.uv_px, covariance, lens=lens)
+    state = problem.start(data.truth).moved(1e-3 * np.random.default_rng(1).normal(size=18))
+
+    def whitened(change):
+        return problem.linearised(state.moved(change))[1]
+
+    assert np.abs(problem.linearised(state)[0] + numeric(whitened, 18)).max() < 1e-3
+    rows, _ = problem.prior(state)
+    assert np.abs(rows + numeric(lambda d: problem.prior(state.moved(d))[1], 18)).max() < 1e-6
+
+
+def test_refinement_reaches_the_truth_without_noise():
+    data = scene(6)
+    start = data.truth.moved(np.array([0.02, -0.01, 0.02, 0.03, 0.02, -0.02, 0.03, 0.02, 0.02, 0.02, 0.02, 0.01, 0.01]))
+    assert_same(refine(SpotProblem(data.camera, data.base_T_ee, data.uv_px), start).setup, data.truth, 1e-8)
+
+
+def test_errors_are_what_the_covariance_says():
+    inside, normalised = 0, []
+    trials = 120
+    for seed in range(trials):
+        data, uv = noisy(seed, orientations=9)
+        found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
+        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        size = error @ np.linalg.solve(found.covariance[:6, :6], error)
+        normalised.append(size / 6.0)
+        inside += size < 6.0 * fisher_f.ppf(0.95, 6, found.degrees_of_freedom)
+    # 0.95 with a standard error of 0.02: three of them.
+    assert 0.89 <= inside / trials <= 1.0
+    assert 0.8 < np.mean(normalised) < 1.3
+
+
+def test_an_arms_noise_that_is_modelled_makes_the_errors_smaller_and_the_covariance_true():
+    plain, modelled, sizes = [], [], []
+    noise = PoseNoise(position_m=2e-4, rotation_rad=1e-3)
+    for seed in range(40):
+        data = scene(seed, orientations=9, reach_m=(0.05, 0.6))
+        rng = np.random.default_rng(seed + 500)
+        uv = data.uv_px + rng.normal(0.0, 0.1, data.uv_px.shape)
+        root = np.sqrt(noise.covariance().diagonal())
+        poses = np.stack([perturb(T, root * rng.normal(size=6)) for T in data.base_T_ee])
+        pixel = np.tile(0.01 * np.eye(2), (len(uv), 1, 1))
+        without = refine(SpotProblem(data.camera, poses, uv, pixel), data.truth)
+        found = refine(SpotProblem(data.camera, poses, uv, pixel, pose_noise=noise), data.truth)
+        plain.append(perturbation_between(without.setup.cam_T_base, data.truth.cam_T_base))
+        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        modelled.append(error)
+        sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
+        assert 0.7 < found.scale < 1.3  # spots and arm together explain the residuals
+    assert np.sqrt(np.mean(np.square(modelled))) < np.sqrt(np.mean(np.square(plain)))
+    assert 0.7 < np.mean(sizes) < 1.4
+
+
+def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_its_prior_has_a_part_in_it():
+    model = LensModel("brown_conrady", 640, 480)
+    right = np.array([543.0, 543.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])
+    prior = np.diag([16.0, 16.0, 9.0, 9.0])
+    fixed, freed = [], []
+    for seed in range(24):
+        data, uv = noisy(seed, 0.2, orientations=12)
+        believed = right.copy()
+        believed[:4] += np.sqrt(prior.diagonal()) * np.random.default_rng(seed + 50).normal(size=4)
+        lens = LensPrior(model, believed, (0, 1, 2, 3), prior)
+        start = common_plane.solve(model.camera(believed).undistort(uv), data.base_T_ee)
+        for out, found in (
+            (fixed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)),
+            (freed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens), start)),
+        ):
+            error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+            out.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
+        assert found.lens_covariance.shape == (4, 4) and found.covariance.shape == (13, 13)
+        assert (found.lens_covariance.diagonal() <= prior.diagonal() * 1.001).all()
+        assert found.camera.fx_px == pytest.approx(believed[0] + found.lens[0])
+    assert 0.6 < np.mean(freed) < 1.6
+    assert np.mean(fixed) > 5.0
+
+
+def test_what_is_not_determined_is_refused():
+    data = scene(orientations=5)
+    one = data.group == 0
+    with pytest.raises(CalibrationError, match=r"don't tell all|agree with each other"):
+        refine(SpotProblem(data.camera, data.base_T_ee[one], data.uv_px[one]), data.truth)
+    behind = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, -1.0, data.truth.point_ee_m,
+                        data.truth.direction_ee)  # fmt: skip
+    with pytest.raises(CalibrationError, match="before the camera"):
+        refine(SpotProblem(data.camera, data.base_T_ee, data.uv_px), behind)
+
+
+def test_parameters_have_as_many_names_as_the_covariance_has_rows():
+    data, uv = noisy(1)
+    found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
+    assert found.covariance.shape == (len(PARAMETERS), len(PARAMETERS))
+    assert found.camera == PAPER_LENS
