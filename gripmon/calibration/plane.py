@@ -23,6 +23,8 @@ from gripmon.camera import Camera, LensSettings, make_camera
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array
 
+DOUBTED = 1e-3
+"""Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
 _STEP = 0.05
 """Central differences reach so many standard deviations."""
 
@@ -80,9 +82,12 @@ class Coincidence:
 
     ``residuals_m`` (c, 2) on the plate, gripper axes, ``residuals_px`` (c, 2) measured less predicted; ``p_value``: the
     probability of residuals as large by chance, 1 where nothing is left over to test (two known corners leave one
-    equation, four inferred ones three).  ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above
-    the plate) by which the corners, taken alone, leave the plate, with ``apart_sigma`` (3,) and ``apart_p``; None
-    where fewer than four known corners can't tell.  ``plate_xy_m`` (c, 2): the corners in the plate's frame.
+    equation, four inferred ones three).  Below :data:`DOUBTED` the corners' part of the errors is ``enlarged`` by as
+    much as the residuals exceed theirs.
+
+    ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above the plate) by which the corners, taken
+    alone, leave the plate, with ``apart_sigma`` (3,) and ``apart_p``; None where fewer than four known corners can't
+    tell.  ``plate_xy_m`` (c, 2): the corners in the plate's frame.
     """
 
     sighting: Sighting
@@ -94,6 +99,7 @@ class Coincidence:
     residuals_m: Array
     residuals_px: Array
     p_value: float
+    enlarged: float
     tilt_rad: Array | None
     gap_m: float | None
     apart_sigma: Array | None
@@ -136,6 +142,10 @@ def calibrate_plane(
     common += _camera_directions(given, camera, sighting)
     slopes = [_slope(solve, direction) for direction in (*own, *common)]
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
+    size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
+    p_value = float(chi2.sf(size, freedom)) if freedom else 1.0
+    enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
+    motion[:, len(own) - 2 * len(corners.names) : len(own)] *= enlarged
     apart_covariance = apart @ apart.T
     points = found.corners_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3]
     known_apart = found.apart is not None
@@ -148,7 +158,8 @@ def calibrate_plane(
         common=motion[:, len(own) :],
         residuals_m=found.residuals_m,
         residuals_px=corners.uv_px - made.project(points),
-        p_value=chance(found.residuals_m.ravel(), left @ left.T),
+        p_value=p_value,
+        enlarged=enlarged,
         tilt_rad=found.apart[:2] if found.apart is not None else None,
         gap_m=float(found.apart[2]) if found.apart is not None else None,
         apart_sigma=np.sqrt(apart_covariance.diagonal()) if known_apart else None,
@@ -173,12 +184,15 @@ def corners_of(lengths: Array) -> Array:
 
 def chance(values: Array, covariance: Array) -> float:
     """Probability of values as large by their (perhaps singular) covariance; 1 where nothing is free."""
+    size, freedom = _size(values, covariance)
+    return float(chi2.sf(size, freedom)) if freedom else 1.0
+
+
+def _size(values: Array, covariance: Array) -> tuple[float, int]:
+    """Weighted squares, and how many values are free."""
     variances, axes = np.linalg.eigh(covariance)
     free = variances > 1e-6 * max(float(variances.max()), 1e-300)
-    if not free.any():
-        return 1.0
-    size = np.square(axes.T[free] @ values) / variances[free]
-    return float(chi2.sf(size.sum(), int(free.sum())))
+    return float((np.square(axes.T[free] @ values) / variances[free]).sum()), int(free.sum())
 
 
 def _check_count(corners: FingerCorners, known: KnownCorners | None) -> None:
@@ -207,14 +221,14 @@ def _plate_directions(given: _Given, covariance: Array) -> list[_Direction]:
     def changed(change: Array) -> _Given:
         return replace(given, cam_T_plate=perturb(given.cam_T_plate, change))
 
-    return [_along(changed, root) for root in np.linalg.cholesky(covariance).T]
+    return [_along(changed, root) for root in _roots(covariance)]
 
 
 def _corner_directions(given: _Given, corners: FingerCorners) -> list[_Direction]:
     def changed(change: Array) -> _Given:
         return replace(given, uv_px=given.uv_px + change.reshape(-1, 2))
 
-    return [_along(changed, root) for root in np.linalg.cholesky(corners.covariance_px).T]
+    return [_along(changed, root) for root in _roots(corners.covariance_px)]
 
 
 def _camera_directions(given: _Given, camera: GivenCamera, sighting: Sighting) -> list[_Direction]:
@@ -233,11 +247,17 @@ def _camera_directions(given: _Given, camera: GivenCamera, sighting: Sighting) -
             moved[1] *= moved[0] / vector[0]
         return replace(given, camera=model.camera(moved), cam_T_plate=plate_pose(model.settings(moved), sighting)[0])
 
-    # By eigenvectors: a parameter that was hardly free makes the covariance nearly singular.
-    scale = np.sqrt(np.maximum(camera.covariance.diagonal(), 1e-300))
-    variances, axes = np.linalg.eigh(camera.covariance / np.outer(scale, scale))
-    roots = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
-    return [_along(changed, root) for root in roots.T]
+    return [_along(changed, root) for root in _roots(camera.covariance)]
+
+
+def _roots(covariance: Array) -> Array:
+    """(n, n) rows of independent errors, one standard deviation each; by eigenvectors, as corners that share an edge,
+    or parameters that were hardly free, make a covariance nearly singular.
+    """
+    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    variances, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    roots: Array = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
+    return roots.T
 
 
 def _along(changed: Callable[[Array], _Given], root: Array) -> _Direction:

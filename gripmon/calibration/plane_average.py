@@ -9,17 +9,16 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from gripmon.calibration.plane import Coincidence, corners_of, lengths_of
+from gripmon.calibration.plane import DOUBTED, Coincidence, corners_of, lengths_of
 from gripmon.calibration.plane_equations import FEWEST_CORNERS
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array
 
-DOUBTED = 1e-3
-"""Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
 BESIDE_STEPS = 2.0
 """Steps of the pattern beyond the points that were seen from which a corner is said to be off the plate."""
 OTHER_WAY_RAD = np.pi / 2.0
+"""Nobody's rough calibration is off by as much."""
 _ROUNDS = 3
 
 
@@ -143,7 +142,8 @@ def doubts(image: Coincidence, inferred: bool) -> list[str]:
         what = "make no rectangle" if inferred else "don't fit the gripper file"
         out.append(
             f"the corners {what} (probability {image.p_value:.1g}), most of all {names[worst]}, {size_mm:.3f} mm off: "
-            "another jaw opening, another target, a bent finger, or fingertips that don't stand on the plate"
+            "another jaw opening, another target, a bent finger, or fingertips that don't stand on the plate; "
+            f"uncertainty x {image.enlarged:.1f}"
         )
     if image.apart_p is not None and image.apart_p < DOUBTED:
         out.append(_apart_text(image))
@@ -158,8 +158,8 @@ def _apart_text(image: Coincidence) -> str:
     tilt, sigma = np.degrees(image.tilt_rad), np.degrees(image.apart_sigma[:2])
     return (
         f"the fingertips don't stand on the plate (probability {image.apart_p:.1g}): tilted by {tilt[0]:+.2f} +- "
-        f"{sigma[0]:.2f} and {tilt[1]:+.2f} +- {sigma[1]:.2f} degrees about x and y, {1e3 * image.gap_m:+.3f} +- "
-        f"{1e3 * image.apart_sigma[2]:.3f} mm above it"
+        f"{sigma[0]:.2f} and {tilt[1]:+.2f} +- {sigma[1]:.2f} degrees about x and y, {1e3 * abs(image.gap_m):.3f} +- "
+        f"{1e3 * image.apart_sigma[2]:.3f} mm {'above' if image.gap_m > 0.0 else 'below'} it"
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from gripmon.cli import calibrate_intrinsics
+from gripmon.cli import calibrate_intrinsics, calibrate_plane
 
-_METHODS = (calibrate_intrinsics,)
+_METHODS = (calibrate_intrinsics, calibrate_plane)
 
 _DESCRIPTION = """\
 The off-line methods, from images alone.  Each writes a file with residuals, covariance and
@@ -16,6 +16,8 @@ provenance, whole or not at all, and replaces none without --force."""
 _EPILOG = """\
 examples:
   gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
+  gripmon calibrate plane on_plate.png --camera camera.yaml --target circles:8x8:0.008:0.004 \\
+      --gripper gripper.yaml --corners rough.yaml --out hand_eye.yaml
 
 exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why"""
 

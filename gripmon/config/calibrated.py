@@ -36,12 +36,11 @@ def with_sections(path: Path, values: dict[str, Any]) -> tuple[dict[str, Any], C
     values, paths, hand_eye = dict(values), {}, None
     if isinstance(values.get("camera"), str):
         paths["camera"] = _file(path, "camera", values["camera"])
-        values["camera"] = msgspec.to_builtins(read_camera(paths["camera"]).camera)
+        values["camera"] = _as_read(read_camera(paths["camera"]).camera)
     if isinstance(values.get("reference"), str):
         paths["reference"] = _file(path, "reference", values["reference"])
         hand_eye = read_hand_eye(paths["reference"])
-        transform = msgspec.to_builtins(hand_eye.cam_T_grip)
-        values["reference"] = {"cam_T_grip": transform, "covariance": list(hand_eye.covariance)}
+        values["reference"] = {"cam_T_grip": _as_read(hand_eye.cam_T_grip), "covariance": list(hand_eye.covariance)}
     return values, CalibrationFiles(paths, hand_eye)
 
 
@@ -69,6 +68,11 @@ def mismatch(hand_eye: HandEyeCalibration, camera: LensSettings, gripper: Grippe
         wrong = f"is {hand_eye.gripper.name}{same}, the configuration has {gripper.name}"
         return Fault("gripper", wrong, "the hand/eye calibration made with the same gripper file")
     return None
+
+
+def _as_read(value: msgspec.Struct) -> Any:
+    """As it stands in a file, with lists."""
+    return msgspec.json.decode(msgspec.json.encode(value))
 
 
 def _file(path: Path, key: str, name: str) -> Path:

@@ -1,7 +1,17 @@
 """From rough corners in an image to a gripper's measured ones: what the hand/eye calibration on a plate begins with."""
 
 from gripmon.onboarding.measuring import measure_known, measure_outlines
-from gripmon.onboarding.outlines import Outline, inferred_model, outlines_of
+from gripmon.onboarding.onplate import KnownGripper, Look, UnknownGripper
+from gripmon.onboarding.outlines import Outline, outlines_of
 from gripmon.onboarding.rough import RoughCorners
 
-__all__ = ["Outline", "RoughCorners", "inferred_model", "measure_known", "measure_outlines", "outlines_of"]
+__all__ = [
+    "KnownGripper",
+    "Look",
+    "Outline",
+    "RoughCorners",
+    "UnknownGripper",
+    "measure_known",
+    "measure_outlines",
+    "outlines_of",
+]

@@ -41,6 +41,15 @@ def rough_pose(
     contact_m: float,
 ) -> Array:
     """``cam_T_grip`` (4, 4) from rough corners of a known gripper, good to some pixels.  :class:`CalibrationError`."""
+    check_rough(gripper, rough)
+    points_m = gripper.points_grip_m(jaw_opening_m)
+    known = np.array([points_m[gripper.point_ids.index(name)] for name in rough])
+    each = np.tile(np.eye(2) * _ROUGH_PX**2, (len(rough), 1, 1))
+    return stand(camera, cam_T_plate, np.array(list(rough.values()), dtype=float), each, known, contact_m).cam_T_grip
+
+
+def check_rough(gripper: Gripper, rough: Mapping[str, tuple[float, float]]) -> None:
+    """Raise :class:`CalibrationError` for rough corners that the gripper doesn't have, or too few of them."""
     strange = [name for name in rough if name not in gripper.corner_ids]
     if strange:
         raise CalibrationError(
@@ -48,10 +57,6 @@ def rough_pose(
         )
     if len(rough) < FEWEST_CORNERS:
         raise CalibrationError(f"{len(rough)} corner ({', '.join(rough)}); at least {FEWEST_CORNERS}, which lie apart")
-    points_m = gripper.points_grip_m(jaw_opening_m)
-    known = np.array([points_m[gripper.point_ids.index(name)] for name in rough])
-    each = np.tile(np.eye(2) * _ROUGH_PX**2, (len(rough), 1, 1))
-    return stand(camera, cam_T_plate, np.array(list(rough.values()), dtype=float), each, known, contact_m).cam_T_grip
 
 
 def measure_known(
@@ -82,8 +87,13 @@ def measure_known(
         if want and not usable
     }
     taken = corners.usable & named
+    if np.count_nonzero(taken) < FEWEST_CORNERS:
+        reasons = ", ".join(f"{name} {reason}" for name, reason in missing.items()) or "too few were asked for"
+        raise CalibrationError(
+            f"{np.count_nonzero(taken)} corner(s) of the gripper ({reasons}); at least {FEWEST_CORNERS}, that lie apart"
+        )
     lens = block_diag(*found.prediction.corners.d_uv_d_xy[taken])
-    covariance = lens @ corners.joint_covariance_xy(taken) @ lens.T if taken.any() else np.zeros((0, 0))
+    covariance = lens @ corners.joint_covariance_xy(taken) @ lens.T
     names = tuple(name for name, use in zip(gripper.corner_ids, taken, strict=True) if use)
     return FingerCorners(names, corners.uv_px[taken], 0.5 * (covariance + covariance.T)), missing
 

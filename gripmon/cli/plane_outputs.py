@@ -1,0 +1,136 @@
+"""What ``gripmon calibrate plane`` writes and says."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gripmon.calibration.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibration.plane import Coincidence
+from gripmon.calibration.plane_average import PlaneCalibration
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.cli import calibration_files as files
+from gripmon.cli.plane_inputs import Inputs
+from gripmon.corners.taught import gripper_digest
+from gripmon.geometry import to_record
+from gripmon.gripper import Gripper, GripperError, GripperModel
+from gripmon.onboarding import KnownGripper, Look, UnknownGripper
+from gripmon.provenance import Provenance, provenance_of
+
+
+def inferred_gripper(
+    inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, arguments: argparse.Namespace
+) -> Gripper | None:
+    """The gripper that the images show; None if it is known.  Raises :class:`CalibrationError`."""
+    if not isinstance(inputs.method, UnknownGripper):
+        return None
+    model = inputs.method.model(
+        arguments.name, looks, result, arguments.jaw_range, arguments.jaw_opening, _provenance(inputs, arguments)
+    )
+    try:
+        return Gripper(model)
+    except GripperError as error:
+        raise CalibrationError(f"what the corners show is no gripper: {error}") from None
+
+
+def write(inputs: Inputs, result: PlaneCalibration, inferred: Gripper | None, arguments: argparse.Namespace) -> None:
+    """The files, each whole or not at all."""
+    method = inputs.method
+    if inferred is not None:
+        files.write_document(_without_defaults(inferred.model), Path(arguments.gripper_out), "--gripper-out")
+    gripper = method.gripper if isinstance(method, KnownGripper) else inferred
+    assert gripper is not None, "an inferred gripper has been made"
+    opening_m = method.jaw_opening_m if isinstance(method, KnownGripper) else None
+    if opening_m is None and gripper.has_jaw:
+        opening_m = gripper.jaw_nominal_m
+    document = HandEyeCalibration(
+        camera=inputs.camera.lens,
+        gripper=CalibratedGripper(name=gripper.name, sha256=gripper_digest(gripper)),
+        jaw_opening_m=opening_m,
+        cam_T_grip=to_record(result.cam_T_grip),
+        covariance=tuple(result.covariance.ravel().tolist()),
+        residuals=HandEyeResiduals(
+            rms_m=result.rms_m,
+            rms_px=result.rms_px,
+            corners=sum(len(image.corners.names) for image in result.images),
+            images=len(result.images),
+        ),
+        warnings=result.warnings,
+        provenance=_provenance(inputs, arguments),
+    )
+    files.write_document(document, Path(arguments.out))
+
+
+def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, arguments: argparse.Namespace) -> None:
+    """What a person should know; warnings go to stderr."""
+    width = max(len(image.sighting.name) for image in result.images)
+    print(f"{'image':<{width}}  plate points     rms  corners  residual  tilt about x, y          gap")
+    for look in looks:
+        print(_image_line(look.coincidence, width))
+    if inputs.jaw_note is not None:
+        print(f"note: {inputs.jaw_note}")
+    for look in looks:
+        for name, reason in look.missing.items():
+            print(f"note: {look.coincidence.sighting.name}: {name} not measured: {reason}")
+    if result.consistency_p is not None:
+        print(f"the images agree with each other: probability {result.consistency_p:.2g} of differing as much")
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    sigma = np.sqrt(result.covariance.diagonal())
+    x, y, z = (1e3 * result.cam_T_grip[:3, 3]).tolist()
+    sx, sy, sz = (1e3 * sigma[:3]).tolist()
+    print(f"TCP in the camera frame  {x:.3f} {y:.3f} {z:.3f} mm  +- {sx:.4f} {sy:.4f} {sz:.4f} mm")
+    rx, ry, rz = np.degrees(sigma[3:]).tolist()
+    print(f"rotation about x, y, z   +- {rx:.4f} {ry:.4f} {rz:.4f} degrees")
+    if inputs.inferred:
+        print(_lengths_line(result))
+        print(f"written: {arguments.gripper_out}")
+    print(f"written: {arguments.out}")
+
+
+def _image_line(image: Coincidence, width: int) -> str:
+    used, left_out = int(image.plate.used[0].sum()), int((~image.plate.used[0]).sum())
+    points = f"{used}" + (f" (-{left_out})" if left_out else "")
+    residual_mm = 1e3 * float(np.sqrt(np.mean(np.square(image.residuals_m))))
+    apart = ""
+    if image.tilt_rad is not None and image.gap_m is not None:
+        tilt = np.degrees(image.tilt_rad)
+        apart = f"  {tilt[0]:+.3f} {tilt[1]:+.3f} degrees   {1e3 * image.gap_m:+.4f} mm"
+    rms_px, corners = image.plate.rms_px, len(image.corners.names)
+    return f"{image.sighting.name:<{width}}  {points:>12} {rms_px:4.2f} px  {corners:7d} {residual_mm:6.4f} mm{apart}"
+
+
+def _lengths_line(result: PlaneCalibration) -> str:
+    sides = 2e3 * result.corners_m[3, :2]
+    sigma = 1e3 * np.sqrt(result.lengths_covariance.diagonal()[:2])
+    apart, along = (f"{side:.3f} +- {error:.4f} mm" for side, error in zip(sides, sigma, strict=True))
+    return f"fingertips {apart} apart, innermost edges {along} long"
+
+
+def _provenance(inputs: Inputs, arguments: argparse.Namespace) -> Provenance:
+    options: dict[str, Any] = {"--target": arguments.target, "--camera": arguments.camera, "--config": arguments.config}
+    options |= {"--gripper": arguments.gripper, "--infer": arguments.infer, "--jaw-opening": arguments.jaw_opening}
+    if arguments.jaw_range is not None:
+        options["--jaw-range"] = ":".join(f"{end:g}" for end in arguments.jaw_range)
+    if arguments.infer:
+        options |= {"--name": arguments.name, "--gripper-out": arguments.gripper_out}
+    options["--out"] = arguments.out
+    words = [*arguments.images, *(word for name in arguments.corners or [] for word in ("--corners", name))]
+    return provenance_of(files.command_line("plane", words, options), inputs.files)
+
+
+def _without_defaults(model: GripperModel) -> Any:
+    """Without keys that only say what goes without saying."""
+    import msgspec
+
+    out = msgspec.to_builtins(model)
+    out["fingers"] = {
+        name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()
+    }
+    out["edges"] = {name: {"from": edge["from"], "to": edge["to"]} for name, edge in out["edges"].items()}
+    return {key: value for key, value in out.items() if value not in (None, [], ())}
