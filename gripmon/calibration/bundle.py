@@ -26,6 +26,9 @@ BIWEIGHT = 4.685
 """Tukey's constant: 95 % efficiency for normal errors."""
 OUTLIER = 5.0
 """Normalised residual, in robust standard deviations, beyond which a point is left out at the end."""
+STRANGE = 0.5
+"""Part of a view's points that fit, below which it is no view of the same target by the same camera."""
+PARALLEL = float(np.cos(np.radians(3.0)))
 ROUNDS = 12
 """Rounds of weights, and of the offsets of discs' centres, at most."""
 
@@ -79,6 +82,7 @@ class BundleProblem:
             if turn > 0 and np.allclose(parameters, before, rtol=1e-9, atol=1e-12):
                 break
         used = [size <= OUTLIER * scale for size in sizes]
+        self._check_views(used)
         for _ in range(2):
             self._correct_discs(parameters, poses)
             parameters, poses = self._minimise(parameters, poses, [u.astype(float) for u in used])
@@ -107,7 +111,7 @@ class BundleProblem:
 
     def _cost(self, parameters: Array, poses: Sequence[Array], weights: Sequence[Array]) -> float:
         sizes = self._sizes(parameters, poses)
-        return float(sum(np.where(w > 0.0, w * s * s, 0.0).sum() for s, w in zip(sizes, weights, strict=True)))
+        return float(sum((w * np.square(np.where(w > 0.0, s, 0.0))).sum() for s, w in zip(sizes, weights, strict=True)))
 
     def _normal(self, parameters: Array, poses: Sequence[Array], weights: Sequence[Array]) -> tuple[Array, Array]:
         """Normal matrix and right-hand side: p free parameters, then 6 for each view."""
@@ -158,10 +162,21 @@ class BundleProblem:
             parameters, poses, cost, damping = trial, moved, new, max(0.1 * damping, 1e-12)
             if gain <= CONVERGED * cost:
                 return parameters, poses
+        normals = np.stack([T[:3, 2] for T in poses])
+        if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL:
+            raise CalibrationError(DEGENERATE)
         raise CalibrationError(
             f"did not converge in {LARGEST_ITERATIONS} steps; more views, more tilted against each other, or a model "
             "with fewer parameters"
         )
+
+    def _check_views(self, used: Sequence[NDArray[np.bool_]]) -> None:
+        for sighting, good in zip(self._sightings, used, strict=True):
+            if len(used) > 1 and good.mean() < STRANGE:
+                raise CalibrationError(
+                    f"{sighting.name}: {int((~good).sum())} of {len(good)} points contradict the other images; images "
+                    "of one camera and focus, or without this one"
+                )
 
     def _conclude(self, parameters: Array, poses: list[Array], used: list[NDArray[np.bool_]]) -> Bundle:
         weights = [u.astype(float) for u in used]

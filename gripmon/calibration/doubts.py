@@ -26,23 +26,15 @@ LARGE_RMS_SHARE = 0.0007
 """Root mean square residual over the image's width from which it is said to be large; and the one from which no camera
 of the model fits at all."""
 LARGEST_RMS_SHARE = 0.003
-STRANGE = 0.5
-"""Part of a view's points that fit, below which it is no view of the same target by the same camera."""
 
 
-def check_fit(lens_model: LensModel, bundle: Bundle, free: Array, sightings: Sequence[Sighting]) -> None:
+def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
     """Refuse what is no calibration: :class:`CalibrationError`."""
     if bundle.rms_px > LARGEST_RMS_SHARE * lens_model.width_px:
         raise CalibrationError(
             f"no {lens_model.name} camera explains the views: residuals of {bundle.rms_px:.3g} px are left; images of "
             "one camera and focus, the target as it was described, or another model"
         )
-    for sighting, used in zip(sightings, bundle.used, strict=True):
-        if len(sightings) > 1 and used.mean() < STRANGE:
-            raise CalibrationError(
-                f"{sighting.name}: {int((~used).sum())} of {len(used)} points contradict the other images; images of "
-                "one camera and focus: leave it out"
-            )
     moves_focal = np.flatnonzero(free[0])
     if len(moves_focal):
         share = math.sqrt(bundle.covariance[moves_focal[0], moves_focal[0]]) / bundle.parameters[0]

@@ -16,16 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibration.bundle import DEGENERATE, Bundle, BundleProblem
-from gripmon.calibration.doubts import check_fit, doubts_of
+from gripmon.calibration.doubts import USELESS_FOCAL, check_fit, doubts_of
 from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.camera import LensSettings, make_camera
+from gripmon.geometry import log_rotation
 from gripmon.records import Array
 
 FEWEST_POINTS = 8
 """In a view; a plane's pose needs four."""
 FOCAL_STARTS = np.geomspace(0.25, 8.0, 31)
 """Focal lengths over the image's width that are tried: fields of view from 127 to 7 degrees."""
+
+ASSUMED_CENTRE = 0.01
+"""Standard deviation of the principal point about the image's centre, in its widths, where a single view can't tell;
+and that of the aspect about 1."""
+ASSUMED_ASPECT = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,12 +134,44 @@ def calibrate_single_view(
     """Focal length, lens and the plate's pose from one view of a plane, principal point at the image's centre and
     square pixels: what the self-viewing method's off-line step starts with (Tsai's single-view coplanar calibration).
 
-    The plate must be tilted against the image, by 30 degrees or so: parallel to it, focal length and distance are one
-    unknown.  Raises :class:`CalibrationError` then.
+    That the principal point is there is assumed, to :data:`ASSUMED_CENTRE` and :data:`ASSUMED_ASPECT`; the covariances
+    contain what these do to the rest.  The plate must be tilted against the image, by 30 degrees or so: parallel to
+    it, focal length and distance are one unknown.  Raises :class:`CalibrationError` then.
     """
     names = parameter_names(model)
     held = {"cx_px", "cy_px", "aspect"} | set(names[5:])  # one view can't tell more of a lens than one number
-    return calibrate([sighting], model, fixed=fixed | held)
+    result = calibrate([sighting], model, fixed=fixed | held)
+    changes = _assumed(result, sighting, _free(model, fixed | held)[1])
+    parameters, pose = np.stack([c for c, _ in changes], axis=1), np.stack([c for _, c in changes], axis=1)
+    index = [names.index(name) for name in result.parameters]
+    result = replace(
+        result,
+        covariance=result.covariance + parameters[index] @ parameters[index].T,
+        pose_covariance=(result.pose_covariance[0] + pose @ pose.T,),
+    )
+    if "fx_px" in result.parameters and result.covariance[0, 0] > (USELESS_FOCAL * result.camera.fx_px) ** 2:
+        raise CalibrationError(DEGENERATE)
+    return replace(result, warnings=doubts_of(result, [sighting]))
+
+
+def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array) -> list[tuple[Array, Array]]:
+    """What a standard deviation of each assumption changes: all parameters (k,) and the plate's pose (6,)."""
+    lens_model = LensModel(result.model, *sighting.size_px)
+    problem = BundleProblem(lens_model, [sighting], free)
+    at, pose = lens_vector(result.camera), result.cam_T_plate[0]
+    centre_px = ASSUMED_CENTRE * lens_model.width_px
+    out = []
+    for k, change in ((2, centre_px), (3, centre_px), (1, ASSUMED_ASPECT * at[1])):
+        moved = at.copy()
+        moved[k] += change
+        try:
+            bundle = problem.solve(moved, [pose])
+        except CalibrationError:
+            raise CalibrationError(DEGENERATE) from None
+        other = bundle.cam_T_plate[0]
+        turned = log_rotation(other[:3, :3] @ pose[:3, :3].T)
+        out.append((bundle.parameters - at, np.concatenate([other[:3, 3] - pose[:3, 3], turned])))
+    return out
 
 
 def cross_validate(
@@ -227,7 +265,7 @@ def _supported(
     for name in (*reversed(parameter_names(lens_model.name)[5:]), ""):
         names, free = _free(lens_model.name, fixed | set(held))
         bundle = _solve(BundleProblem(lens_model, sightings, free), lens_model, sightings)
-        check_fit(lens_model, bundle, free, sightings)
+        check_fit(lens_model, bundle, free)
         try:
             make_camera(lens_model.settings(bundle.parameters))
             break
@@ -260,19 +298,19 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
     # Where lens and focal length trade places the best start may lead astray: its neighbours get their chance.
     starts.sort(key=lambda start: start[:2])
     best: Bundle | None = None
-    failure = CalibrationError(DEGENERATE)
+    failure: CalibrationError | None = None
     for _, _, parameters, poses in starts[:3]:
         try:
             bundle = problem.solve(parameters, poses)
         except CalibrationError as error:
-            failure = error
+            failure = failure or error
             continue
         if best is None or _merit(bundle) < _merit(best):
             best = bundle
         if best.scale < 1.5:
             break
     if best is None:
-        raise failure
+        raise failure or CalibrationError(DEGENERATE)
     return best
 
 

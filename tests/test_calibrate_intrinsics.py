@@ -1,0 +1,203 @@
+"""What a calibration does with views that aren't the best: outliers, discs, one view, none that helps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from sightings import CAMERAS, PLATE_M, poses, seen
+
+from gripmon.calibration.intrinsics import (
+    calibrate,
+    calibrate_best,
+    calibrate_single_view,
+    cross_validate,
+    lens_vector,
+    plate_pose,
+)
+from gripmon.calibration.lens_models import MODELS
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import PaperLens
+from gripmon.geometry import exp_rotation, log_rotation
+
+BROWN = CAMERAS["brown_conrady"]
+
+
+def normalised(result, settings) -> float:
+    error = lens_vector(result.camera) - lens_vector(settings)
+    return float(error @ np.linalg.solve(result.covariance, error))
+
+
+def test_gross_outliers_are_found_and_change_nothing():
+    rng = np.random.default_rng(1)
+    held = poses(rng, 8)
+    clean = calibrate(seen(BROWN, held, np.random.default_rng(2)), "brown_conrady")
+    views = seen(BROWN, held, np.random.default_rng(2))
+    wrong = [rng.random(len(v)) < 0.08 for v in views]
+    bad = []
+    for view, mask in zip(views, wrong, strict=True):
+        uv = view.uv_px.copy()
+        uv[mask] += rng.uniform(2.0, 40.0, (mask.sum(), 2)) * rng.choice([-1.0, 1.0], (mask.sum(), 2))
+        bad.append(replace(view, uv_px=uv))
+    result = calibrate(bad, "brown_conrady")
+    for used, mask in zip(result.used, wrong, strict=True):
+        assert not (used & mask).any()
+        assert (used | mask).mean() > 0.99
+    moved = lens_vector(result.camera) - lens_vector(clean.camera)
+    assert np.abs(moved / np.sqrt(clean.covariance.diagonal())).max() < 1.5
+
+
+def test_the_offset_of_discs_centres_is_corrected():
+    """With it the errors are what the covariance says; without it they are many times that."""
+    rng, trials = np.random.default_rng(5), 5
+    corrected, plain = [], []
+    for _ in range(trials):
+        views = seen(BROWN, poses(rng, 8), rng, noise_px=0.02, radius_m=0.007)
+        corrected.append(normalised(calibrate(views, "brown_conrady"), BROWN))
+        plain.append(normalised(calibrate([replace(v, disc_radius_m=0.0) for v in views], "brown_conrady"), BROWN))
+    low, high = chi2.ppf([0.001, 0.999], 8 * trials) / trials
+    assert low < np.mean(corrected) < high
+    assert np.mean(plain) > 10.0 * high
+
+
+def test_one_view_gives_focal_length_and_lens():
+    """Cameras whose principal point and aspect are what is assumed only roughly: errors are as large as stated."""
+    rng = np.random.default_rng(8)
+    squares, poses_squares = [], []
+    for turn in rng.uniform(0.0, 2.0 * np.pi, 40):
+        cx, cy, aspect = rng.normal([383.5, 287.5, 1.0], [7.68, 7.68, 1e-3])
+        truth = PaperLens(
+            width_px=768, height_px=576, fx_px=962.0, fy_px=962.0 * aspect, cx_px=cx, cy_px=cy, kappa_per_px2=1.9e-7
+        )
+        T = np.eye(4)
+        T[:3, :3] = exp_rotation(0.55 * np.array([np.cos(turn), np.sin(turn), 0.0]))
+        T[:3, 3] = np.array([0.0, 0.0, 0.25]) - T[:3, :3] @ PLATE_M.mean(axis=0)
+        result = calibrate_single_view(seen(truth, [T], rng, noise_px=0.05)[0])
+        assert result.parameters == ("fx_px", "kappa_per_px2")
+        assert result.camera.fx_px == result.camera.fy_px and result.camera.cx_px == 383.5
+        error = np.array([result.camera.fx_px - 962.0, result.camera.kappa_per_px2 - 1.9e-7])
+        squares.append(float(error @ np.linalg.solve(result.covariance, error)))
+        found = result.cam_T_plate[0]
+        moved = np.concatenate([T[:3, 3] - found[:3, 3], log_rotation(T[:3, :3] @ found[:3, :3].T)])
+        poses_squares.append(float(moved @ np.linalg.solve(result.pose_covariance[0], moved)))
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * len(squares)) / len(squares)
+    assert low < np.mean(squares) < high
+    low, high = chi2.ppf([0.0005, 0.9995], 6 * len(squares)) / len(squares)
+    assert low < np.mean(poses_squares) < high
+
+
+def flat_pose(x: float, y: float, z: float, roll: float = 0.0) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = exp_rotation(np.array([0.0, 0.0, roll]))
+    T[:3, 3] = np.array([x, y, z]) - T[:3, :3] @ PLATE_M.mean(axis=0)
+    return T
+
+
+def test_views_parallel_to_the_image_determine_no_camera():
+    rng = np.random.default_rng(9)
+    held = [flat_pose(0.01 * k - 0.03, 0.0, 0.25 + 0.02 * k, 0.2 * k) for k in range(6)]
+    with pytest.raises(CalibrationError, match=r"don't determine the camera.*tilted by 20 to 45 degrees"):
+        calibrate(seen(BROWN, held, rng), "brown_conrady")
+    with pytest.raises(CalibrationError, match="tilted"):
+        calibrate_single_view(seen(CAMERAS["paper"], held[:1], rng)[0])
+
+
+def test_views_that_support_the_model_badly_are_warned_of():
+    """Two hardly tilted views in the middle of the image: doubts about focal length, lens and reach, each in words."""
+    rng = np.random.default_rng(10)
+    weak = [flat_pose(0.0, 0.0, 0.6), flat_pose(0.01, 0.0, 0.5)]
+    for k, T in enumerate(weak):
+        tilt = exp_rotation(np.array([0.12, 0.1 * k, 0.0]))
+        T[:3, :3] = tilt @ T[:3, :3]
+        T[:3, 3] = np.array([0.0, 0.0, 0.55]) - T[:3, :3] @ PLATE_M.mean(axis=0)
+    said = "\n".join(calibrate(seen(BROWN, weak, rng), "brown_conrady", fixed=frozenset({"cx_px", "cy_px"})).warnings)
+    assert "the focal length is uncertain by" in said
+    assert "not told from 0" in said
+    assert "the lens is extrapolated" in said
+    good = calibrate(seen(BROWN, poses(rng, 14), rng, noise_px=0.03), "brown_conrady")
+    assert good.warnings == ()
+
+
+def test_a_view_by_another_camera_is_named():
+    rng = np.random.default_rng(13)
+    views = seen(BROWN, poses(rng, 9), rng)
+    other = replace(seen(CAMERAS["fisheye"], poses(rng, 1, 0.12), rng)[0], name="stranger.png")
+    with pytest.raises(CalibrationError, match=r"stranger\.png: \d+ of \d+ points contradict the other images"):
+        calibrate([*views[:4], other, *views[4:]], "brown_conrady")
+
+
+def test_views_by_two_cameras_are_refused():
+    rng = np.random.default_rng(14)
+    views = [*seen(BROWN, poses(rng, 5), rng), *seen(CAMERAS["fisheye"], poses(rng, 5, 0.12), rng)]
+    with pytest.raises(CalibrationError, match=r"contradict the other images|explains the views"):
+        calibrate(views, "brown_conrady")
+
+
+def test_views_of_two_sizes_are_refused():
+    rng = np.random.default_rng(15)
+    views = seen(BROWN, poses(rng, 4), rng)
+    views[2] = replace(views[2], size_px=(1280, 960))
+    with pytest.raises(CalibrationError, match="768 x 576 px and view 2 1280 x 960 px; images of one camera"):
+        calibrate(views, "paper")
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_the_criterion_finds_the_model(name: str):
+    rng = np.random.default_rng(16)
+    distance_m = 0.11 if name == "fisheye" else 0.2
+    views = seen(CAMERAS[name], poses(rng, 8, distance_m), rng, noise_px=0.05)
+    best = calibrate_best(views, MODELS)
+    assert best.model == name
+    assert best.criterion is not None and min(best.criterion, key=best.criterion.__getitem__) == name
+    assert len(best.criterion) >= 3
+
+
+def test_cross_validation_measures_what_the_noise_is():
+    rng = np.random.default_rng(17)
+    views = seen(BROWN, poses(rng, 10), rng, noise_px=0.1)
+    steps: list[int] = []
+    crossed = cross_validate(views, "brown_conrady", step=lambda: steps.append(1))
+    # A pose of its own takes 6 of a view's some hundred coordinates.
+    assert crossed == pytest.approx(0.1, rel=0.08) and len(steps) == 5
+    assert crossed > 0.999 * calibrate(views, "brown_conrady").rms_px
+    assert cross_validate(views[:3], "brown_conrady") is None
+
+
+def test_what_is_fixed_stays():
+    rng = np.random.default_rng(18)
+    views = seen(BROWN, poses(rng, 6), rng)
+    fixed = frozenset({"cx_px", "cy_px", "aspect", "coefficients.2", "coefficients.3"})
+    result = calibrate(views, "brown_conrady", fixed=fixed)
+    assert result.parameters == ("fx_px", "coefficients.0", "coefficients.1")
+    camera = result.camera
+    assert (camera.cx_px, camera.cy_px) == (383.5, 287.5) and camera.fx_px == camera.fy_px
+    assert camera.coefficients[2:] == (0.0, 0.0)
+    with pytest.raises(CalibrationError, match=r"focal is no parameter of paper; one of fx_px.* or aspect"):
+        calibrate(views, "paper", fixed=frozenset({"focal"}))
+
+
+def test_terms_that_the_views_do_not_support_are_held_and_said():
+    """Where no point lies the fisheye's highest terms fold the lens over; then they are held."""
+    rng = np.random.default_rng(19)
+    result = calibrate(seen(CAMERAS["fisheye"], poses(rng, 5, 0.3), rng, noise_px=0.3), "fisheye")
+    assert "coefficients.3" not in result.parameters
+    assert result.camera.coefficients[3] == 0.0
+    assert any("held at 0" in w and "coefficients.3" in w for w in result.warnings)
+
+
+def test_too_few_points():
+    rng = np.random.default_rng(20)
+    view = seen(BROWN, poses(rng, 1), rng)[0]
+    few = replace(view, uv_px=view.uv_px[:3], plate_m=view.plate_m[:3], covariance_px=view.covariance_px[:3])
+    with pytest.raises(CalibrationError, match="view 0 shows 3 points; at least 8"):
+        calibrate([few], "paper")
+    with pytest.raises(CalibrationError, match="3 points of the plate; at least 4"):
+        plate_pose(BROWN, few)
+    line = PLATE_M[:, 1] == 0.0
+    flat = replace(view, uv_px=view.uv_px[:9], plate_m=PLATE_M[line], covariance_px=view.covariance_px[:9])
+    with pytest.raises(CalibrationError, match="lie on a line"):
+        plate_pose(BROWN, flat)
+    with pytest.raises(CalibrationError, match="no view shows the target"):
+        calibrate([], "paper")
