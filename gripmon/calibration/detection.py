@@ -13,14 +13,10 @@ from gripmon.calibration import blobs, chequers, symmetry
 from gripmon.calibration.lattice import Index
 from gripmon.calibration.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import Charuco, Chequerboard, CircleGrid, Target
+from gripmon.calibration.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 from gripmon.records import Array, Image
 
 _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
-FEWEST = 9
-"""Points of a lattice without marks, fewer of which could be anything."""
-FEWEST_MARKED = 6
-"""Corners of a marked board: which they are is certain."""
 WINDOW = 0.42
 """Radius of what is looked at about a corner, in squares."""
 TOO_BLURRED = 0.16
@@ -44,11 +40,11 @@ def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
 def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     shown = to_bytes(grey)
     board, corners, ids, marks = _marked_corners(shown, target)
-    if len(ids) < FEWEST_MARKED:
-        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) >= FEWEST_MARKED:
+    if len(ids) < FEWEST["charuco"]:
+        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) >= FEWEST["charuco"]:
             return NotFound("the board is mirrored; an image that isn't flipped")
         blurred = _blurred(grey)
-        return NotFound(blurred or f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST_MARKED}")
+        return NotFound(blurred or f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}")
     plate = np.asarray(board.getChessboardCorners(), np.float64)
     # Marks stand in the white squares, and must not stand in the windows.
     margin = 0.5 * (1.0 - target.marker_m / target.square_m)
@@ -56,7 +52,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     window = np.minimum(WINDOW, 1.3 * margin) * steps - (1.0 if 1.3 * margin < WINDOW else 0.0)
     uv_px, covariance, good = _sharp(grey, corners, window)
     note = _note(int(good.sum()), len(plate))
-    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST_MARKED)
+    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
 
 
 def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
@@ -95,7 +91,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST["chequerboard"])
 
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
@@ -123,7 +119,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     cells = _turned(cells, columns, rows)
     plate = np.concatenate([cells * target.spacing_m, np.zeros((len(cells), 1))], axis=1)
     radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), columns * rows, blur_px)
-    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, radius_m, name, note, FEWEST)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, radius_m, name, note, FEWEST["circles"])
 
 
 def _sighting(

@@ -160,7 +160,7 @@ def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array) -> list[
     problem = BundleProblem(lens_model, [sighting], free)
     at, pose = lens_vector(result.camera), result.cam_T_plate[0]
     centre_px = ASSUMED_CENTRE * lens_model.width_px
-    out = []
+    out: list[tuple[Array, Array]] = []
     for k, change in ((2, centre_px), (3, centre_px), (1, ASSUMED_ASPECT * at[1])):
         moved = at.copy()
         moved[k] += change

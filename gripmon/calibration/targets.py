@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
 _Count = Annotated[int, Meta(ge=2, le=200)]
 _Length = Annotated[float, Meta(gt=0.0, le=2.0)]
-_MARKED = 3.0
-"""A spacing beyond this many metres was meant in millimetres."""
+FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9}
+"""Points that a view must show."""
+_WIDEST = 2.0
+"""A square beyond this many metres was meant in millimetres."""
 
 
 class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="chequerboard"):
@@ -73,9 +75,9 @@ def parse_target(text: str) -> Target:
 
 def checked(fields: dict[str, object], text: str, right: str) -> Target:
     """A target from its fields.  ValueError as :func:`parse_target`'s."""
-    if max((v for k, v in fields.items() if k.endswith("_m") and isinstance(v, float)), default=0.0) > _MARKED:
+    if max((v for k, v in fields.items() if k.endswith("_m") and isinstance(v, float)), default=0.0) > _WIDEST:
         raise ValueError(
-            f"'{text}' is {fields.get('square_m', fields.get('spacing_m'))} m wide (millimetres?); {right}"
+            f"'{text}': {fields.get('square_m', fields.get('spacing_m'))} m between its points (millimetres?); {right}"
         )
     try:
         target: Target = msgspec.convert(fields, Target)
@@ -86,6 +88,13 @@ def checked(fields: dict[str, object], text: str, right: str) -> Target:
     }[str(fields["kind"])]  # fmt: skip
     if isinstance(inner, str) and not getattr(target, inner) < getattr(target, str(outer)):
         raise ValueError(f"'{text}': {inner} is not below {outer}; {right}")
+    columns, rows = (
+        (target.columns, target.rows) if fields["kind"] != "charuco" else (target.columns - 1, target.rows - 1)
+    )
+    if min(columns, rows) < (2 if fields["kind"] == "charuco" else 3) or columns * rows < FEWEST[str(fields["kind"])]:
+        raise ValueError(
+            f"'{text}' has {columns} x {rows} points, too few to tell it from anything else; at least 3 x 3; {right}"
+        )
     return target
 
 
@@ -97,6 +106,3 @@ def name_of(target: Target) -> str:
     if isinstance(target, CircleGrid):
         return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
     return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
-
-
-TargetKind = Literal["chequerboard", "charuco", "circles"]

@@ -66,6 +66,11 @@ def images_of(paths: Sequence[Path]) -> Iterator[tuple[Path, Image]]:
         yield path, image
 
 
+def read_images(paths: Sequence[Path]) -> list[Image]:
+    """All of them at once, as :func:`images_of`."""
+    return [image for _, image in images_of(paths)]
+
+
 def target_of(text: str, option: str = "--target") -> Target:
     """The target of a command line; a fault ends the command with exit code 2."""
     from gripmon.calibration.targets import parse_target
