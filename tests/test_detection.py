@@ -138,7 +138,7 @@ def test_a_small_board_and_a_large_image():
 @pytest.mark.parametrize(
     ("target", "reason"),
     [
-        ("chequerboard:8x5:0.02", r"the target shows (9 x 6|6 x 9) inner corners; it should have 8 x 5"),
+        ("chequerboard:8x5:0.02", r"the target shows 9 x 6 inner corners; it should have 8 x 5"),
         ("chequerboard:7x7:0.02", r"it should have 7 x 7"),
     ],
 )

@@ -96,7 +96,7 @@ def _search(grey: Grey, columns: int, rows: int, spacing_per_diameter: float) ->
                 centres, spreads = centres[left], spreads[left]
             if len(best) == columns * rows:
                 return [best]
-    return [best] if best else others[:1]
+    return [best or max(others, key=len)] if best or others else []
 
 
 def _united(first: tuple[Array, Array], second: tuple[Array, Array]) -> tuple[Array, Array]:

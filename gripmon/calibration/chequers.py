@@ -66,7 +66,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
             candidates, second = candidates[left], second[left]
         if len(best) == columns * rows:
             break
-    return [best] if best else others[:1]
+    return [best or max(others, key=len)] if best or others else []
 
 
 def fits(lattice: dict[Index, tuple[float, float]], columns: int, rows: int) -> bool:

@@ -20,7 +20,9 @@ _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
 WINDOW = 0.42
 """Radius of what is looked at about a corner, in squares."""
 TOO_BLURRED = 0.16
-"""Standard deviation of the edges' blur, in squares or gaps between discs, from which an image isn't measured in."""
+"""Standard deviation of the edges' blur from which an image isn't measured in: in squares; with discs in gaps or radii,
+half as wide.
+"""
 BLURRED_PX = 3.0
 """Standard deviation of the edges' blur that is said."""
 
@@ -107,8 +109,8 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     pairs = [(k, where[c + 1, r]) for (c, r), k in where.items() if (c + 1, r) in where]
     starts = rough[[a for a, _ in pairs]]
     blur_px = edge_blur_px(grey, starts, 0.5 * (starts + rough[[b for _, b in pairs]]))
-    gap = (1.0 - target.diameter_m / target.spacing_m) * float(np.median(_steps(cells, rough)))
-    if blur_px > 2.0 * TOO_BLURRED * gap:
+    share = target.diameter_m / target.spacing_m
+    if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(_steps(cells, rough))):
         return NotFound(_too_blurred(blur_px))
     noise = noise_of(grey)
     first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
@@ -162,7 +164,8 @@ def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str) -> NotFound:
-    seen = cells.max(axis=0) + 1
+    # The longer side first, as the target's.
+    seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
     return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}")
 
 

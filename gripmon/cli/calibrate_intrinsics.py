@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -143,10 +144,10 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
     for name, reason in views.not_found.items():
         print(f"{name}: {reason}", file=sys.stderr)
     if not views.sightings:
-        reasons = set(views.not_found.values())
-        why = f" ({reasons.pop()})" if len(reasons) == 1 else ""
+        (reason, times), *_ = Counter(views.not_found.values()).most_common(1)
+        why = reason if times == len(paths) else f"{times} of them: {reason}"
         count = "the image doesn't show" if len(paths) == 1 else f"none of {len(paths)} images shows"
-        raise common.CommandFailedError(f"calibrate intrinsics: {count} the target{why}")
+        raise common.CommandFailedError(f"calibrate intrinsics: {count} the target ({why})")
     return views
 
 
@@ -176,8 +177,8 @@ def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
     if isinstance(target, Charuco):
         return []
     step_m = getattr(target, "square_m", None) or getattr(target, "spacing_m", 1.0)
-    spans = [s.plate_m[:, :2].max(axis=0) - s.plate_m[:, :2].min(axis=0) for s in sightings]
-    seen = sorted((round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)), reverse=True)
+    spans = [sorted((s.plate_m.max(axis=0) - s.plate_m.min(axis=0))[:2].tolist(), reverse=True) for s in sightings]
+    seen = [round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)]
     if seen[0] < max(target.columns, target.rows) and len(sightings) > 1:
         whole = f"{target.columns} x {target.rows}"
         return [
