@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from gripmon.cli import common, expected
+from gripmon.cli import common, expected, margins, sweep
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -22,12 +22,17 @@ _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and print what the calibration expects
 to see: where the fingertip corners are in the image (px), which of them and which edges are
 visible, how far away the gripper is (mm), how exact one frame will be along each axis, what the
-view can't tell apart (an unknown jaw opening and the distance), and whether its corners suffice
-to calibrate anew."""
+view can't tell apart (an unknown jaw opening and the distance), whether its corners suffice to
+calibrate anew, how far camera and jaws may move until too little is in view.
+
+With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
+anyone drills a hole."""
 
 _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
   gripmon check configs/folder.yaml --json | python3 -m json.tool
+  gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6 --picture sweep.png
+  gripmon check configs/folder.yaml --sweep --fov 40,60,80 --roll 0,90 --at 384,288
 
 exit codes: 0 sound; 2 a fault in the configuration, in a file of Zenoh's that it names, or a package
 that it needs is missing (one line says file, key, what is wrong, what would be right); 3 the
@@ -45,10 +50,14 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("config", metavar="CONFIG", help="configuration file (YAML)")
     parser.add_argument("--json", action="store_true", help="one JSON object instead of text; metres, radians, px")
+    sweep.add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon check``."""
+    if arguments.sweep:
+        return sweep.run(arguments)
+    sweep.refuse_without_sweep(arguments)
     config = common.load(arguments.config)
     report = {**expectation(config), "zenoh": _zenoh_values(config), "source": _source_report(config)}
     print(json.dumps(report, indent=2) if arguments.json else _as_text(report))
@@ -84,6 +93,7 @@ def expectation(config: Config) -> dict[str, Any]:
             {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
         ],
         "accuracy": expected.accuracy(config),
+        "in_view": margins.in_view(config),
         "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
         "recording": settings.recording.directory if settings.recording.enabled else None,
         "metrics": f"http://{metrics.address}:{metrics.port}/metrics" if metrics.enabled else None,
@@ -259,6 +269,7 @@ def _as_text(report: dict[str, Any]) -> str:
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
     lines += [_corner_line(corner) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
+    lines += margins.in_view_lines(report["in_view"])
     lines += [f"{name:<10} {text}" for name, text in outside.items()]
     return "\n".join(lines)
 

@@ -7,6 +7,7 @@ standard deviation: what comes out is the covariance that the geometry gives, wi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,16 +18,14 @@ from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
 from gripmon.corners.uncertainty import Uncertainty
-from gripmon.geometry import from_record
+from gripmon.geometry import from_record, invert
 from gripmon.gripper import Gripper
 from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.outlook.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
 from gripmon.records import Array, Image, ReferenceRecord
 
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
-
-FEWEST_EDGES = 3
-"""Edges that must be seen for a fit to be believed."""
 
 _STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0
 
@@ -57,7 +56,7 @@ class Outlook:
 
     ``covariance`` (6, 6) as it would be published; ``weakest`` (6,) one standard deviation along its least certain
     direction, rotations counted by how far they move the fingertips.  ``edges``: how many can be sampled; with fewer
-    than :data:`FEWEST_EDGES` nothing will be measured.  ``jaw`` is None for a gripper without one.
+    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one.
     """
 
     covariance: Array
@@ -98,8 +97,28 @@ def expect(
     if gripper.has_jaw:
         free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
         jaw = _jaw_outlook(tracker.update(free)[1], free.covariance, lever_m)
-    edges, corners = len(given.prediction.layout.edges), given.corners.usable
+    edges, corners = _edges_seen(given), given.corners.usable
     return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw)
+
+
+class Foreseen(NamedTuple):
+    """Of one frame with a reported opening: ``covariance`` (6, 6) as it would be published, ``usable`` (c,) corners,
+    and the lever, m, by which a turn counts.
+    """
+
+    covariance: Array
+    usable: NDArray[np.bool_]
+    lever_m: float
+
+
+def foresee_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Foreseen:
+    """What a frame at a pose and an opening (nominal if None) gives; only where the view suffices."""
+    gripper, settings = rig.gripper, rig.settings
+    opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+    meter = ForeseeingMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
+    measurement = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
+    covariance = Tracker(rig.camera, gripper, settings, rig.taught).update(measurement)[1]
+    return Foreseen(covariance, measurement.corners.usable, _lever_m(measurement.prediction))
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
@@ -127,6 +146,12 @@ def _jaw_outlook(pose_covariance: Array, covariance: Array, lever_m: float) -> J
     )
 
 
+def _edges_seen(measurement: Measurement) -> int:
+    """Edges of which enough samples are seen."""
+    edge = measurement.prediction.layout.edge[measurement.candidates.sample]
+    return int(np.count_nonzero(np.bincount(edge, minlength=1) >= FEWEST_SAMPLES))
+
+
 def _lever_m(prediction: Prediction) -> float:
     """Root mean square distance of the gripper's corners from the TCP: how far a turn by one radian moves them."""
     levers_m = prediction.corners.cam_m - prediction.cam_T_grip[:3, 3]
@@ -134,7 +159,7 @@ def _lever_m(prediction: Prediction) -> float:
 
 
 class ForeseeingMeter(FingertipMeter):
-    """Looks at no image: finds an edge point on every profile, where it was predicted."""
+    """Looks at no image: finds an edge point on every profile that no other finger hides, where it was predicted."""
 
     def foresee(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
         """What the edge points alone give at a pose and an opening."""
@@ -143,7 +168,10 @@ class ForeseeingMeter(FingertipMeter):
         return self.measure(nothing, cam_T_grip, jaw_opening_m, 1.0, here, jaw_reported)
 
     def _look(self, image: Image, prediction: Prediction) -> Votes:
-        sample = np.flatnonzero(prediction.ok)
+        gripper, eye_grip_m = self._gripper, invert(prediction.cam_T_grip)[:3, 3]
+        points_grip_m = gripper.points_grip_m(prediction.jaw_opening_m)
+        hidden = samples_behind(gripper, prediction.layout, points_grip_m, eye_grip_m)
+        sample = np.flatnonzero(prediction.ok & ~hidden)
         polarity = self._polarity
         step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
         sigma_px, width_px = np.full(len(sample), EDGE_POINT_SIGMA_PX), np.ones(len(sample))

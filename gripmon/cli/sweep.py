@@ -1,0 +1,192 @@
+"""``gripmon check CONFIG --sweep``: what would other camera mounts see?"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common, sweep_table
+from gripmon.cli.margins import rig_of
+
+if TYPE_CHECKING:
+    from gripmon.camera import Camera
+    from gripmon.config import Config
+    from gripmon.outlook import Grid
+
+_MOST_VALUES, _MOST_MOUNTS = 100, 20000
+_NEAREST_M, _FARTHEST_M = 0.005, 5.0
+_DISTANCES, _TILTS_DEG = (0.6, 1.8, 9), "0:75:6"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the sweep's options to the parser of ``check``."""
+    group = parser.add_argument_group(
+        "sweep of camera mounts",
+        "RANGE is FIRST:LAST:COUNT, or single values with commas; write --roll=-90:90:3 where it begins with a minus. "
+        "What isn't given stays as in the configuration, but for distance (0.6 to 1.8 times) and tilt (0 to 75°).",
+    )
+    group.add_argument(
+        "--sweep", action="store_true", help="try other camera mounts, and lenses; the source is left out"
+    )
+    group.add_argument("--distance", metavar="RANGE", help="from the camera's centre to the TCP (m)")
+    group.add_argument(
+        "--tilt",
+        metavar="RANGE",
+        help="of the optical axis against the gripper's z axis (degrees, 0 along the fingers)",
+    )
+    group.add_argument(
+        "--side",
+        metavar="RANGE",
+        help="where the camera sits about the gripper's z axis (degrees; 0 at -y, 90 at +x)",
+    )
+    group.add_argument(
+        "--roll", metavar="RANGE", help="about the optical axis: how far the picture is turned clockwise (degrees)"
+    )
+    lens = group.add_mutually_exclusive_group()
+    lens.add_argument(
+        "--focal", metavar="RANGE", help="focal length, same sensor (px); any but the calibrated one without distortion"
+    )
+    lens.add_argument("--fov", metavar="RANGE", help="the same by the image's width (degrees)")
+    group.add_argument("--at", metavar="U,V", help="where in the image the TCP shows (px; default: where it shows now)")
+    group.add_argument("--picture", metavar="FILE", help="draw the sweep (.png, .jpg)")
+
+
+_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "at", "picture")
+
+
+def refuse_without_sweep(arguments: argparse.Namespace) -> None:
+    """End the command if an option of the sweep stands alone."""
+    for name in _OPTIONS:
+        if getattr(arguments, name) is not None:
+            raise common.CommandFailedError(f"--{name}: only has a meaning for a sweep; add --sweep", common.EXIT_USAGE)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Try the mounts, print the table, draw the picture."""
+    config = common.load(arguments.config, check_source=False, with_taught=False)
+    grid, at_px = _grid(config, arguments)
+    picture = None if arguments.picture is None else Path(arguments.picture)
+    if picture is not None:
+        _check_picture(picture)
+    from gripmon.outlook import Mount, tried, try_mount
+
+    opening_m = config.jaw_opening_m
+    present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m)
+    trials = []
+    with common.progress_bar(len(grid), "mount") as step:
+        for trial in tried(grid, opening_m):
+            trials.append(trial)
+            step()
+    ranked = sorted(trials, key=lambda trial: trial.rank)
+    if arguments.json:
+        print(json.dumps(sweep_table.as_json(config, grid, at_px, present, ranked), indent=2))
+    else:
+        print("\n".join(sweep_table.as_text(config, grid, at_px, present, ranked)))
+    if picture is not None:
+        from gripmon.outlook.picture import draw_sweep
+
+        if not draw_sweep(picture, rig_of(config), grid, present, trials, opening_m):
+            raise common.not_writable(picture, OSError("the image library refused"), "--picture")
+        if not arguments.json:
+            print(f"picture    {picture}")
+    return common.EXIT_DONE
+
+
+def _check_picture(path: Path) -> None:
+    if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise common.CommandFailedError(f"--picture {path}: is no kind of picture; .png or .jpg", common.EXIT_USAGE)
+    common.check_file(path, "--picture")
+
+
+def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
+    from gripmon.outlook import Grid, Mount, towards
+
+    present, rig = Mount.of(config.cam_T_grip), rig_of(config)
+    low, high, count = _DISTANCES
+    default = f"{low * present.distance_m}:{high * present.distance_m}:{count}"
+    distances_m = _values("--distance", arguments.distance or default, _NEAREST_M, _FARTHEST_M, "m")
+    tilts = _values("--tilt", arguments.tilt or _TILTS_DEG, 0.0, 180.0, "degrees")
+    sides = _values("--side", arguments.side, -360.0, 360.0, "degrees") if arguments.side else None
+    rolls = _values("--roll", arguments.roll, -360.0, 360.0, "degrees") if arguments.roll else None
+    cameras = _cameras(config.camera, arguments)
+    at_px = _spot(config, arguments.at)
+    try:
+        directions = tuple(towards(camera, at_px) for camera in cameras)
+    except ValueError as error:
+        raise common.CommandFailedError(f"--at: {error}", common.EXIT_USAGE) from None
+    grid = Grid(
+        distances_m,
+        tuple(math.radians(v) for v in tilts),
+        (present.side_rad,) if sides is None else tuple(math.radians(v) for v in sides),
+        (present.roll_rad,) if rolls is None else tuple(math.radians(v) for v in rolls),
+        tuple(rig._replace(camera=camera) for camera in cameras),
+        directions,
+    )
+    if len(grid) > _MOST_MOUNTS:
+        raise common.CommandFailedError(
+            f"--sweep: {len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", common.EXIT_USAGE
+        )
+    return grid, at_px
+
+
+def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
+    from gripmon.outlook import with_focal
+
+    option, text = ("--fov", arguments.fov) if arguments.fov else ("--focal", arguments.focal)
+    if text is None:
+        return [camera]
+    if option == "--fov":
+        angles = _values(option, text, 1.0, 170.0, "degrees")
+        focals_px = [0.5 * camera.width_px / math.tan(0.5 * math.radians(angle)) for angle in angles]
+    else:
+        focals_px = list(_values(option, text, 1.0, 1e6, "px"))
+    try:
+        return [with_focal(camera, focal_px) for focal_px in focals_px]
+    except ValueError as error:
+        raise common.CommandFailedError(f"{option} {text}: {error}", common.EXIT_USAGE) from None
+
+
+def _spot(config: Config, text: str | None) -> tuple[float, float]:
+    """Where the TCP is to show: as now, or as said."""
+    camera = config.camera
+    right = f"two numbers inside {camera.width_px} x {camera.height_px} px, such as --at {camera.width_px // 2},"
+    right += f"{camera.height_px // 2}"
+    if text is None:
+        (u, v), where = camera.project(config.cam_T_grip[None, :3, 3])[0].tolist(), "the TCP shows now at"
+    else:
+        try:
+            u, v = (float(part) for part in text.split(","))
+        except ValueError:
+            raise common.CommandFailedError(
+                f"--at {text}: is no point of the image; {right}", common.EXIT_USAGE
+            ) from None
+        where = "lies at"
+    if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
+        raise common.CommandFailedError(
+            f"--at: {where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}", common.EXIT_USAGE
+        )
+    return u, v
+
+
+def _values(option: str, text: str, lowest: float, highest: float, unit: str) -> tuple[float, ...]:
+    """The values of a RANGE; a fault ends the command with exit code 2."""
+    right = f"FIRST:LAST:COUNT or values with commas, {lowest:g} to {highest:g} {unit}, at most {_MOST_VALUES}"
+    try:
+        if ":" in text:
+            first, last, number = text.split(":")
+            low, high, count = float(first), float(last), int(number)
+            if not 1 <= count <= _MOST_VALUES or (count == 1 and low != high):
+                raise ValueError
+            values = [low + (high - low) * k / max(count - 1, 1) for k in range(count)]
+        else:
+            values = [float(part) for part in text.split(",")]
+    except ValueError:
+        raise common.CommandFailedError(f"{option} {text}: is no range; {right}", common.EXIT_USAGE) from None
+    wrong = [v for v in values if not lowest <= v <= highest]
+    if wrong or len(values) > _MOST_VALUES:
+        what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
+        raise common.CommandFailedError(f"{option} {text}: {what}; {right}", common.EXIT_USAGE)
+    return tuple(sorted(set(values)))

@@ -1,0 +1,148 @@
+"""What a sweep of camera mounts says: a table for a person, plain values for JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gripmon.camera import Camera
+    from gripmon.config import Config
+    from gripmon.outlook import Grid, Trial
+
+_SHOWN = 8
+_REASONS_SHOWN = 4
+
+
+def as_json(
+    config: Config, grid: Grid, at_px: tuple[float, float], present: Trial, ranked: list[Trial]
+) -> dict[str, Any]:
+    return {
+        "config": str(config.path),
+        "tcp_at_px": list(at_px),
+        "jaw_opening_m": config.jaw_opening_m,
+        "warn_m": config.settings.monitor.policy.warn_m,
+        "limit_m": config.settings.monitor.policy.limit_m,
+        "present": _trial_values(config.camera, present),
+        "mounts": [_trial_values(grid.rigs[trial.lens].camera, trial) for trial in ranked],
+    }
+
+
+def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
+    from gripmon.geometry import to_record
+    from gripmon.outlook import field_of_view_rad, weakest_direction
+
+    transform, covariance = to_record(trial.cam_T_grip), trial.covariance
+    sigma = weakest = None
+    if covariance is not None and trial.lever_m is not None:
+        sigma = [math.sqrt(v) for v in covariance.diagonal().tolist()]
+        weakest = weakest_direction(covariance, trial.lever_m).tolist()
+    smallest = None if trial.smallest is None else trial.smallest.tolist()
+    angle = field_of_view_rad(camera)
+    return {
+        **trial.mount._asdict(),
+        "focal_px": camera.fx_px,
+        "field_of_view_rad": None if math.isnan(angle) else angle,
+        "cam_T_grip": {
+            "translation_m": list(transform.translation_m),
+            "rotation_xyzw": list(transform.rotation_xyzw),
+        },
+        "works": trial.works,
+        "reasons": list(trial.reasons),
+        "corners": trial.sight.corners,
+        "edges": trial.sight.edges,
+        "jaw": {
+            "opening_m": trial.openings_m.tolist(),
+            "corners": trial.corners.tolist(),
+            "edges": trial.edges.tolist(),
+            "share": trial.share,
+        },
+        "sigma": None if sigma is None else {"tcp_m": sigma[:3], "rotation_rad": sigma[3:]},
+        "weakest": None if weakest is None else {"tcp_m": weakest[:3], "rotation_rad": weakest[3:]},
+        "worst_sigma_m": trial.worst_sigma_m,
+        "smallest": None if smallest is None else {"tcp_m": smallest[:3], "rotation_rad": smallest[3:]},
+        "delay_frames": trial.delay_frames,
+        "margin_px": trial.margin_px,
+        # JSON knows no infinity.
+        "shift_m": None if trial.shift_m is None or math.isinf(trial.shift_m) else trial.shift_m,
+    }
+
+
+_COLUMNS = (
+    ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
+    ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 7),
+    ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
+)  # fmt: skip
+
+
+def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Trial, ranked: list[Trial]) -> list[str]:
+    working = sum(trial.works for trial in ranked)
+    warn_mm = 1e3 * config.settings.monitor.policy.warn_m
+    lines = [
+        f"{config.path}: {len(ranked)} mounts tried, {working} would work",
+        f"TCP        at ({at_px[0]:.1f}, {at_px[1]:.1f}) px in all of them",
+        " " * 10 + "".join(title.rjust(width) for title, _, width in _COLUMNS),
+        " " * 10 + "".join(unit.rjust(width) for _, unit, width in _COLUMNS),
+    ]
+    lines += [
+        f"{'best' if k == 0 and trial.works else '':<10}{_row(grid.rigs[trial.lens].camera, trial)}"
+        for k, trial in enumerate(ranked[:_SHOWN])
+    ]
+    place = sum(trial.rank < present.rank for trial in ranked)
+    lines.append(f"{'present':<10}{_row(config.camera, present)}")
+    better = f"{place} of those tried are" if place else "none of those tried is"
+    lines.append(f"           {better} better than the present one")
+    lines += [f"           present: {reason}" for reason in present.reasons]
+    lines += _failing(ranked)
+    lines += [
+        "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
+        "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
+        "           worst opening; notices: the smallest step that is noticed along every axis; in: frames until",
+        f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
+        "           until too little is in view.  Not known here: focus, light, what is in the camera's way.",
+    ]
+    if ranked[0].works:
+        lines += _to_copy(ranked[0])
+    return lines
+
+
+def _row(camera: Camera, trial: Trial) -> str:
+    mount, covariance = trial.mount, trial.covariance
+    angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
+    cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{v:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
+    cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
+    if covariance is not None:
+        cells += [f"{1e3 * math.sqrt(v):.3f}" for v in covariance.diagonal()[:3].tolist()]
+        cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
+        cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
+        cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
+    row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))
+    return row if trial.works else f"{row}  NO: {trial.reasons[0]}"
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return "-" if value is None else f"{factor * value:.{digits}f}"
+
+
+def _failing(ranked: list[Trial]) -> list[str]:
+    """The commonest first reasons."""
+    counts: dict[str, int] = {}
+    for trial in ranked:
+        if trial.kind is not None:
+            counts[trial.kind] = counts.get(trial.kind, 0) + 1
+    commonest = sorted(counts.items(), key=lambda item: -item[1])[:_REASONS_SHOWN]
+    return [
+        f"{'others' if k == 0 else '':<10} {count} would not work: {kind}" for k, (kind, count) in enumerate(commonest)
+    ]
+
+
+def _to_copy(best: Trial) -> list[str]:
+    from gripmon.geometry import to_record
+
+    transform = to_record(best.cam_T_grip)
+    return [
+        "best as    reference:",
+        "             cam_T_grip:",
+        f"               translation_m: [{', '.join(f'{v:.6f}' for v in transform.translation_m)}]",
+        f"               rotation_xyzw: [{', '.join(f'{v:.6f}' for v in transform.rotation_xyzw)}]",
+    ]

@@ -1,0 +1,53 @@
+"""What a calibration may expect before there is any image: how exact a frame will be, what stays in view when the
+camera or the jaws move, and what other camera mounts would see.
+"""
+
+from gripmon.outlook.expected import (
+    EDGE_POINT_SIGMA_PX,
+    ForeseeingMeter,
+    Foreseen,
+    JawOutlook,
+    Outlook,
+    expect,
+    foresee_frame,
+    weakest_direction,
+)
+from gripmon.outlook.jaw_travel import Gap, JawTravel, over_jaw
+from gripmon.outlook.margins import Border, Freedom, border, freedom, moved_camera, sideways_m
+from gripmon.outlook.mounts import Mount, field_of_view_rad, towards, with_focal
+from gripmon.outlook.sweep import Grid, Trial, tried, try_mount
+from gripmon.outlook.visibility import FEWEST_CORNERS, FEWEST_EDGES, Rig, Sight, behind_another_finger, see
+
+__all__ = [
+    "EDGE_POINT_SIGMA_PX",
+    "FEWEST_CORNERS",
+    "FEWEST_EDGES",
+    "Border",
+    "ForeseeingMeter",
+    "Foreseen",
+    "Freedom",
+    "Gap",
+    "Grid",
+    "JawOutlook",
+    "JawTravel",
+    "Mount",
+    "Outlook",
+    "Rig",
+    "Sight",
+    "Trial",
+    "behind_another_finger",
+    "border",
+    "expect",
+    "field_of_view_rad",
+    "foresee_frame",
+    "freedom",
+    "moved_camera",
+    "over_jaw",
+    "see",
+    "sideways_m",
+    "towards",
+    "tried",
+    "try_mount",
+    "weakest_direction",
+    "with_focal",
+]
