@@ -19,7 +19,7 @@ from gripmon.outlook.sweep import Grid, Trial
 from gripmon.outlook.visibility import Rig
 from gripmon.records import Array
 from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, JawScript
+from gripmon.simulator.scenario import Background, FingerLook, JawScript
 
 _WIDTH, _EDGE, _GAP = 1500, 30, 36
 _INK, _FAINT, _PAPER, _MARK = (20, 20, 20), (95, 95, 95), (255, 255, 255), (226, 32, 38)
@@ -28,6 +28,7 @@ _LEFT, _ROW, _BELOW = 50, 46, 46
 _THUMB = 460
 _JPEG_QUALITY = 88
 _STILL = Background(kind="plain", motion="still", boxes=0, cables=0)
+_FINGERS = FingerLook(carriers=False)  # nothing but what the gripper file describes
 
 Colour = tuple[int, int, int]
 
@@ -103,10 +104,10 @@ def _maps(shown: _Slice) -> list[_Map]:
     def of(value: Callable[[Trial], float]) -> Array:
         return np.array([[value(trial) for trial in row] for row in shown.trials], dtype=np.float64)
 
-    noticed = of(lambda t: 1e6 * t.noticed_m if math.isfinite(t.noticed_m) else math.nan)
+    noticed = of(lambda t: 1e3 * t.noticed_m if math.isfinite(t.noticed_m) else math.nan)
     shift = of(lambda t: math.nan if t.shift_m is None or math.isinf(t.shift_m) else 1e3 * t.shift_m)
     return [
-        _Map("smallest step noticed along every axis (µm)", noticed, False, True, 0),
+        _Map("smallest step noticed along every axis (mm)", noticed, False, True, 3),
         _Map("jaw travel with enough in view (%)", of(lambda t: 100.0 * t.share), True, False, 0),
         _Map("the camera may shift sideways by (mm)", shift, True, False, 0),
     ]
@@ -234,7 +235,9 @@ def _look(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Pictures.Image
     """A simulated image with the corners marked: visible ones green, others red."""
     camera, gripper = rig.camera, rig.gripper
     jaw = JawScript(knots=((0.0, jaw_opening_m),)) if gripper.has_jaw and jaw_opening_m is not None else JawScript()
-    image = Simulator(camera, gripper, trial.cam_T_grip, Scenario(background=_STILL, jaw=jaw), 1).render(0)
+    image = Simulator(
+        camera, gripper, trial.cam_T_grip, Scenario(background=_STILL, fingers=_FINGERS, jaw=jaw), 1
+    ).render(0)
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     picture = Pictures.fromarray(grey).convert("RGB")
     scale = _THUMB / picture.width
@@ -257,8 +260,8 @@ def _caption(draw: ImageDraw.ImageDraw, trial: Trial, at: tuple[int, int], width
         f"{trial.sight.corners} corners, {trial.sight.edges} edges; {100.0 * trial.share:.0f} % of the jaw's travel"
     ]
     if trial.covariance is not None:
-        x, y, z = (1e6 * math.sqrt(v) for v in trial.covariance.diagonal()[:3].tolist())
-        lines.append(f"TCP to x {x:.0f}, y {y:.0f}, z {z:.0f} µm; notices steps of {1e6 * trial.noticed_m:.0f} µm")
+        x, y, z = (1e3 * math.sqrt(v) for v in trial.covariance.diagonal()[:3].tolist())
+        lines.append(f"TCP to x {x:.3f}, y {y:.3f}, z {z:.3f} mm; notices steps of {1e3 * trial.noticed_m:.3f} mm")
     if trial.reasons:
         lines += _wrapped(trial.reasons[0], width)
     for k, line in enumerate(lines[:4]):
