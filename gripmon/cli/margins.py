@@ -103,7 +103,7 @@ def _camera_lines(values: dict[str, Any]) -> list[str]:
     )
     lines = [
         f"           it can be measured until the camera shifts along its {shifts} mm",
-        f"           or turns about its {turns}°; each alone, at this opening",
+        f"           or turns about its {turns}°; each alone{', at this opening' * (values['jaw_travel'] is not None)}",
     ]
     known = [
         (amount, f"{sign}{axis}", free["shift_reason"][axis][k])
