@@ -93,3 +93,39 @@ def true_corners(
     points = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     uv = make_camera(lens).project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
     return dict(zip(gripper.corner_ids, uv, strict=True))
+
+
+_OUTLINE = {"inner_near": "in_near", "inner_far": "in_far", "outer_near": "out_near"}
+
+
+def outline_pixels(
+    cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS, jaw_opening_m: float = OPENING_M
+) -> dict[str, np.ndarray]:
+    """Pixels of the two fingertips' outlines in view, by the names for a gripper that isn't known; the true corners'
+    names are those of :func:`true_name`.
+    """
+    gripper, camera = box_gripper(), make_camera(lens)
+    points_m = gripper.points_grip_m(jaw_opening_m)
+    out = {}
+    for finger in ("left", "right"):
+        true = true_corners(cam_T_grip, lens, jaw_opening_m)
+        out |= {f"{finger}_{name}": true[true_name(f"{finger}_{name}")] for name in _OUTLINE}
+        for name, foot in (("rise_far", "in_far"), ("rise_near", "out_near")):
+            point = points_m[gripper.point_ids.index(f"{finger[0].upper()}_{foot}")] - [0.0, 0.0, 0.025]
+            out[f"{finger}_{name}"] = camera.project((cam_T_grip[:3, :3] @ point + cam_T_grip[:3, 3])[None])[0]
+    return out
+
+
+def true_name(name: str) -> str:
+    """``left_inner_near`` is the gripper file's ``L_in_near``."""
+    finger, _, corner = name.partition("_")
+    return f"{finger[0].upper()}_{_OUTLINE[corner]}"
+
+
+def rough(points: dict[str, np.ndarray], seed: int, off_px: float = 5.0) -> dict[str, tuple[float, float]]:
+    """Somebody's guess: up to so many pixels off in u and v."""
+    rng = np.random.default_rng(seed)
+    return {
+        name: (float(u), float(v))
+        for name, (u, v) in ((n, p + rng.uniform(-off_px, off_px, 2)) for n, p in points.items())
+    }
