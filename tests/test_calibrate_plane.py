@@ -191,6 +191,18 @@ def test_nothing_is_replaced_without_force(here: Path, capsys: pytest.CaptureFix
     check_truth(hand_eye(here / "he.yaml"))
 
 
+def test_the_same_as_json(here: Path, capsys: pytest.CaptureFixture[str]):
+    assert plane("p0.png", *INFER, "--corners", "outline.yaml", "--out", "he.yaml", "--json") == 0
+    said = json.loads(capsys.readouterr().out)
+    found = hand_eye(here / "he.yaml")
+    assert said["covariance"] == list(found.covariance) and said["rms_m"] == found.residuals.rms_m
+    assert said["sides_m"] == pytest.approx([0.034, 0.016], abs=1e-4) and said["written"] == ["new.yaml", "he.yaml"]
+    (image,) = said["images"]
+    assert image["corners"]["left_inner_near"]["uv_px"] == pytest.approx(
+        true_corners(TRUE)["L_in_near"].tolist(), abs=0.3
+    )
+
+
 def one(name: str) -> dict[str, object]:
     return {"corners": {name: [241.0, 240.0]}}
 
@@ -201,31 +213,31 @@ def one(name: str) -> dict[str, object]:
         (["p0.png", *KNOWN], 2, "nothing says where the gripper is in the image; --corners FILE.yaml, or --config"),
         (["p0.png", *KNOWN, "--corners", "none.yaml"], 2, "none.yaml: there is no such file"),
         (["p0.png", *KNOWN, "--corners", "camera.yaml"], 2, "camera.yaml: schema: unknown key; one of corners"),
-        (["p0.png", *KNOWN, "--corners", "outline.yaml"], 2, "outline.yaml: corners.left_inner_near: two_box_fingers has no"),
+        (["p0.png", *KNOWN, "--corners", "outline.yaml"], 2, "corners.left_inner_near: two_box_fingers has no"),
         (["p0.png", *KNOWN, "--corners", "one.yaml"], 2, "one.yaml: 1 corner (L_in_near); at least 2, which lie apart"),
         (["p0.png", "p1.png", "empty.png", *KNOWN, *["--corners", "rough.yaml"] * 2], 2, "2 files for 3 images"),
         (["p0.png", "p0.png", *KNOWN, "--corners", "rough.yaml"], 2, "p0.png: is the same image as p0.png"),
         (["small.png", *KNOWN, "--corners", "rough.yaml"], 2, "small.png: 384 x 288 px; the camera's 768 x 576 px"),
         (["rough.yaml", *KNOWN, "--corners", "rough.yaml"], 2, "rough.yaml: "),
         (["empty.png", *KNOWN, "--corners", "rough.yaml"], 3, "empty.png: no lattice of discs in the image"),
-        (["flipped.png", *KNOWN, "--corners", "flipped.yaml"], 3, "flipped.png: the corners are mirrored; an image that"),
+        (["flipped.png", *KNOWN, "--corners", "flipped.yaml"], 3, "flipped.png: the corners are mirrored"),
         (["flipped.png", *INFER, "--corners", "flipped_outline.yaml"], 3, "the innermost corners are mirrored"),
         (["p0.png", *KNOWN, "--infer", "--corners", "rough.yaml"], 2, "not allowed with argument --gripper"),
         (["p0.png", *INFER], 2, "--infer: needs rough corners"),
         (["p0.png", *INFER[:-2], "--corners", "outline.yaml"], 2, "--gripper-out FILE.yaml"),
         (["p0.png", *INFER[:-1], "he.yaml", "--corners", "outline.yaml"], 2, "name the same file twice"),
-        (["p0.png", *INFER, "--corners", "rough.yaml"], 2, "rough.yaml: corners.L_in_near: is no name of a fingertip's"),
-        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0.04:0.06"], 3, "the jaws stand 0.0340 m open"),
-        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "60"], 2, "'60' is no range; MIN:MAX in metres"),
+        (["p0.png", *INFER, "--corners", "rough.yaml"], 2, "corners.L_in_near: is no name of a fingertip's"),
+        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0.04:0.06"], 3, "jaws stand 0.0340 m open"),
+        (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "60"], 2, "'60' is no range; MIN:MAX"),
         (["p0.png", *INFER, "--corners", "outline.yaml", "--jaw-range", "0:60"], 2, "millimetres?"),
         (["p0.png", *KNOWN, "--jaw-range", "0:0.06", "--corners", "rough.yaml"], 2, "--jaw-range: has no effect"),
-        (["p0.png", *KNOWN[:-1], "0.09", "--corners", "rough.yaml"], 2, "--jaw-opening 0.09: the gripper's is 0 to 0.06 m"),
+        (["p0.png", *KNOWN[:-1], "0.09", "--corners", "rough.yaml"], 2, "--jaw-opening 0.09: the gripper's is"),
         (["p0.png", *KNOWN[:-1], "0.05", "--corners", "rough.yaml"], 3, "p0.png: the corners don't fit the gripper"),
         (["p0.png", *KNOWN[2:], "--corners", "rough.yaml"], 2, "the camera isn't said; --camera FILE.yaml"),
         (["p0.png", *KNOWN[:4], "--corners", "rough.yaml"], 2, "the gripper isn't said; --gripper FILE.yaml"),
-        (["p0.png", "--camera", "gripper.yaml", *KNOWN[2:], "--corners", "rough.yaml"], 2, "gripper.yaml: schema: is None"),
+        (["p0.png", "--camera", "gripper.yaml", *KNOWN[2:], "--corners", "rough.yaml"], 2, "gripper.yaml: schema: is"),
         (["p0.png", *KNOWN[:5], "camera.yaml", "--corners", "rough.yaml"], 2, "camera.yaml: schema: unknown key"),
-        (["p0.png", *KNOWN[:2], "--target", "circles:8", *KNOWN[4:], "--corners", "rough.yaml"], 2, "--target: 'circles:8'"),
+        (["p0.png", *KNOWN[:2], "--target", "circles:8", *KNOWN[4:], "--corners", "rough.yaml"], 2, "'circles:8' has"),
     ],
 )  # fmt: skip
 def test_bad_input_is_one_clear_line(

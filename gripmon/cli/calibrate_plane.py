@@ -78,6 +78,7 @@ def add_parser(methods: Any) -> None:
     parser.add_argument("--out", required=True, metavar="FILE.yaml", help="file to write")
     parser.add_argument("--picture", metavar="FILE.png", help="also draw the first image with residuals, enlarged")
     parser.add_argument("--force", action="store_true", help="replace files that are there")
+    parser.add_argument("--json", action="store_true", help="one JSON object instead of text; m, rad, px")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -137,7 +138,10 @@ def _look(method: KnownGripper | UnknownGripper, target: Any, path: Path, image:
     from gripmon.calibration.sighting import CalibrationError, NotFound
     from gripmon.onboarding import KnownGripper
 
-    sight = detect(image, target, str(path))
+    try:
+        sight = detect(image, target, str(path))
+    except ValueError as error:
+        raise common.CommandFailedError(f"--target: {error}", common.EXIT_USAGE) from None
     if isinstance(sight, NotFound):
         raise CalibrationError(sight.reason)
     if isinstance(method, KnownGripper):

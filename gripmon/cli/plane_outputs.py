@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -68,6 +69,11 @@ def write(inputs: Inputs, result: PlaneCalibration, inferred: Gripper | None, ar
 
 def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, arguments: argparse.Namespace) -> None:
     """What a person should know; warnings go to stderr."""
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if arguments.json:
+        print(json.dumps(_values(inputs, looks, result, arguments), indent=2))
+        return
     width = max(len(image.sighting.name) for image in result.images)
     print(f"{'image':<{width}}  plate points     rms  corners  residual  tilt about x, y          gap")
     for look in looks:
@@ -79,8 +85,6 @@ def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, argu
             print(f"note: {look.coincidence.sighting.name}: {name} not measured: {reason}")
     if result.consistency_p is not None:
         print(f"the images agree with each other: probability {result.consistency_p:.2g} of differing as much")
-    for warning in result.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
     sigma = np.sqrt(result.covariance.diagonal())
     x, y, z = (1e3 * result.cam_T_grip[:3, 3]).tolist()
     sx, sy, sz = (1e3 * sigma[:3]).tolist()
@@ -91,6 +95,49 @@ def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, argu
         print(_lengths_line(result))
         print(f"written: {arguments.gripper_out}")
     print(f"written: {arguments.out}")
+
+
+def _values(
+    inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, arguments: argparse.Namespace
+) -> dict[str, Any]:
+    transform = to_record(result.cam_T_grip)
+    out: dict[str, Any] = {
+        "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
+        "covariance": result.covariance.ravel().tolist(),
+        "rms_m": result.rms_m,
+        "rms_px": result.rms_px,
+        "consistency_p": result.consistency_p,
+        "warnings": result.warnings,
+        "images": [_image_values(look) for look in looks],
+        "written": [arguments.gripper_out, arguments.out] if inputs.inferred else [arguments.out],
+    }
+    if inputs.inferred:
+        sigma = np.sqrt(result.lengths_covariance.diagonal()[:2])
+        out["sides_m"] = (2.0 * result.corners_m[3, :2]).tolist()
+        out["sides_sigma_m"] = sigma.tolist()
+    return out
+
+
+def _image_values(look: Look) -> dict[str, Any]:
+    image = look.coincidence
+    sigma_px = np.sqrt(image.corners.covariance_px.diagonal()).reshape(-1, 2)
+    rows = zip(image.corners.names, image.corners.uv_px, sigma_px, image.residuals_m, strict=True)
+    return {
+        "image": image.sighting.name,
+        "plate_points": int(image.plate.used[0].sum()),
+        "plate_points_left_out": int((~image.plate.used[0]).sum()),
+        "plate_rms_px": image.plate.rms_px,
+        "corners": {
+            name: {"uv_px": uv.tolist(), "sigma_px": sigma.tolist(), "residual_m": residual.tolist()}
+            for name, uv, sigma, residual in rows
+        },
+        "missing": look.missing,
+        "residuals_p": image.p_value,
+        "tilt_rad": None if image.tilt_rad is None else image.tilt_rad.tolist(),
+        "gap_m": image.gap_m,
+        "tilt_gap_sigma": None if image.apart_sigma is None else image.apart_sigma.tolist(),
+        "tilt_gap_p": image.apart_p,
+    }
 
 
 def _image_line(image: Coincidence, width: int) -> str:
