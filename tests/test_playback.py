@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -177,3 +179,28 @@ def test_json_lines_are_a_recording_without_images(tmp_path: Path):
     assert [to_json(r) for r in found.records()] == lines(*records)
     assert [a.seq for a in found.alerts] == [40, 90]
     assert found.picture(3) is None and list(found.shots()) == []
+
+
+def test_what_rerun_merged_reads_the_same(run: Run, recording: Recording, tmp_path: Path):
+    """rerun's own tool writes other chunks, in another order, and one ``meta`` for all files."""
+    merged = tmp_path / "merged.rrd"
+    command = [sys.executable, "-m", "rerun", "rrd", "optimize", *map(str, run.files), "-o", str(merged)]
+    subprocess.run(command, check=True, capture_output=True)
+    (found,) = open_recordings([merged]).recordings
+    assert [to_json(r) for r in found.records()] == [to_json(r) for r in run.records]
+    assert np.array_equal(found.image_seqs, recording.image_seqs)
+    assert [shot.blob for shot in found.shots()] == [shot.blob for shot in recording.shots()]
+    assert (found.commands, found.references, found.alerts) == (
+        recording.commands, recording.references, recording.alerts,
+    )  # fmt: skip
+    assert found.faults == ()
+
+
+def test_files_put_one_behind_the_other(run: Run, recording: Recording, tmp_path: Path):
+    joined = tmp_path / "joined.rrd"
+    joined.write_bytes(b"".join(path.read_bytes() for path in run.files))
+    (found,) = open_recordings([joined]).recordings
+    assert [to_json(r) for r in found.records()] == [to_json(r) for r in run.records]
+    assert np.array_equal(found.image_seqs, recording.image_seqs)
+    (fault,) = found.faults
+    assert "its messages were read one by one" in fault

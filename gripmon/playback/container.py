@@ -11,6 +11,7 @@ says which message holds what.
 from __future__ import annotations
 
 import os
+import re
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
@@ -112,20 +113,18 @@ class RrdFile:
         Ends at the file's end or at the first place that is no message, which goes to ``faults``.
         """
         with self.path.open("rb") as file:
-            descriptor = file.fileno()
             begin = end = _FILE_HEADER_BYTES
-            while True:
-                kind, size = _message_at(descriptor, end, self.size)
+            for kind, offset, size in _walk(file.fileno(), self.size):
+                if kind is None or kind == _END or offset != end or end - begin + size > _BLOCK_BYTES:
+                    if end > begin:
+                        yield Span(begin, end - begin)
+                    begin = end = offset
                 if kind is None:
-                    self._say_where_it_ends(end, size)
-                if kind is None or kind == _END:
-                    break
-                if end - begin + size > _BLOCK_BYTES and end > begin:
-                    yield Span(begin, end - begin)
-                    begin = end
-                end += size
-            if end > begin:
-                yield Span(begin, end - begin)
+                    self._say_where_it_ends(offset, damaged=size > 0)
+                elif kind == _END:
+                    begin = end = offset + size
+                else:
+                    end += size
 
     def record_texts(self, store: StoreName, block: Block) -> list[str]:
         """The frames' records in a block."""
@@ -194,19 +193,17 @@ class RrdFile:
     def _find_stores(self, descriptor: int) -> list[StoreName]:
         """The recordings (not layouts) in the file; their introductions come before their first chunks."""
         expected = self._stores_of_footer() if self.has_footer else None
-        offset = _FILE_HEADER_BYTES
         found: list[StoreName] = []
         known = 0
-        while True:
-            kind, size = _message_at(descriptor, offset, self.size)
+        for kind, offset, size in _walk(descriptor, self.size):
             if kind == _STORE_INFO:
                 self._introductions.append(os.pread(descriptor, size, offset))
             elif known < len(self._introductions):
                 known = len(self._introductions)
                 found = self._introduced()
-            if kind is None or kind == _END or (expected and len(found) >= len(expected)):
-                return found
-            offset += size
+            if expected and len(found) >= len(expected):
+                break
+        return found
 
     def _stores_of_footer(self) -> list[StoreName]:
         from rerun.chunk import RrdReader
@@ -231,8 +228,8 @@ class RrdFile:
         self.has_footer = False
         self.faults.append(f"has a footer that can't be used ({_one_line(error)}); its messages were read one by one")
 
-    def _say_where_it_ends(self, offset: int, missing: int) -> None:
-        if missing:
+    def _say_where_it_ends(self, offset: int, damaged: bool) -> None:
+        if damaged:
             self.faults.append(f"is damaged at byte {offset}; the {offset / 1e6:.1f} MB before it were used")
         elif offset < self.size:
             whole = f"its {offset / 1e6:.1f} MB of whole messages were used"
@@ -267,17 +264,30 @@ def _manifest(batch: Any, file_size: int) -> Manifest:
     )
 
 
-def _message_at(descriptor: int, offset: int, file_size: int) -> tuple[int | None, int]:
-    """Kind and whole size of the message at an offset; (None, 0) where the file ends, (None, 1) where none can be."""
-    header = os.pread(descriptor, _MESSAGE.size, offset)
-    if len(header) < _MESSAGE.size:
-        return None, 0
-    kind, size = _MESSAGE.unpack(header)
-    if kind > _BLUEPRINT or size > _LARGEST_MESSAGE_BYTES:
-        return None, 1
-    if offset + _MESSAGE.size + size > file_size:
-        return None, 0
-    return kind, _MESSAGE.size + size
+def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, int]]:
+    """Kind, offset and whole size of every message, also where several files were put one behind the other.
+
+    Where no end is said the last is (None, offset, 0) if the file ends too early, (None, offset, 1) if what stands
+    there can't be a message.
+    """
+    offset = _FILE_HEADER_BYTES
+    while True:
+        header = os.pread(descriptor, _MESSAGE.size, offset)
+        kind, size = _MESSAGE.unpack(header) if len(header) == _MESSAGE.size else (_END, file_size)
+        if kind > _BLUEPRINT or size > _LARGEST_MESSAGE_BYTES:
+            yield None, offset, 1
+            return
+        if offset + _MESSAGE.size + size > file_size:
+            yield None, offset, 0
+            return
+        yield kind, offset, _MESSAGE.size + size
+        offset += _MESSAGE.size + size
+        if kind == _END:
+            behind = os.pread(descriptor, 2 * _FOOTER_BYTES, offset)
+            next_file = re.search(MAGIC + b"(?!FOOT)", behind)
+            if next_file is None:
+                return
+            offset += next_file.start() + _FILE_HEADER_BYTES
 
 
 def _messages(part: bytes) -> Iterator[bytes]:

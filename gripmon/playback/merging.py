@@ -69,6 +69,8 @@ def merge(contents: Sequence[Contents]) -> Merged:
     faults += _gaps(parts, table, rows_block, blocks)
     faults += _backwards(parts, table, rows_block, blocks)
     seqs = [part.image_seqs for part in parts]
+    for part in parts:
+        part.table = part.table.take(slice(0, 0))  # it stands in the run's table now
     return Merged(
         parts=parts,
         meta=meta,
@@ -101,12 +103,15 @@ def _place_in_run(part: Contents) -> tuple[int, int, str]:
 
 
 def _missing_files(parts: Sequence[Contents]) -> list[str]:
-    numbered = [(number, part) for part in parts if (number := _number(part)) is not None]
+    """Numbers that are missing, where frames are missing there, too: files may have been put together."""
+    numbered = [(number, part) for part in parts if (number := _number(part)) is not None and len(part.table)]
     said = []
-    for (before, _), (number, part) in zip([(0, None), *numbered], numbered, strict=False):
-        if number > before + 1:
+    before, last = 0, -1
+    for number, part in numbered:
+        if number > before + 1 and part.table.seq.min() > last + 1:
             which = f"number {number - 1} is" if number == before + 2 else f"numbers {before + 1} to {number - 1} are"
             said.append(f"{part.path}: is file {number} of its run, and {which} not there; the others were used")
+        before, last = number, int(part.table.seq.max())
     return said
 
 

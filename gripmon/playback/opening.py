@@ -110,8 +110,8 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
     ours = [contents for contents in found if contents.is_ours]
     if not ours:
         applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
-        said = "; ".join(["", *file.faults])
-        faults.append(f"{path}: is a recording of {applications} without any frames of gripmon's; not used{said}")
+        what = f"is a recording of the application {applications} that holds nothing of a monitor's"
+        faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))
     return ours
 
 

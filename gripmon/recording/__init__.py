@@ -7,7 +7,8 @@ slow disk ever hold the interpreter that the loop runs in.  The daemon itself ne
 
 from __future__ import annotations
 
-from gripmon.recording.feed import Notes, NullRecorder, ProcessRecorder, Recorder, Trace, open_recorder
+from gripmon.recording.feed import ProcessRecorder, open_recorder
+from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
 from gripmon.recording.settings import RecordingSettings
 
 __all__ = ["Notes", "NullRecorder", "ProcessRecorder", "Recorder", "RecordingSettings", "Trace", "open_recorder"]

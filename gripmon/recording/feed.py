@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import NamedTuple, TypeVar
 
 import msgspec
 
@@ -17,6 +17,7 @@ from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.health import Health
 from gripmon.recording.process import WorkerProcess
+from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import EncodedBatch, Events, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
 from gripmon.records import (
@@ -60,56 +61,7 @@ class _Waiting(NamedTuple):
     due: bool
 
 
-Trace = Callable[[], MeasurementTrace | None]
-Notes = Callable[[], MonitorNotes]
 _T = TypeVar("_T")
-
-
-class Recorder(Protocol):
-    """Takes frames without ever blocking; what it could not take is counted.
-
-    ``dropped`` are frames that are not in the recording, ``failure`` says why nothing is being written, None when all
-    is well.
-    """
-
-    @property
-    def dropped(self) -> int: ...
-    @property
-    def failure(self) -> str | None: ...
-
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
-
-    def alert(self, alert: AlertRecord) -> None: ...
-    def reference(self, reference: ReferenceRecord) -> None: ...
-    def command(self, command: RecordedCommand) -> None: ...
-    def state(self, state: StateRecord) -> None: ...
-    def close(self, timeout_s: float = 2.0) -> None: ...
-
-
-class NullRecorder:
-    """Records nothing."""
-
-    dropped = 0
-    failure: str | None = None
-
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        pass
-
-    def alert(self, alert: AlertRecord) -> None:
-        pass
-
-    def reference(self, reference: ReferenceRecord) -> None:
-        pass
-
-    def command(self, command: RecordedCommand) -> None:
-        pass
-
-    def state(self, state: StateRecord) -> None:
-        pass
-
-    def close(self, timeout_s: float = 2.0) -> None:
-        pass
 
 
 def open_recorder(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import time
@@ -238,7 +239,8 @@ class FileSeries:
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
             del stream
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
             self._fail(f"can't write {path}: {error}")
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
@@ -263,13 +265,11 @@ class FileSeries:
         self._unflushed = 0
         self._leave()
         if file is not None:
-            try:
+            with contextlib.suppress(OSError):  # the same disk; a later start mends it
                 if file.frames == 0:
                     file.path.unlink(missing_ok=True)
                 elif file.path.stat().st_size > file.whole_bytes:
                     os.truncate(file.path, file.whole_bytes)
-            except OSError:
-                pass  # the same disk; a later start mends it
         self._fail(why)
         self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
 
@@ -285,11 +285,9 @@ class FileSeries:
 
     def _mend(self) -> None:
         """Earlier files of this robot and camera, whose writer may have been killed."""
-        try:
+        with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
             for entry in self._budget.recordings():
                 repair(entry.path)
-        except OSError:
-            pass  # what is wrong with the directory is said when the first file begins
 
     def _next_number(self) -> int:
         """Above all that there were: a file that was deleted leaves its number unused.  0: they can't be listed."""

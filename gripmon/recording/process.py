@@ -40,7 +40,8 @@ class WorkerProcess:
             stdout=subprocess.DEVNULL,
             pass_fds=(status_write, ring.descriptor),
             start_new_session=True,
-            env={**os.environ, "RERUN": "on"},
+            # What goes wrong with files is reported; rerun's own lines about it would only repeat it on stderr.
+            env={"RUST_LOG": "off", **os.environ, "RERUN": "on"},
         )
         os.close(status_write)
         assert self._process.stdin is not None

@@ -33,7 +33,10 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
-    RecordingLoop(status_descriptor, memory_descriptor).run()
+    try:
+        RecordingLoop(status_descriptor, memory_descriptor).run()
+    except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
+        raise SystemExit(f"recording process: {type(error).__name__}: {error}") from None
 
 
 class RecordingLoop:

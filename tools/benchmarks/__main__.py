@@ -9,6 +9,7 @@ import sys
 from benchmarks import (
     accuracy,
     causes,
+    correction,
     drift,
     frames_in,
     latency,
@@ -20,7 +21,20 @@ from benchmarks import (
     wire,
 )
 
-_BENCHMARKS = (accuracy, causes, drift, frames_in, latency, recalibration, record, recovery, series, smoothing, wire)
+_BENCHMARKS = (
+    accuracy,
+    causes,
+    correction,
+    drift,
+    frames_in,
+    latency,
+    recalibration,
+    record,
+    recovery,
+    series,
+    smoothing,
+    wire,
+)
 
 
 def main() -> int:

@@ -1,0 +1,147 @@
+"""Where the pose changed within a frame or a few: found from both sides, placed to the frame.
+
+At each place the mean of the frames after is compared with that of those before, over several lengths.  A steady creep
+is taken away (the running median of the differences), and the covariance of the rest is the recording's own, without
+its wildest tenth; where all of it is larger for a while, less counts as surprising.  The threshold keeps the chance of
+one false alarm in an hour's frames at :data:`FALSE_ALARMS_PER_HOUR` for Student's errors.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+from scipy.ndimage import median_filter
+
+from gripmon.records import Array
+
+LENGTHS = (4, 8, 16, 32)
+"""Frames on each side."""
+FALSE_ALARMS_PER_HOUR = 0.02
+FREEDOM = 12.0
+"""Student's degrees of freedom of errors before clutter, on simulated images."""
+CALM = 0.9
+"""Part of the squared differences that is taken for noise, whatever happens in the rest."""
+LOCAL = 48
+"""Neighbouring lengths over which the local size of differences is the median's."""
+LEAST_SQUARE = 4.0
+"""A change is at least so large, squared, in units of what frames claim: a background's passing isn't told from it."""
+SAME = 12
+"""Frames within which there is one change only."""
+LIKELY = 0.95
+
+
+@dataclass(frozen=True)
+class Found:
+    """A change between the frames ``index - 1`` and ``index``; in all probability (:data:`LIKELY`) between the one
+    before ``first`` and ``last``.
+    """
+
+    index: int
+    first: int
+    last: int
+
+
+def threshold(frames_per_hour: float, dof: int = 6) -> float:
+    """For squared distances of ``dof`` numbers."""
+    chance = FALSE_ALARMS_PER_HOUR / max(frames_per_hour, 1.0) / len(LENGTHS)
+    return float(dof * stats.f.isf(chance, dof, FREEDOM))
+
+
+def differences(y: Array, length: int) -> Array:
+    """Means of the ``length`` rows from each place on less those before it (n, a); NaN at the ends."""
+    total = np.concatenate([np.zeros((1, y.shape[1])), np.cumsum(y, axis=0)])
+    out = np.full(y.shape, np.nan)
+    middle = total[length:-length]
+    out[length : len(y) - length + 1] = (total[2 * length :] - 2.0 * middle + total[: -2 * length]) / length
+    return out
+
+
+def surprises(y: Array, length: int) -> Array:
+    """Squared size (n,) of the differences in units of their usual spread; 0 at the ends."""
+    out = np.zeros(len(y))
+    if len(y) < 8 * length:
+        return out
+    inside = slice(length, len(y) - length + 1)
+    moved = differences(y, length)[inside]
+    stride = max(length // 2, 1)
+    # Of a slow creep, which is the same all around; a running median of every few.
+    window = 2 * LOCAL + 1
+    coarse = median_filter(moved[::stride], size=(min(window, len(moved[::stride]) | 1), 1), mode="nearest")
+    moved = moved - np.repeat(coarse, stride, axis=0)[: len(moved)]
+    squared = _mahalanobis(moved)
+    usual = _local_median(squared, stride)
+    out[inside] = squared / np.maximum(usual / np.median(squared), 1.0)
+    return out
+
+
+def _mahalanobis(moved: Array) -> Array:
+    """By the covariance of the calm part, made right for normal numbers."""
+    dof = moved.shape[1]
+    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + 1e-300)
+    for _ in range(6):
+        squared = np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True)
+        calm = squared <= np.quantile(squared, CALM)
+        kept = stats.chi2.cdf(stats.chi2.ppf(CALM, dof), dof + 2) / CALM
+        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept
+    return np.asarray(np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True))
+
+
+def _local_median(squared: Array, stride: int) -> Array:
+    some = squared[::stride]
+    smooth = median_filter(some, size=min(2 * LOCAL + 1, len(some) | 1), mode="nearest")
+    return np.repeat(smooth, stride)[: len(squared)]
+
+
+def find(y: Array, frames_per_hour: float) -> list[Found]:
+    """Changes in the frames ``y`` (n, a), whitened by what they claim."""
+    statistic = np.stack([surprises(y, length) for length in LENGTHS])
+    limit = threshold(frames_per_hour, y.shape[1])
+    found: list[Found] = []
+    for index in _peaks(statistic.max(axis=0), limit):
+        place = _place(y, index, int(LENGTHS[int(statistic[:, index].argmax())]))
+        if place is not None and (not found or place.index - found[-1].index >= SAME // 2):
+            found.append(place)
+    return found
+
+
+def _peaks(statistic: Array, limit: float) -> list[int]:
+    """Highest places first, none near a higher one; in order of time."""
+    left = statistic.copy()
+    above = np.flatnonzero(left > limit)
+    taken: list[int] = []
+    for index in above[np.argsort(-left[above])].tolist():
+        if left[index] > limit:
+            taken.append(index)
+            left[max(index - SAME, 0) : index + SAME] = 0.0
+    return sorted(taken)
+
+
+def _place(y: Array, index: int, length: int) -> Found | None:
+    """The likeliest place within a window's length: both sides have a mean of their own, errors are white."""
+    begin, end = max(index - 2 * length, 0), min(index + 2 * length, len(y))
+    part = y[begin:end]
+    candidates = np.arange(max(index - length, begin + 1), min(index + length, end - 1) + 1) - begin
+    total = np.concatenate([np.zeros((1, y.shape[1])), np.cumsum(part, axis=0)])
+    all_sum, count = total[-1], len(part)
+    # Within-group squares are what is left of the total by the split's between-group ones.
+    spread = _own_noise(part)
+    before, after = total[candidates], all_sum - total[candidates]
+    explained = (before**2 / candidates[:, None] + after**2 / (count - candidates)[:, None]) / spread
+    gain = 0.5 * (explained.sum(axis=1) - explained.sum(axis=1).max())
+    best = int(gain.argmax())
+    probability = np.exp(gain)
+    probability /= probability.sum()
+    low = high = best
+    while probability[low : high + 1].sum() < LIKELY:
+        left = probability[low - 1] if low > 0 else -1.0
+        right = probability[high + 1] if high + 1 < len(candidates) else -1.0
+        low, high = (low - 1, high) if left >= right else (low, high + 1)
+    return Found(*(int(begin + candidates[k]) for k in (best, low, high)))
+
+
+def _own_noise(part: Array) -> Array:
+    """Variance (a,) of frames about their neighbours."""
+    step = np.diff(part, axis=0)
+    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + 1e-9)

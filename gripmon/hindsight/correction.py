@@ -1,0 +1,275 @@
+"""The best transform for every instant of a recording, knowing all of it: before and after.
+
+The pose is a random walk with a rate, cut where it changed at once (:mod:`.changes`); frames measure it with errors
+that are new in each of them, last for half a second, or for as long as a background stays (:mod:`.noise`).  Means of
+blocks of frames are smoothed forwards and backwards (:mod:`.smoother`), on vectors about one pose (:mod:`.chart`), axis
+by axis after whitening by what frames claim.  Quick motion is added from what is left (:mod:`.motion`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.hindsight import changes, chart, motion
+from gripmon.hindsight.blocks import Blocks, Spread, at, held, with_gaps
+from gripmon.hindsight.noise import Shares, learn_shares, likeliest_dynamics
+from gripmon.hindsight.run import Bools, Ints, Run, prepare, wild_frames
+from gripmon.hindsight.smoother import Dynamics, Smoothed, smooth
+from gripmon.records import Array
+
+BLOCK_S = 0.13
+WILD_FREEDOM = 12.0
+"""Student's degrees of freedom of a block's error."""
+SURELY_MOVED = 60.0
+"""Squared size of a change, in units of what frames claim, that no background explains."""
+RAMP_FRAMES = 32
+PASSES = 2
+
+SMOOTHED, FOLLOWED, DISBELIEVED, GAP = range(4)
+SOURCES = ("smoothed", "followed", "disbelieved", "gap")
+"""How an instant's transform came about: smoothed; smoothed and followed the frames' quick motion; smoothed without its
+own frame, which is wrong; no frame there."""
+
+
+@dataclass(frozen=True)
+class ChangePoint:
+    """The pose changed between the frames ``index - 1`` and ``index``, or in a gap before it.
+
+    ``size`` (6,) is the perturbation, m and rad in camera axes, from before to after, ``size_covariance`` (6, 6) that
+    of its error.  In 95 of 100 cases it happened between ``earliest_ns`` and ``latest_ns``.
+    """
+
+    index: int
+    stamp_ns: int
+    earliest_ns: int
+    latest_ns: int
+    size: Array
+    size_covariance: Array
+
+
+@dataclass(frozen=True)
+class Correction:
+    """One row a frame: ``cam_T_grip`` (n, 4, 4), its error's ``covariance`` (n, 6, 6) in the published convention,
+    ``segment`` (n,) between changes, ``source`` (n,) index into :data:`SOURCES`.
+
+    ``learnt``: what the recording shows of its errors, in units of the reported variance.
+    """
+
+    stamp_ns: Ints
+    cam_T_grip: Array
+    covariance: Array
+    segment: Ints
+    source: NDArray[np.int8]
+    change_points: tuple[ChangePoint, ...]
+    learnt: Shares
+    dynamics: Dynamics
+    faults: tuple[str, ...] = ()
+
+
+def correct(
+    stamp_ns: Ints,
+    cam_T_grip: Array,
+    covariance: Array,
+    measured: Bools,
+    progress: Callable[[], None] = lambda: None,
+) -> Correction:
+    """Correct one run: ``stamp_ns`` (n,), transforms (n, 4, 4) and covariances (n, 6, 6) as recorded, and whether each
+    was ``measured`` (n,); what isn't, is not looked at.  ``progress`` is called :data:`STAGES` times.
+
+    ValueError when fewer than :data:`.run.LEAST_FRAMES` frames were measured.
+    """
+    run = prepare(stamp_ns, cam_T_grip, covariance, measured)
+    wild = wild_frames(run)
+    run.usable &= ~wild
+    progress()
+    found = _changes(run)
+    progress()
+    fit = _fit(run, found)
+    kept = [f for f, size in zip(found, _sizes(run, fit), strict=True) if size > changes.LEAST_SQUARE]
+    if len(kept) < len(found):
+        fit = _fit(run, kept)
+    progress()
+    return _conclude(run, fit, stamp_ns, wild)
+
+
+STAGES = 3
+
+
+def _changes(run: Run) -> list[changes.Found]:
+    """In frames' numbers; a gap before a change is part of where it may have happened."""
+    good = np.flatnonzero(run.usable)
+    y = run.y[good]
+    return [
+        changes.Found(*(int(good[k]) for k in (found.index, found.first, found.last)))
+        for found in changes.find(y, 3600.0 / run.frame_s)
+        if _is_sharp(y, found.index)
+    ]
+
+
+def _is_sharp(y: Array, index: int) -> bool:
+    """Whether it is a change at once, rather than the passing over from one background to the next."""
+    half = 2 * RAMP_FRAMES
+    part = y[max(index - half, 0) : index + half]
+    middle = index - max(index - half, 0)
+    place = np.arange(len(part))
+    step = (place >= middle).astype(float)
+    ramps = [
+        np.clip((place - middle - shift * ramp) / ramp + 0.5, 0.0, 1.0)
+        for ramp in (RAMP_FRAMES, 2 * RAMP_FRAMES)
+        for shift in (-0.33, 0.0, 0.33)
+    ]
+    left = [_unexplained(part, law) for law in (step, *ramps)]
+    before, after = part[max(middle - 16, 0) : middle].mean(axis=0), part[middle : middle + 16].mean(axis=0)
+    return left[0] <= min(left[1:]) or float(((after - before) ** 2).sum()) > SURELY_MOVED
+
+
+def _unexplained(part: Array, law: Array) -> float:
+    """Squares that are left of the rows when each axis is a constant and a multiple of the law."""
+    basis = np.stack([np.ones(len(law)), law], axis=1)
+    noise = np.sqrt(np.median(np.diff(part, axis=0) ** 2, axis=0)) + 1e-9
+    scaled = part / noise
+    rest = scaled - basis @ np.linalg.lstsq(basis, scaled, rcond=None)[0]
+    return float((rest * rest).sum())
+
+
+@dataclass
+class _Fit:
+    """Blocks at ``time_s`` (m,) of the ``segment`` (m,), smoothed; what is left of the frames; quick motion."""
+
+    found: list[changes.Found]
+    time_s: Array
+    segment: Ints
+    smoothed: Smoothed
+    shares: Shares
+    dynamics: Dynamics
+    swing: Array
+    quick: Array
+    quick_error: Array
+
+
+def _segments(run: Run, found: list[changes.Found]) -> Ints:
+    out = np.zeros(len(run.y), np.int64)
+    out[[f.index for f in found]] = 1
+    return np.cumsum(out)
+
+
+def _fit(run: Run, found: list[changes.Found]) -> _Fit:
+    segment = _segments(run, found)
+    good = np.flatnonzero(run.usable)
+    swing: Array = np.zeros((len(good), 6))
+    quick: Array = np.zeros((len(good), 6))
+    quick_error: Array = np.zeros_like(quick)
+    extra = np.ones(0)
+    size = int(np.clip(round(BLOCK_S / run.frame_s), 1, 16))
+    for number in range(PASSES + 1):
+        blocks = Blocks(run, good, segment[good], size, run.y[good] - quick, swing)
+        if number == 0:
+            extra = np.ones(len(blocks.time_s))
+        if number < PASSES:
+            trimmed = number > 0 or not found
+            shares = learn_shares(blocks.time_s, blocks.mean, blocks.segment, blocks.frame_variance(), trimmed)
+        variance = blocks.variance(shares.white) * extra[:, None]
+        restarts = np.diff(blocks.segment, prepend=0) > 0
+        if number < PASSES:
+            dynamics = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
+        time_s, where = with_gaps(run, blocks.time_s)
+        full = Spread(where, len(time_s))
+        smoothed = smooth(
+            time_s,
+            full.of(blocks.mean, np.nan),
+            full.of(variance, np.inf),
+            full.of(restarts.astype(float)[:, None], 0.0)[:, 0] > 0.5,
+            dynamics,
+        )
+        block_segment = held(blocks.segment, where, len(time_s))
+        x = at(time_s, block_segment, smoothed, run.time_s[good], segment[good])[0]
+        rest = run.y[good] - x
+        off = (blocks.mean - smoothed.x[where]) ** 2 / (variance + shares.mid + shares.slow)
+        extra = np.maximum((WILD_FREEDOM + off.sum(axis=1)) / (WILD_FREEDOM + 6.0), 1.0)
+        quick, quick_error = motion.vibration(rest)
+        swing = motion.swings(rest - quick, run.claimed[good])
+    return _Fit(found, time_s, block_segment, smoothed, shares, dynamics, swing, quick, quick_error)
+
+
+def _jump(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
+    """x after less before the change (6,), and its variance."""
+    at_s = run.time_s[[fit.found[number].index] * 2]
+    x, variance = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
+    return x[1] - x[0], variance.sum(axis=0)
+
+
+def _sizes(run: Run, fit: _Fit) -> list[float]:
+    return [float((_jump(run, fit, k)[0] ** 2).sum()) for k in range(len(fit.found))]
+
+
+def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
+    segment = _segments(run, fit.found)
+    x, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s, segment)
+    variance = variance + fit.shares.unseen
+    good = np.flatnonzero(run.usable)
+    source = np.full(len(x), GAP, np.int8)
+    source[good], source[wild] = SMOOTHED, DISBELIEVED
+    # Quick motion: a vibration as the spectrum has it, a swing as far as frames scatter more than usual.
+    frame = (fit.shares.frame + fit.shares.white + fit.shares.mid) * run.claimed[good]
+    follow = fit.swing / (fit.swing + frame)
+    rest = run.y[good] - x[good] - fit.quick
+    x[good] += fit.quick + follow * rest
+    variance[good] += fit.quick_error + (1.0 - follow) ** 2 * fit.swing + follow**2 * frame
+    source[good[(follow > 0.5).any(axis=1)]] = FOLLOWED
+    spread = variance[:, :, None] * np.eye(6)
+    points = []
+    for k, found in enumerate(fit.found):
+        points.append(_point(run, fit, k, stamp_ns))
+        _unsure_in_gap(run, fit, k, found, x, spread)
+    vectors = x @ run.root.T
+    covariance = np.einsum("ij,njk,lk->nil", run.root, spread, run.root, optimize=True)
+    poses = chart.to_poses(run.origin_T, vectors)
+    covariance = chart.covariances_to_poses(covariance, vectors)
+    return Correction(
+        np.asarray(stamp_ns, np.int64),
+        poses,
+        0.5 * (covariance + np.swapaxes(covariance, -1, -2)),
+        segment,
+        source,
+        tuple(points),
+        fit.shares,
+        fit.dynamics,
+        tuple(run.faults),
+    )
+
+
+def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: changes.Found, x: Array, spread: Array) -> None:
+    """Where nothing was measured before a change it may have happened at any moment, all alike probable."""
+    before = np.flatnonzero(run.usable[: found.index])[-1]
+    gap = np.arange(before + 1, found.index)
+    if not len(gap):
+        return
+    begin_s, end_s = run.time_s[before], run.time_s[found.index]
+    passed = ((run.time_s[gap] - begin_s) / max(end_s - begin_s, 1e-9))[:, None]
+    later, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s[gap], np.full(len(gap), number + 1))
+    way = later - x[gap]
+    x[gap] += passed * way
+    apart = (passed * (1.0 - passed))[:, :, None] * (way[:, :, None] * way[:, None, :])
+    spread[gap] += apart + passed[:, :, None] * (variance[:, :, None] * np.eye(6))
+
+
+def _point(run: Run, fit: _Fit, number: int, stamp_ns: Ints) -> ChangePoint:
+    found = fit.found[number]
+    _, variance = _jump(run, fit, number)
+    good = np.flatnonzero(run.usable[: found.first])
+    at_s = run.time_s[[found.index] * 2]
+    x, _ = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
+    before_T, after_T = chart.to_poses(run.origin_T, x @ run.root.T)
+    size = chart.to_vectors(before_T, after_T[None])[0]
+    return ChangePoint(
+        found.index,
+        int(stamp_ns[found.index]),
+        int(stamp_ns[good[-1]]),
+        int(stamp_ns[found.last]),
+        size,
+        run.root @ (variance[:, None] * run.root.T),
+    )

@@ -1,0 +1,169 @@
+"""What the recording itself shows of its errors, axis by axis in units of the reported variance.
+
+Second differences ``y(t) - 2 y(t + l) + y(t + 2 l)`` hardly see a pose that stands still or creeps steadily.  Their
+mean squares at growing lags tell how much of the error is new in each block, how much lasts for half a second, and how
+much for as long as a background stays.  What frames claim and nobody has seen is kept as an error that never averages
+out.  How the pose itself wanders is the likeliest of a list.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from gripmon.hindsight.smoother import MID_S, SLOW_S, Bools, Dynamics, log_likelihood
+from gripmon.records import Array
+
+LONGEST_LAG_S = 30.0
+TRIM, TRIMMED_MEAN = 0.98, 0.8735
+"""Part of the squares that is averaged (the rest may be wild), and the mean of that part for normal errors."""
+MEDIAN = 0.4549
+LEAST_WHITE = 1e-4
+LEAST_SLOW = 0.3
+"""The error that lasts is believed to be as large as the reported one, and this at least, if differences show it."""
+PRIOR_BACKGROUNDS = 3.0
+"""So many backgrounds' worth it counts that all that is claimed, and seen nowhere else, lasts."""
+
+WANDERS = (1e-6, 1e-3, 1e-1)
+TURNS = ((1e-9, 1e-6), (1e-7, 1e-2), (1e-6, 1e2), (1e-4, 1e2), (1e-2, 1e2), (1.0, 1e2))
+"""Variances that are tried, a second: of x, of its rate together with that of the first rate (reported sd/s, squared).
+"""
+SLOW_FACTORS = (1.0, 2.5, 6.0)
+WORTH_WANDER, WORTH_TURN, WORTH_SLOW = 6.0, 1.5, 1.0
+"""By so much the logarithm of the likelihood has to grow for each step to the next.  Backgrounds that change look like
+wandering, hardly like a rate.
+"""
+LIKELIHOOD_S, LIKELIHOOD_BLOCKS = 2.0, 2500
+"""Means of so many seconds at least, and no more of them, are what the likelihood is reckoned of: a background passes
+to the next one meanwhile.
+"""
+
+
+@dataclass(frozen=True)
+class Shares:
+    """(a,) each: variance of a block's own error, of that which lasts for :data:`MID_S`, for :data:`SLOW_S`; of a
+    single frame about its block; and what is claimed beyond that.
+    """
+
+    white: Array
+    mid: Array
+    slow: Array
+    frame: Array
+    unseen: Array
+
+
+def second_differences(time_s: Array, y: Array, segment: NDArray[np.int64], lag: int) -> Array:
+    """(k, a), only of evenly spaced triples within a segment."""
+    first, middle, last = slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None)
+    usual = lag * np.median(np.diff(time_s))
+    even = np.abs(time_s[middle] - time_s[first] - usual) < 0.2 * usual
+    even &= np.abs(time_s[last] - time_s[middle] - usual) < 0.2 * usual
+    even &= segment[first] == segment[last]
+    out: Array = (y[first] - 2.0 * y[middle] + y[last])[even]
+    return out[np.isfinite(out).all(axis=1)]
+
+
+def mean_squares(differences: Array, trimmed: bool) -> Array:
+    """(a,) of columns, steps and gross errors left out."""
+    squares = differences * differences
+    if not trimmed:
+        return np.asarray(np.median(squares, axis=0) / MEDIAN)
+    inside = squares <= np.quantile(squares, TRIM, axis=0)
+    return np.asarray((squares * inside).sum(axis=0) / inside.sum(axis=0) / TRIMMED_MEAN)
+
+
+def step_of(time_s: Array) -> float:
+    """Usual interval, s."""
+    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+
+
+def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Array, trimmed: bool) -> Shares:
+    """From block means ``y`` (m, a) at the times (m,), which belong to a ``segment`` (m,) each; ``frame`` (a,) is the
+    variance of frames about their block.
+    """
+    series = y.shape[1]
+    step_s = step_of(time_s)
+    rows, values, weights = [], [], []
+    lag = 1
+    while 2 * lag < 0.75 * len(time_s) and lag * step_s <= LONGEST_LAG_S:
+        differences = second_differences(time_s, y, segment, lag)
+        if len(differences) >= 8:
+            lasting = [_seen(lag * step_s, correlation_s) for correlation_s in (MID_S, SLOW_S)]
+            rows.append([1.0, *lasting])
+            values.append(mean_squares(differences, trimmed) / 6.0)
+            weights.append(np.sqrt(max(len(differences) / (3.0 * lag), 1.0)))
+        lag *= 2
+    out = np.zeros((3, series))
+    if len(rows) < 3:
+        # Too short to tell: a half of what is claimed is new, the other half lasts.
+        out[0], out[2] = 0.25, 0.5
+    else:
+        for axis in range(series):
+            seen = np.maximum([v[axis] for v in values], LEAST_WHITE)
+            relative = np.array(weights) / seen
+            out[:, axis], _ = nnls(np.array(rows) * relative[:, None], seen * relative)
+    white, mid = np.maximum(out[0], LEAST_WHITE), out[1]
+    expected = np.maximum(1.0 - frame - white - mid, LEAST_SLOW)
+    backgrounds = step_s * len(time_s) / (2.0 * SLOW_S)
+    slow = (backgrounds * np.minimum(out[2], 2.0 * expected) + PRIOR_BACKGROUNDS * expected) / (
+        backgrounds + PRIOR_BACKGROUNDS
+    )
+    return Shares(white, mid, slow, frame, np.maximum(1.0 - frame - white - mid - slow, 0.0))
+
+
+def _seen(lag_s: float, correlation_s: float) -> float:
+    """Variance of second differences over six, of an error with the variance 1."""
+    return 1.0 - 4.0 / 3.0 * float(np.exp(-lag_s / correlation_s)) + float(np.exp(-2.0 * lag_s / correlation_s)) / 3.0
+
+
+def likeliest_dynamics(time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares) -> Dynamics:
+    """How the pose wanders, for each axis by itself."""
+    group = max(round(LIKELIHOOD_S / step_of(time_s)), -(-len(time_s) // LIKELIHOOD_BLOCKS), 1)
+    if len(time_s) < 8 * group:
+        group = 1
+    mid = shares.mid
+    if group > 1:
+        # The mean of many of its correlation times: white.
+        variance = variance + mid * 2.0 * MID_S / step_of(time_s)
+        mid = np.full_like(mid, 1e-9)
+        time_s, y, variance, restarts = _coarser(time_s, y, variance, restarts, group)
+    tried, cost = _candidates()
+    series, many = y.shape[1], len(tried)
+    wander, turn, rate, factor = (np.repeat(column, series) for column in tried.T)
+    candidates = Dynamics(factor * np.tile(shares.slow, many), np.tile(mid, many), wander, turn, rate)
+    found = log_likelihood(time_s, np.tile(y, (1, many)), np.tile(variance, (1, many)), restarts, candidates)
+    best = (found.reshape(many, series) - cost[:, None]).argmax(axis=0)
+    wander, turn, rate, factor = tried[best].T
+    return Dynamics(factor * shares.slow, shares.mid, wander, turn, rate)
+
+
+def _candidates() -> tuple[Array, Array]:
+    """Rows of wander, turn, first rate's variance, factor on the slow error (c, 4), and what each costs (c,)."""
+    rows, costs = [], []
+    for i, wander in enumerate(WANDERS):
+        for j, turn in enumerate(TURNS):
+            for k, factor in enumerate(SLOW_FACTORS):
+                rows.append((wander, *turn, factor))
+                costs.append(WORTH_WANDER * i + WORTH_TURN * j + WORTH_SLOW * k)
+    return np.array(rows), np.array(costs)
+
+
+def _coarser(
+    time_s: Array, y: Array, variance: Array, restarts: Bools, group: int
+) -> tuple[Array, Array, Array, Bools]:
+    """Weighted means of up to ``group`` neighbouring blocks of a segment."""
+    segment = np.cumsum(restarts)
+    first = np.flatnonzero(restarts)
+    start = np.concatenate([[0], first])[segment]
+    begins = (np.arange(len(time_s)) - start) % group == 0
+    at = np.flatnonzero(begins)
+    weight = np.where(np.isfinite(variance) & np.isfinite(y), 1.0 / variance, 0.0)
+    total = np.add.reduceat(weight, at, axis=0)
+    mean = np.add.reduceat(weight * np.where(weight > 0.0, y, 0.0), at, axis=0) / np.where(total > 0.0, total, 1.0)
+    counts = np.diff(np.append(at, len(time_s)))
+    time_s = np.add.reduceat(time_s, at) / counts
+    with np.errstate(divide="ignore"):
+        return time_s, mean, np.where(total > 0.0, 1.0 / total, np.inf), restarts[at]

@@ -1,0 +1,67 @@
+"""What the loop sees of a recording."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from gripmon.records import (
+    AlertRecord,
+    Frame,
+    FrameRecord,
+    MeasurementTrace,
+    MonitorNotes,
+    RecordedCommand,
+    ReferenceRecord,
+    StateRecord,
+)
+
+Trace = Callable[[], MeasurementTrace | None]
+Notes = Callable[[], MonitorNotes]
+
+
+class Recorder(Protocol):
+    """Takes frames without ever blocking; what it could not take is counted.
+
+    ``dropped`` are frames that are not in the recording, ``failure`` says why nothing is being written, None when all
+    is well.
+    """
+
+    @property
+    def dropped(self) -> int: ...
+    @property
+    def failure(self) -> str | None: ...
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
+
+    def alert(self, alert: AlertRecord) -> None: ...
+    def reference(self, reference: ReferenceRecord) -> None: ...
+    def command(self, command: RecordedCommand) -> None: ...
+    def state(self, state: StateRecord) -> None: ...
+    def close(self, timeout_s: float = 2.0) -> None: ...
+
+
+class NullRecorder:
+    """Records nothing."""
+
+    dropped = 0
+    failure: str | None = None
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        pass
+
+    def alert(self, alert: AlertRecord) -> None:
+        pass
+
+    def reference(self, reference: ReferenceRecord) -> None:
+        pass
+
+    def command(self, command: RecordedCommand) -> None:
+        pass
+
+    def state(self, state: StateRecord) -> None:
+        pass
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        pass

@@ -1,0 +1,118 @@
+"""Columns of frames: values, codes, joining, lines of JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playback_runs import lines, records_of_a_run
+from recorded import record
+
+from gripmon.geometry import from_record
+from gripmon.playback import FrameTable
+from gripmon.records import FrameRecord, Origin, State, Verdict
+
+
+@pytest.fixture(scope="module")
+def records() -> list[FrameRecord]:
+    return records_of_a_run(0, 130)
+
+
+@pytest.fixture(scope="module")
+def table(records: list[FrameRecord]) -> FrameTable:
+    return FrameTable.from_records(records)
+
+
+def test_every_number_stands_in_its_column(records: list[FrameRecord], table: FrameTable):
+    assert len(table) == len(records)
+    for i, r in enumerate(records):
+        assert (table.seq[i], table.stamp_ns[i], table.latency_ns[i]) == (r.seq, r.stamp_ns, r.latency_ns)
+        assert FrameTable.VERDICTS[table.verdict[i]] == r.verdict
+        assert FrameTable.STATES[table.state[i]] == r.state
+        assert FrameTable.ORIGINS[table.source[i]] == r.source
+        assert (table.reference_ids[table.reference[i]], table.revision[i]) == (r.reference_id, r.revision)
+        assert table.corners_used[i] == sum(corner.used for corner in r.corners)
+        assert table.corners_total[i] == len(r.corners)
+        assert table.refused[i] == (r.reason is not None)
+        if r.drift is not None:
+            assert table.d_m[i] == r.drift.translation_m and table.delta_rad[i] == r.drift.rotation_rad
+            assert tuple(table.tcp_shift_m[i]) == r.drift.tcp_shift_m
+        if r.covariance is not None:
+            assert np.array_equal(table.covariance[i], np.reshape(r.covariance, (6, 6)))
+        if r.smoothed is not None:
+            assert tuple(table.smoothed[i]) == (*r.smoothed.translation_m, *r.smoothed.rotation_xyzw)
+            assert np.array_equal(table.smoothed_covariance[i], np.reshape(r.smoothed.covariance, (6, 6)))
+
+
+def test_null_is_not_a_number(records: list[FrameRecord], table: FrameTable):
+    for column, name in (
+        (table.cam_T_grip[:, 0], "cam_T_grip"),
+        (table.covariance[:, 0, 0], "covariance"),
+        (table.smoothed[:, 0], "smoothed"),
+        (table.smoothed_covariance[:, 0, 0], "smoothed"),
+        (table.d_m, "drift"),
+        (table.rms_px, "rms_px"),
+        (table.jaw_opening_m, "jaw_opening_m"),
+    ):
+        null = [getattr(r, name) is None for r in records]
+        assert any(null) and np.array_equal(np.isnan(column), null), name
+
+
+def test_matrices_are_those_of_the_geometry(records: list[FrameRecord], table: FrameTable):
+    matrices = table.matrices()
+    for matrix, r in zip(matrices, records, strict=True):
+        if r.cam_T_grip is None:
+            assert np.isnan(matrix[:3]).all()
+        else:
+            assert np.allclose(matrix, from_record(r.cam_T_grip), atol=1e-14)
+    assert np.isfinite(table.matrices(smoothed=True)[0]).all() and np.isnan(table.matrices(smoothed=True)[1, :3]).all()
+
+
+def test_joining_keeps_each_frames_reference():
+    one = FrameTable.from_records([record(0, reference_id="a"), record(1, reference_id="b")])
+    two = FrameTable.from_records([record(2, reference_id="b"), record(3, reference_id="c"), record(4)])
+    joined = FrameTable.concatenate([one, two])
+    assert [joined.reference_ids[i] for i in joined.reference] == ["a", "b", "b", "c", "first"]
+    assert joined.seq.tolist() == [0, 1, 2, 3, 4]
+    taken = joined.take(np.array([4, 0]))
+    assert taken.seq.tolist() == [4, 0] and [taken.reference_ids[i] for i in taken.reference] == ["first", "a"]
+
+
+def test_no_frames_are_an_empty_table():
+    for empty in (FrameTable.from_records([]), FrameTable.concatenate([])):
+        assert len(empty) == 0 and empty.covariance.shape == (0, 6, 6) and empty.matrices().shape == (0, 4, 4)
+
+
+def test_blocks_make_no_difference():
+    """More rows than are gathered at once."""
+    many = [record(i % 7, seq=i, reference_id=f"r{i // 3000}") for i in range(9000)]
+    table = FrameTable.from_records(iter(many))
+    assert table.seq.tolist() == list(range(9000))
+    assert [table.reference_ids[i] for i in table.reference[[0, 2999, 3000, 8999]]] == ["r0", "r0", "r1", "r2"]
+
+
+def test_json_lines_give_the_same_columns(table: FrameTable, records: list[FrameRecord], tmp_path: Path):
+    path = tmp_path / "estimates.jsonl"
+    path.write_bytes(b"\n".join(lines(*records)) + b"\n\n")
+    read = FrameTable.from_jsonl(path)
+    for name, column in vars(table).items():
+        if isinstance(column, np.ndarray):
+            assert np.array_equal(getattr(read, name), column, equal_nan=column.dtype.kind == "f"), name
+
+
+def test_a_line_that_is_cut_off(records: list[FrameRecord], tmp_path: Path):
+    path = tmp_path / "estimates.jsonl"
+    path.write_bytes(b"\n".join(lines(*records[:5]))[:-30])
+    with pytest.raises(ValueError, match=r"estimates\.jsonl: 1 lines are no frame records \(line 5:"):
+        FrameTable.from_jsonl(path)
+    faults: list[str] = []
+    assert FrameTable.from_jsonl(path, faults).seq.tolist() == [0, 1, 2, 3]
+    assert len(faults) == 1
+
+
+def test_names_of_every_version_have_a_code():
+    newer = record(0, state=State("dreaming"), source=Origin("oracle"), verdict=Verdict.SUSPECT)
+    table = FrameTable.from_records([newer])
+    assert FrameTable.STATES[table.state[0]] == "other" == FrameTable.ORIGINS[table.source[0]]
+    assert set(map(str, State)) < set(FrameTable.STATES) and set(map(str, Verdict)) == set(FrameTable.VERDICTS)

@@ -1,0 +1,250 @@
+"""Disks that are full, read-only or don't answer: the loop goes on, somebody is told, and recording comes back."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import psutil
+import pytest
+from daemon_bench import Bench
+from loopback import alert_record
+from recorded import Recorded, frame, record, recorder, trace, wait_until
+
+from gripmon.daemon import DaemonSettings
+from gripmon.daemon.watch import Watch
+from gripmon.recording import ProcessRecorder
+from gripmon.recording.health import SILENT_AFTER_S, Health
+from gripmon.records import AlertEvent, AlertKind, Severity
+
+LONG_S = 60.0
+
+
+def command(*arguments: str) -> None:
+    subprocess.run(arguments, check=True, capture_output=True)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """3 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    try:
+        command("mount", "-t", "tmpfs", "-o", "size=3m", "gripmon-test", str(place))
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("mounting a tmpfs is not allowed here")
+    yield place
+    command("umount", "--lazy", str(place))
+
+
+@pytest.fixture
+def freezable_disk(tmp_path: Path) -> Iterator[Path]:
+    """An ext4 in a file, which fsfreeze can stop."""
+    tools = [shutil.which(name) for name in ("mkfs.ext4", "fsfreeze", "mount")]
+    place, file = tmp_path / "disk", tmp_path / "disk.img"
+    place.mkdir()
+    try:
+        if None in tools:
+            raise OSError
+        with file.open("wb") as whole:
+            whole.truncate(64_000_000)
+        command("mkfs.ext4", "-q", "-F", str(file))
+        command("mount", "-o", "loop", str(file), str(place))
+    except (OSError, subprocess.CalledProcessError):
+        pytest.skip("mounting a file as ext4, or freezing it, is not possible here")
+    yield place
+    subprocess.run(["fsfreeze", "--unfreeze", str(place)], check=False, capture_output=True)
+    command("umount", "--lazy", str(place))
+
+
+def offer(writer: ProcessRecorder, first: int, count: int) -> None:
+    for i in range(first, first + count):
+        writer.offer(frame(i), record(i), partial(trace, i))
+
+
+def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
+    written = writer.frames_written
+    offer(writer, first, count)
+    wait_until(lambda: writer.frames_written == written + count, LONG_S)
+
+
+def test_a_full_disk(small_disk: Path) -> None:
+    writer = recorder(small_disk)
+    offer_and_wait(writer, 0, 20)
+    first = writer.path
+    assert first is not None
+    ballast = small_disk / "somebody-elses"
+    _fill(ballast)
+    lost = 0
+    while writer.failure is None:  # until its pages are full, too
+        assert lost < 2000
+        offer(writer, 20 + lost, 10)
+        lost += 10
+        time.sleep(0.05)
+    assert "recording failed: can't write" in writer.failure
+    wait_until(lambda: writer.frames_written + writer.dropped == 20 + lost, LONG_S)
+    ballast.unlink()
+    wait_until(lambda: writer.failure is None, LONG_S)
+    offer_and_wait(writer, 5000, 10)
+    second = writer.path
+    writer.close(20.0)
+    assert second is not None and second != first
+    assert Recorded(second).seqs() == list(range(5000, 5010))
+    # The first file ends with a whole message, or readers would refuse all of it.
+    from rerun.chunk import RrdReader
+
+    with pytest.warns(match="no footer"):
+        chunks = RrdReader(first).stream().to_chunks()
+    batches = [chunk.to_record_batch() for chunk in chunks if chunk.entity_path == "/record"]
+    held = [seq for batch in batches for seq in batch.column("frame").to_pylist()]
+    assert sorted(held) == list(range(writer.frames_written - 10))
+
+
+def test_a_disk_that_is_read_only(small_disk: Path) -> None:
+    command("mount", "-o", "remount,ro", str(small_disk))
+    writer = recorder(small_disk)
+    wait_until(lambda: writer.failure is not None, LONG_S)
+    assert "recording failed: can't write" in str(writer.failure)
+    offer(writer, 0, 10)
+    wait_until(lambda: writer.dropped == 10, LONG_S)
+    writer.alert(alert_record(text="recording failed"))
+    command("mount", "-o", "remount,rw", str(small_disk))
+    wait_until(lambda: writer.failure is None, LONG_S)
+    offer_and_wait(writer, 10, 10)
+    writer.close(20.0)
+    assert (writer.frames_written, writer.dropped) == (10, 10)
+    (path,) = small_disk.glob("*.rrd")
+    told = Recorded(path)
+    assert told.seqs() == list(range(10, 20))
+    assert any("recording failed" in str(cell.values["text"]) for cell in told.timed("events")), "why there is a gap"
+
+
+def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
+    writer = recorder(freezable_disk, queue_frames=50)
+    offer_and_wait(writer, 0, 20)
+    first = writer.path
+    command("fsfreeze", "--freeze", str(freezable_disk))
+    count = 20
+    slowest_s = 0.0
+    while writer.failure is None or writer.dropped == 0:
+        assert count < 20_000, "nobody notices"
+        before_s = time.monotonic()
+        offer(writer, count, 1)
+        slowest_s = max(slowest_s, time.monotonic() - before_s)
+        count += 1
+        time.sleep(0.01)
+    assert "the disk" in str(writer.failure) and "doesn't answer" in str(writer.failure)
+    assert writer.frames_written == 20
+    command("fsfreeze", "--unfreeze", str(freezable_disk))
+    wait_until(lambda: writer.failure is None, LONG_S)
+    wait_until(lambda: writer.frames_written + writer.dropped == count, LONG_S)
+    offer_and_wait(writer, count, 10)
+    assert writer.path == first, "it waited, and nothing was cut off"
+    writer.close(20.0)
+    assert first is not None
+    seqs = Recorded(first).seqs()
+    assert seqs[:20] == list(range(20)) and seqs[-10:] == list(range(count, count + 10))
+    assert len(seqs) == writer.frames_written
+
+
+def test_closing_while_the_disk_doesn_t_answer_takes_no_longer_than_allowed(freezable_disk: Path) -> None:
+    writer = recorder(freezable_disk)
+    offer_and_wait(writer, 0, 20)
+    worker = writer.process_id
+    assert worker is not None
+    command("fsfreeze", "--freeze", str(freezable_disk))
+    offer(writer, 20, 20)
+    begun_s = time.monotonic()
+    writer.close(1.0)
+    # Without a bound it would take as long as the disk stays frozen: for ever.
+    assert time.monotonic() - begun_s < LONG_S
+    assert writer.failure is not None and writer.dropped == 20
+    command("fsfreeze", "--unfreeze", str(freezable_disk))
+    wait_until(lambda: not psutil.pid_exists(worker) or _is_gone(worker), LONG_S)
+
+
+def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, queue_frames=50)
+    offer_and_wait(writer, 0, 10)
+    worker = writer.process_id
+    assert worker is not None
+    os.kill(worker, signal.SIGSTOP)
+    wait_until(lambda: writer.failure is not None, LONG_S)
+    assert writer.failure == "recording pauses: its process was stopped from outside"
+    os.kill(worker, signal.SIGCONT)
+    wait_until(lambda: writer.failure is None, LONG_S)
+    offer_and_wait(writer, 10, 10)
+    writer.close(20.0)
+    assert (writer.frames_written, writer.dropped) == (20, 0)
+
+
+def test_losses_that_go_on_are_said_and_a_burst_is_not() -> None:
+    health = Health(0.0)
+
+    def look(at_s: float, frames: int, images: int) -> str | None:
+        health.look(at_s, at_s, True, os.getpid(), frames, images)
+        return health.fault
+
+    assert [look(t, 5, 0) for t in (1.0, 2.0, 3.0, 4.0, 5.0)] == [None] * 5, "once"
+    said = [look(t, 5, int(t)) for t in (6.0, 7.0, 8.0, 9.0)]
+    assert said == [None, None, *["recording thins: it can't keep up, images are dropped"] * 2]
+    after = [look(t, 5, 9) for t in (10.0, 11.0, 12.0, 13.0, 14.0, 15.0)]
+    assert after[0] is not None and after[-1] is None
+    health.look(20.0 + SILENT_AFTER_S, 19.0, True, os.getpid(), 5, 9)
+    assert health.fault == "recording pauses: its process hasn't answered for 5 s"
+    assert look(26.0, 5, 9) is None
+
+
+def test_the_alert_about_the_recording() -> None:
+    watch = Watch(DaemonSettings(), 0.0)
+    assert watch.recording(None, 1.0, 10) == []
+    (raised,) = watch.recording("recording failed: no space", 2.0, 20)
+    assert (raised.kind, raised.severity, raised.event) == (AlertKind.RECORDING, Severity.WARNING, AlertEvent.RAISED)
+    assert raised.text == "recording failed: no space"
+    assert watch.recording("recording failed: no space", 3.0, 30) == [], "said once"
+    (standing,) = watch.standing(())
+    assert (standing.kind, standing.alert_id) == (AlertKind.RECORDING, raised.alert_id)
+    (cleared,) = watch.recording(None, 4.0, 40)
+    assert (cleared.event, cleared.alert_id) == (AlertEvent.CLEARED, raised.alert_id)
+    assert watch.standing(()) == ()
+
+
+def test_the_daemon_says_so_and_goes_on() -> None:
+    def failing(why: str | None):
+        return lambda _: setattr(bench.recording, "failure", why)
+
+    bench = Bench([])
+    bench.source._items = iter([0, failing("recording failed: no space"), 1, 2, failing(None), 3, 4])
+    assert bench.run() == 0
+    told = [(a.kind, a.event, a.seq) for a in bench.network.alerts]
+    assert told == [(AlertKind.RECORDING, AlertEvent.RAISED, 1), (AlertKind.RECORDING, AlertEvent.CLEARED, 3)]
+    assert [a.event for a in bench.recording.alerts] == [AlertEvent.RAISED, AlertEvent.CLEARED]
+    assert [r.seq for r in bench.network.transforms] == [0, 1, 2, 3, 4]
+    assert [len(s.open_alerts) for s in bench.network.states if "no space" in s.message][:1] == [1]
+
+
+def _fill(path: Path) -> None:
+    """With bytes until no more go there."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT)
+    try:
+        for size in (65_536, 4096):
+            with contextlib.suppress(OSError):
+                while os.write(descriptor, bytes(size)) == size:
+                    pass
+    finally:
+        os.close(descriptor)
+    assert shutil.disk_usage(path.parent).free < 4096
+
+
+def _is_gone(process_id: int) -> bool:
+    try:
+        return psutil.Process(process_id).status() == psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return True
