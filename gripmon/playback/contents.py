@@ -16,7 +16,7 @@ import numpy as np
 from gripmon.playback import entities
 from gripmon.playback.container import Block, Manifest, RrdFile, Span, StoreName, texts_of
 from gripmon.playback.lenient import DECODING_ERRORS, read
-from gripmon.playback.table import FrameTable, IntArray, Line, TableBuilder
+from gripmon.playback.table import IntArray, Line, TableBuilder
 from gripmon.records import (
     AlertRecord,
     FrameRecord,
@@ -75,13 +75,13 @@ class Places:
 
 @dataclass
 class Contents:
-    """What one file holds of one recording.  ``record_block`` (n,) says of each row of ``table`` in which of
+    """What one file holds of one recording.  ``record_block`` (n,) says of each row of ``frames`` in which of
     ``record_blocks`` it lies; ``events`` are decoded records by entity, ``alerting`` the frames' records with alerts.
     """
 
     source: Source
     store: StoreName
-    table: FrameTable
+    frames: TableBuilder
     record_blocks: list[Block] = field(default_factory=list)
     record_block: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     image_seqs: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
@@ -107,7 +107,7 @@ class Contents:
 
     @property
     def is_ours(self) -> bool:
-        return self.meta is not None or len(self.table) > 0 or self.about is not None
+        return self.meta is not None or len(self.frames) > 0 or self.about is not None
 
 
 def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], None]) -> Contents:
@@ -176,7 +176,7 @@ class Reading:
 
     def contents(self) -> Contents:
         """What was gathered."""
-        table = self._builder.table()
+        self._builder.close()
         for name in sorted(self._builder.unknown_names):
             self._notes.append(f"has frames with {name!r:.60}, which this version doesn't know")
         events = {entity: self._understood(entity) for entity in _EVENTS}
@@ -187,7 +187,7 @@ class Reading:
         return Contents(
             source=self._source,
             store=self._store,
-            table=table,
+            frames=self._builder,
             record_blocks=self._record_blocks,
             record_block=np.array(self._record_block, np.int64),
             image_seqs=seqs,

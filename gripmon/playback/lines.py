@@ -54,6 +54,6 @@ def read_lines(file: LineFile, progress: Callable[[int], None]) -> Contents:
             offset += size
             progress(offset)
     contents = reading.contents()
-    if not len(contents.table):
+    if not len(contents.frames):
         raise UnreadableFileError("holds no frame records")
     return contents
