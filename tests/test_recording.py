@@ -146,7 +146,7 @@ def test_curves_have_people_s_units(told: Recorded) -> None:
     shift = told.by_seq("drift/tcp_shift_mm", "scalars")
     band = told.by_seq("drift/tcp_shift_sigma_mm", "scalars")
     d, delta = told.by_seq("drift/d_mm", "scalars"), told.by_seq("drift/delta_deg", "scalars")
-    rms, latency = told.by_seq("quality/rms_px", "scalars"), told.by_seq("timing/latency_us", "scalars")
+    rms, latency = told.by_seq("residual/rms_px", "scalars"), told.by_seq("timing/latency_us", "scalars")
     for i in set(range(COUNT)) - {20, 21}:
         expected = story(i)
         assert expected.drift is not None
@@ -161,7 +161,7 @@ def test_curves_have_people_s_units(told: Recorded) -> None:
 
 
 def test_what_is_unknown_leaves_a_gap(told: Recorded) -> None:
-    for path in ("drift/tcp_shift_mm", "drift/tcp_shift_sigma_mm", "drift/d_mm", "drift/delta_deg", "quality/rms_px"):
+    for path in ("drift/tcp_shift_mm", "drift/tcp_shift_sigma_mm", "drift/d_mm", "drift/delta_deg", "residual/rms_px"):
         values = told.by_seq(path, "scalars")
         assert values[20] == [] and values[21] == [] and values[22] != []
 

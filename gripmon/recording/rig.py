@@ -59,6 +59,13 @@ class RigWriter:
                 translation=[t.translation_m for t in transforms], quaternion=[t.rotation_xyzw for t in transforms]
             )
             self._send.frames("rig/gripper", posed, columns)
+        averaged = [row for row in rows if row.record.smoothed is not None]
+        if averaged:
+            poses = [row.record.smoothed for row in averaged if row.record.smoothed is not None]
+            columns = rr.Transform3D.columns(
+                translation=[p.translation_m for p in poses], quaternion=[p.rotation_xyzw for p in poses]
+            )
+            self._send.frames("rig/smoothed", averaged, columns)
         for row in rows:
             self._write_fingers(row)
         pictured = [row for row in rows if row.picture is not None or row.record.reason is not None]
