@@ -1,18 +1,18 @@
 """Everything that is a number over time, with the limits that it is judged by, in people's units.
 
 ==================================  ================================================================================
-``drift/tcp_shift_mm``              against the reference, camera axes; and ``…_length_mm``;  ``…_sigma_mm`` the band of
-                                    one standard deviation, ``…_smoothed_mm`` that of the smoothed transform
+``drift/tcp_shift_mm``              against the reference: camera axes, and its length;  ``…_sigma_mm`` the band of one
+                                    standard deviation, ``…_smoothed_mm`` that of the smoothed transform
 ``drift/d_mm``, ``delta_deg``       ``d`` and ``delta`` of equation (14)
 ``drift/limits_mm``, ``_deg``       of that length and turn: for a warning, for an error and a new reference (of ``d``)
 ``drift/noticed_mm``, ``_deg``      between which two a constant shift along an axis passes unnoticed: x, y, z; x, y, z
 ``drift/truth_mm``, ``error_mm``    where a simulator tells the truth
 ``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised or noted
 ``test/share``                      the drift test's largest statistic over its threshold;  ``test/alarm`` is 1
-``transform/raw``, ``smoothed``     translation (m) and quaternion x, y, z, w
+``transform``                       translation (m) and quaternion x, y, z, w, raw and smoothed
 ``sigma/…``                         standard deviations, raw and smoothed;  ``noise/…`` what was learnt of the stream's
-``residual/rms_px``                 of the corners;  ``corners_px`` each corner's distance from where the transform
-                                    has it, ``edges_used_px``, ``edges_refused_px`` each edge point's in the overlay
+``residual/rms_px``                 of corners and of used edge points, from where the transform has them
+``residual/corners_px``             each corner's distance;  ``residual/edge_points`` each point's of the overlay
 ``quality``, ``timing``, ``jaw``    counts of points and corners, latency, the opening that came with the frame
 ``image/…``                         statistics of the recorded images
 ==================================  ================================================================================
@@ -20,6 +20,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
@@ -34,6 +35,7 @@ from gripmon.records import AlertEvent, FrameRecord, Limits, ReferenceRecord, Se
 
 _XYZ = ["x", "y", "z"]
 _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
+_LIMITS_EVERY_NS = 2_000_000_000
 _Millimetres = list[float]
 
 
@@ -44,7 +46,8 @@ class CurveWriter:
         self._send = send
         self._corner_ids = scene.corner_ids
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
-        self._limits: Limits | None = None
+        self._newest: Row | None = None
+        self._drawn_ns: int | None = None
         _log_styles(send, scene)
 
     def add_reference(self, reference: ReferenceRecord) -> None:
@@ -68,18 +71,20 @@ class CurveWriter:
             send.curve("image/sharpness", shown, [p.sharpness for p in pictures])
         traced = [r for r in shown if r.trace is not None]
         sides = [_edge_residuals_px(r.trace) for r in traced if r.trace is not None]
-        for index, name in enumerate(("edges_used_px", "edges_refused_px") if traced else ()):
-            some = [side[index] for side in sides]
-            whole = rr.AnyValues.columns(distance_px=np.concatenate(some)).partition([len(each) for each in some])
-            send.frames(f"residual/{name}", traced, whole)
+        if sides:
+            used, refused = ([side[i] for side in sides] for i in (0, 1))
+            columns = [
+                *rr.AnyValues.columns(used_px=np.concatenate(used)).partition([len(each) for each in used]),
+                *rr.AnyValues.columns(refused_px=np.concatenate(refused)).partition([len(each) for each in refused]),
+            ]
+            send.frames("residual/edge_points", traced, rr.ComponentColumnList(columns))
 
     def _drift(self, rows: Sequence[Row]) -> None:
         send = self._send
         drifts = [r.record.drift for r in rows]
         shifts_mm = [_millimetres(None if d is None else d.tcp_shift_m) for d in drifts]
-        send.scalars("drift/tcp_shift_mm", rows, shifts_mm)
-        lengths_mm = [math.hypot(*shift_mm) if shift_mm else None for shift_mm in shifts_mm]
-        send.curve("drift/tcp_shift_length_mm", rows, lengths_mm)
+        with_length_mm = [[*shift_mm, math.hypot(*shift_mm)] if shift_mm else [] for shift_mm in shifts_mm]
+        send.scalars("drift/tcp_shift_mm", rows, with_length_mm)
         send.scalars("drift/tcp_shift_sigma_mm", rows, [_band_mm(r.record) for r in rows])
         smoothed = [None if (s := r.record.smoothed) is None else s.translation_m for r in rows]
         send.scalars("drift/tcp_shift_smoothed_mm", rows, list(map(self._shift_mm, rows, smoothed)))
@@ -93,7 +98,7 @@ class CurveWriter:
             marked = [i for i, r in enumerate(rows) if _tells_news(r.record, severity)]
             if marked:
                 # Without a drift to mark it stands on the axis.
-                heights_mm = [lengths_mm[i] or 0.0 for i in marked]
+                heights_mm = [with_length_mm[i][3] if with_length_mm[i] else 0.0 for i in marked]
                 send.curve(f"drift/alerts/{severity}", [rows[i] for i in marked], heights_mm)
 
     def _shift_mm(self, row: Row, tcp_m: tuple[float, float, float] | None) -> _Millimetres:
@@ -104,65 +109,63 @@ class CurveWriter:
         return [1e3 * (now - old) for now, old in zip(tcp_m, reference_tcp_m, strict=True)]
 
     def _transforms(self, rows: Sequence[Row]) -> None:
-        send = self._send
-        raw = [r.record.cam_T_grip for r in rows]
-        smoothed = [r.record.smoothed for r in rows]
-        send.scalars("transform/raw", rows, [() if t is None else (*t.translation_m, *t.rotation_xyzw) for t in raw])
-        send.scalars(
-            "transform/smoothed", rows, [() if t is None else (*t.translation_m, *t.rotation_xyzw) for t in smoothed]
-        )
-        for name, covariances in (
-            ("", [r.record.covariance for r in rows]),
-            ("smoothed_", [None if s is None else s.covariance for s in smoothed]),
-        ):
-            sigmas = [[] if c is None else [math.sqrt(variance) for variance in c[::7]] for c in covariances]
-            send.scalars(f"sigma/{name}tcp_um", rows, [[1e6 * v for v in s[:3]] for s in sigmas])
-            send.scalars(f"sigma/{name}rotation_deg", rows, [list(map(math.degrees, s[3:])) for s in sigmas])
+        poses, tcp_um, turns_deg = [], [], []
+        for record in (row.record for row in rows):
+            raw, smoothed = record.cam_T_grip, record.smoothed
+            poses.append(_both(7, *([*t.translation_m, *t.rotation_xyzw] if t else [] for t in (raw, smoothed))))
+            covariances = (record.covariance or (), () if smoothed is None else smoothed.covariance)
+            sigmas = [[math.sqrt(variance) for variance in covariance[::7]] for covariance in covariances]
+            tcp_um.append(_both(3, *([1e6 * v for v in sigma[:3]] for sigma in sigmas)))
+            turns_deg.append(_both(3, *([math.degrees(v) for v in sigma[3:]] for sigma in sigmas)))
+        self._send.scalars("transform", rows, poses)
+        self._send.scalars("sigma/tcp_um", rows, tcp_um)
+        self._send.scalars("sigma/rotation_deg", rows, turns_deg)
 
     def _test(self, rows: Sequence[Row]) -> None:
-        send = self._send
-        send.curve("test/share", rows, [r.statistic_share for r in rows])
+        self._send.curve("test/share", rows, [r.statistic_share for r in rows])
         judged = [r for r in rows if r.limits is not None]
         if not judged:
             return
-        # A straight line needs its ends only.
-        ends = judged[:1] + judged[-1:] if len(judged) > 1 else judged
-        limits = [r.limits for r in ends if r.limits is not None]
-        send.curve("test/alarm", ends, [1.0] * len(ends))
-        send.scalars("drift/limits_mm", ends, [(1e3 * each.warn_m, 1e3 * each.limit_m) for each in limits])
+        self._newest = judged[-1]
+        # What changes slowly needs few points, and every chunk costs two kilobytes.
+        if self._drawn_ns is None or not 0 <= judged[-1].record.stamp_ns - self._drawn_ns < _LIMITS_EVERY_NS:
+            self._draw_limits(judged[:1] + judged[-1:] if len(judged) > 1 else judged)
+
+    def finish(self) -> None:
+        """The end of the file: lines reach to its last frame."""
+        if self._newest is not None and self._newest.record.stamp_ns != self._drawn_ns:
+            self._draw_limits([self._newest])
+
+    def _draw_limits(self, rows: Sequence[Row]) -> None:
+        send, limits = self._send, [r.limits for r in rows if r.limits is not None]
+        self._drawn_ns = rows[-1].record.stamp_ns
+        send.curve("test/alarm", rows, [1.0] * len(rows))
+        send.scalars("drift/limits_mm", rows, [(1e3 * each.warn_m, 1e3 * each.limit_m) for each in limits])
         degrees = [(math.degrees(each.warn_rad), math.degrees(each.limit_rad)) for each in limits]
-        send.scalars("drift/limits_deg", ends, degrees)
-        changed = []
-        for row in judged:
-            if row.limits is not self._limits or row is judged[-1]:
-                changed.append(row)
-            self._limits = row.limits
-        limits = [r.limits for r in changed if r.limits is not None]
-        send.scalars("drift/noticed_mm", changed, [_noticed(each, slice(0, 3), 1e3) for each in limits])
-        send.scalars("drift/noticed_deg", changed, [_noticed(each, slice(3, 6), 180.0 / math.pi) for each in limits])
+        send.scalars("drift/limits_deg", rows, degrees)
+        send.scalars("drift/noticed_mm", rows, [_noticed(each, slice(0, 3), 1e3) for each in limits])
+        send.scalars("drift/noticed_deg", rows, [_noticed(each, slice(3, 6), 180.0 / math.pi) for each in limits])
         scatters = [each.scatter or () for each in limits]
-        send.scalars("noise/scatter_um", changed, [[1e6 * v for v in s[:3]] for s in scatters])
-        send.scalars("noise/scatter_deg", changed, [list(map(math.degrees, s[3:])) for s in scatters])
-        send.scalars("noise/average_share", changed, [each.average_share for each in limits])
-        send.scalars("noise/average_walk_um", changed, [[1e6 * w for w in each.average_walk[:3]] for each in limits])
+        send.scalars("noise/scatter_um", rows, [[1e6 * v for v in s[:3]] for s in scatters])
+        send.scalars("noise/scatter_deg", rows, [list(map(math.degrees, s[3:])) for s in scatters])
+        send.scalars("noise/average_share", rows, [each.average_share for each in limits])
+        send.scalars("noise/average_walk_um", rows, [[1e6 * w for w in each.average_walk[:3]] for each in limits])
 
     def _measurement(self, rows: Sequence[Row]) -> None:
         send = self._send
-        send.curve("residual/rms_px", rows, [r.record.rms_px for r in rows])
         send.curve("quality/corners_used", rows, [float(sum(c.used for c in r.record.corners)) for r in rows])
         send.curve("jaw/reported_m", rows, [r.jaw_reported_m for r in rows])
         send.curve("timing/latency_us", rows, [1e-3 * r.record.latency_ns for r in rows])
+        sides = [None if r.trace is None else _edge_residuals_px(r.trace) for r in rows]
+        edges = [[] if side is None or not side[0].size else [_rms(side[0])] for side in sides]
+        corners = [[] if r.record.rms_px is None else [r.record.rms_px] for r in rows]
+        send.scalars("residual/rms_px", rows, list(map(functools.partial(_both, 1), corners, edges)))
         traced = [r for r in rows if r.trace is not None]
-        traces = [r.trace for r in traced if r.trace is not None]
-        if not traces:
-            return
-        corners_px = [_corner_residuals_px(r.record, t) for r, t in zip(traced, traces, strict=True)]
-        send.scalars("residual/corners_px", traced, corners_px)
-        sides = [_edge_residuals_px(trace) for trace in traces]
-        counts = [(float(used.size), float(refused.size)) for used, refused in sides]
-        send.scalars("quality/edge_points", traced, counts)
-        rms_px = [None if not used.size else float(np.sqrt(np.mean(np.square(used)))) for used, _ in sides]
-        send.curve("residual/edges_rms_px", traced, rms_px)
+        if traced:
+            corners_px = [_corner_residuals_px(r.record, r.trace) for r in traced if r.trace is not None]
+            send.scalars("residual/corners_px", traced, corners_px)
+            counts = [[float(used.size), float(refused.size)] for used, refused in filter(None, sides)]
+            send.scalars("quality/edge_points", traced, counts)
 
 
 def _log_styles(send: Sender, scene: Scene) -> None:
@@ -175,12 +178,11 @@ def _log_styles(send: Sender, scene: Scene) -> None:
         send.static(path, rr.SeriesLines(names=names, colors=colours, widths=[width] * count))
 
     both = [f"{axis}{side}" for side in ("-", "+") for axis in _XYZ]
-    lines("drift/tcp_shift_mm", _XYZ, axes, 2.0)
+    lines("drift/tcp_shift_mm", [*_XYZ, "length"], [*axes, palette.WHOLE], 1.8)
     lines("drift/tcp_shift_sigma_mm", [f"{name}σ" for name in both], pale * 2, 0.7)
     lines("drift/tcp_shift_smoothed_mm", [f"{axis} smoothed" for axis in _XYZ], pale, 1.5)
     lines("drift/truth_mm", [f"true {axis}" for axis in _XYZ], paler, 6.0)
     lines("drift/error_mm", _XYZ, axes, 1.0)
-    lines("drift/tcp_shift_length_mm", "length", palette.WHOLE, 1.5)
     lines("drift/d_mm", "d", palette.WHOLE, 1.5)
     lines("drift/delta_deg", "δ", palette.WHOLE, 1.5)
     for unit in ("mm", "deg"):
@@ -192,8 +194,7 @@ def _log_styles(send: Sender, scene: Scene) -> None:
         send.static(f"drift/alerts/{severity}", points)
     lines("test/share", "statistic / threshold", palette.WHOLE, 1.5)
     lines("test/alarm", "alarm", palette.BAD, 1.5)
-    for path in ("transform/raw", "transform/smoothed"):
-        send.static(path, rr.SeriesLines(names=_POSE))
+    send.static("transform", rr.SeriesLines(names=[*_POSE, *(f"{name} smoothed" for name in _POSE)]))
     for path in (
         "sigma/tcp_um",
         "sigma/rotation_deg",
@@ -202,14 +203,21 @@ def _log_styles(send: Sender, scene: Scene) -> None:
         "noise/average_walk_um",
     ):
         lines(path, _XYZ, axes, 1.5)
-    for path in ("sigma/smoothed_tcp_um", "sigma/smoothed_rotation_deg"):
-        lines(path, [f"{axis} smoothed" for axis in _XYZ], pale, 1.0)
     send.static("noise/average_share", rr.SeriesLines(names=[*_XYZ, *(f"about {axis}" for axis in _XYZ)]))
-    lines("residual/rms_px", "corners, rms", palette.BUSY, 1.5)
-    lines("residual/edges_rms_px", "edge points, rms", palette.EDGE_USED, 1.5)
+    lines("residual/rms_px", ["corners, rms", "edge points, rms"], [palette.CORNER_USED, palette.EDGE_USED], 1.5)
     send.static("residual/corners_px", rr.SeriesLines(names=list(scene.corner_ids)))
     lines("quality/edge_points", ["edge points used", "refused"], [palette.EDGE_USED, palette.EDGE_REFUSED], 1.5)
     lines("quality/corners_used", "corners used", palette.CORNER_USED, 1.5)
+
+
+def _both(size: int, raw: list[float], other: list[float]) -> list[float]:
+    """Two series of ``size`` numbers side by side; NaN, which leaves a gap, for one that is unknown alone."""
+    gap = [math.nan] * size
+    return [*(raw or gap), *(other or gap)] if raw or other else []
+
+
+def _rms(values: NDArray[np.float32]) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
 
 
 def _millimetres(metres: Sequence[float] | None) -> _Millimetres:

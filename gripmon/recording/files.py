@@ -145,7 +145,8 @@ class FileSeries:
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
-        if self._stream is not None:
+        if self._stream is not None and self._writer is not None:
+            self._writer.finish()
             self._stream.disconnect()
         self._leave()
         self._lose()
@@ -207,7 +208,8 @@ class FileSeries:
 
     def _end(self) -> None:
         """Complete the file before the next one; what waits stays for that."""
-        if self._stream is not None:
+        if self._stream is not None and self._writer is not None:
+            self._writer.finish()
             self._stream.disconnect()
         self._leave()
 

@@ -73,6 +73,10 @@ class RowWriter:
             self._curves.write_pictures(rows)
             self._overlay.write_late(rows)
 
+    def finish(self) -> None:
+        """Nothing more comes into this file."""
+        self._curves.finish()
+
     def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Line:
         self._rig.write_reference(reference, first)
         whole = rr.AnyValues.columns(json=[to_json(reference).decode()])
