@@ -100,6 +100,10 @@ class FileSeries:
     def path(self) -> str | None:
         return None if self._file is None else str(self._file.path)
 
+    @property
+    def frames_waiting(self) -> int:
+        return len(self._rows)
+
     def add_frames(self, rows: Sequence[Row]) -> None:
         self._rows += rows
 

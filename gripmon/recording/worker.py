@@ -23,6 +23,7 @@ from gripmon.records import Alert, AlertRecord, Limits
 
 _NICENESS = 10  # the loop goes first when both want the same core
 _STDIN = 0
+_FRAMES_A_WRITE = 128
 _REPORT_PERIOD_S = 1.0  # the daemon must hear something
 
 
@@ -70,6 +71,10 @@ class RecordingLoop:
                 ended = not part
                 for payload in self._unframer.feed(part):
                     self._take(payload)
+                    if self._scene is not None and self._files.frames_waiting >= _FRAMES_A_WRITE:
+                        # Who gathers more than he can write in time falls silent and grows.
+                        self._files.write()
+                        self._report()
             if self._scene is not None and (ended or time.monotonic() >= next_flush):
                 self._files.write()
                 next_report = time.monotonic()
