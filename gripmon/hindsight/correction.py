@@ -175,7 +175,7 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
         variance = blocks.variance(shares.white) * extra[:, None]
         restarts = np.diff(blocks.segment, prepend=0) > 0
         if number < PASSES:
-            dynamics = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
+            dynamics, kinks_s = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
         time_s, where = with_gaps(run, blocks.time_s)
         full = Spread(where, len(time_s))
         smoothed = smooth(
@@ -183,6 +183,7 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
             full.of(blocks.mean, np.nan),
             full.of(variance, np.inf),
             full.of(restarts.astype(float)[:, None], 0.0)[:, 0] > 0.5,
+            _nearest(time_s, kinks_s),
             dynamics,
         )
         block_segment = held(blocks.segment, where, len(time_s))
@@ -193,6 +194,12 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
         quick, quick_error = motion.vibration(rest)
         swing = motion.swings(rest - quick, run.claimed[good])
     return _Fit(found, time_s, block_segment, smoothed, shares, dynamics, swing, quick, quick_error)
+
+
+def _nearest(time_s: Array, wanted_s: list[float]) -> Bools:
+    out = np.zeros(len(time_s), bool)
+    out[np.minimum(np.searchsorted(time_s, wanted_s), len(time_s) - 1)] = True
+    return out
 
 
 def _jump(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
