@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from gripmon.playback import entities
-from gripmon.playback.container import Block, Manifest, RrdFile, Span, StoreName, texts_of
+from gripmon.playback.container import FRAME, Block, Chunk, Manifest, RrdFile, Span, StoreName, texts_of
 from gripmon.playback.lenient import DECODING_ERRORS, read
 from gripmon.playback.table import IntArray, Line, TableBuilder
 from gripmon.records import (
@@ -48,7 +48,7 @@ class Source(Protocol):
     damaged: int
 
     def record_texts(self, store: StoreName, block: Block) -> list[str] | list[bytes]: ...
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Any]: ...
+    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]: ...
 
 
 class Places:
@@ -199,23 +199,23 @@ class Reading:
         )
 
     def _take(
-        self, block: Block, chunks: Sequence[Any], look_at_images: bool = False, keep_places: bool = False
+        self, block: Block, chunks: Sequence[Chunk], look_at_images: bool = False, keep_places: bool = False
     ) -> None:
         for chunk in chunks:
-            entity = chunk.entity_path.removeprefix("/")
+            entity = chunk.entity
             if keep_places and entity in self._places:
-                seqs = frame_numbers(chunk.to_record_batch())
+                seqs = frame_numbers(chunk.batch)
                 if len(seqs):
                     self._places[entity].add(block, int(seqs.min()), int(seqs.max()))
             if entity == entities.RECORD:
-                self.take_records(block, texts_of(chunk.to_record_batch(), "json"))
+                self.take_records(block, texts_of(chunk.batch, "json"))
             elif entity in self._texts:
-                self._texts[entity].update(dict.fromkeys(texts_of(chunk.to_record_batch(), "json")))
+                self._texts[entity].update(dict.fromkeys(texts_of(chunk.batch, "json")))
             elif entity == entities.ABOUT:
-                self._take_about(chunk.to_record_batch())
+                self._take_about(chunk.batch)
             elif entity == (entities.IMAGE if look_at_images else entities.IMAGE_MEAN):
                 component = "EncodedImage:blob" if look_at_images else "Scalars:scalars"
-                self._image_seqs.append(_seqs_with(chunk.to_record_batch(), component))
+                self._image_seqs.append(_seqs_with(chunk.batch, component))
 
     def take_records(self, block: Block, texts: Iterable[str | bytes]) -> None:
         """Frames' records, in order."""
@@ -294,9 +294,9 @@ def _gathered(manifest: Manifest, messages: Sequence[int]) -> list[Block]:
 
 def frame_numbers(batch: Any) -> IntArray:
     """(rows,) of a batch; empty where it isn't on the timeline of frames, the least number where a row isn't."""
-    if "frame" not in batch.schema.names:
+    if FRAME not in batch.schema.names:
         return np.empty(0, np.int64)
-    return batch.column("frame").cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
+    return batch.column(FRAME).cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
 
 
 def _seqs_with(batch: Any, component: str) -> IntArray:

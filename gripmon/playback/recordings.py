@@ -203,15 +203,14 @@ class Recording:
         key = part, block
         if key not in self._kept:
             contents = self._parts[part]
-            content = [f"/{entity}" for entity in entities.ON_DEMAND]
             found: dict[str, list[Any]] = {}
             try:
-                chunks = contents.source.decode(contents.store, block, content)
+                chunks = contents.source.decode(contents.store, block, entities.ON_DEMAND)
             except OSError:
                 chunks = []
             for chunk in chunks:
                 if not chunk.is_static:
-                    found.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk.to_record_batch())
+                    found.setdefault(chunk.entity, []).append(chunk.batch)
             self._kept[key] = found
             if len(self._kept) > _BLOCKS_KEPT:
                 self._kept.popitem(last=False)
