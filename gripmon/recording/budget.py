@@ -65,8 +65,8 @@ class DiskBudget:
         if total <= limit:
             return ""
         return (
-            f"pinned recordings in {self._directory} leave no room: {total / 1e6:.0f} MB of budget_bytes "
-            f"{self._budget_bytes / 1e6:.0f} MB; move them away or delete their .pinned files{trouble}"
+            f"pinned recordings in {self._directory} leave no room: {total / 1e6:.0f} MB, nine tenths of budget_bytes "
+            f"{self._budget_bytes / 1e6:.0f} MB or more; move them away or delete their .pinned files{trouble}"
         )
 
     def recordings(self) -> list[_Entry]:

@@ -17,7 +17,7 @@ import rerun as rr
 from gripmon.recording.budget import DiskBudget, claim, space_missing
 from gripmon.recording.columns import Row
 from gripmon.recording.layout import make_blueprint
-from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy
+from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
 from gripmon.recording.repair import repair
 from gripmon.recording.ring import Moments
 from gripmon.recording.rows import RowWriter
@@ -134,18 +134,20 @@ class FileSeries:
         if self._stream is None or self._writer is None or self._file is None:
             self._lose()
             return
-        if self._stalled:
-            self._lose()  # what rerun holds already is written when the disk answers again
-        else:
-            rows, late, events = self._rows, self._late, self._events
-            self._rows, self._late, self._events = [], [], Events()
-            self._writer.write(rows, events)
-            for first in range(0, len(late), _PICTURES_A_CHUNK):
-                self._writer.write_pictures(late[first : first + _PICTURES_A_CHUNK])
-            self._unflushed += len(rows)
-            self._file.cover(rows)
-        if self._flush(self._stream, self._file):
+        if not self._stalled:  # what rerun holds already is written when the disk answers again
+            self._unflushed += len(self._rows)
+            self._file.cover(self._rows)
+            self._writer.write(self._rows, self._events)
+            self._rows, self._events = [], Events()
+        whole = self._flush(self._stream, self._file)
+        while whole and self._late:
+            late, self._late = self._late[:_PICTURES_A_CHUNK], self._late[_PICTURES_A_CHUNK:]
+            self._writer.write_pictures(late)
+            whole = self._flush(self._stream, self._file)
+        if whole:
             self._keep_house(self._file)
+        elif self._waiting_for_too_much():
+            self._lose()
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
@@ -176,6 +178,12 @@ class FileSeries:
         self.failure = None
         self._retry_s = _FIRST_RETRY_S
         return True
+
+    def _waiting_for_too_much(self) -> bool:
+        """Whether more waits for a disk that doesn't answer than memory is there for."""
+        pictures = (row.picture for row in self._rows)
+        picture_bytes = sum(len(picture.blob) for picture in pictures if picture is not None)
+        return len(self._rows) > self._settings.queue_frames or picture_bytes > self._settings.ring_bytes
 
     def _keep_house(self, file: _File) -> None:
         """Pin what alerts touch, and begin the next file when this one is full, old, or breaks the budget."""
@@ -274,6 +282,7 @@ class FileSeries:
             with contextlib.suppress(OSError):  # the same disk; a later start mends it
                 if file.frames == 0:
                     file.path.unlink(missing_ok=True)
+                    pin_path(file.path).unlink(missing_ok=True)
                 elif file.path.stat().st_size > file.whole_bytes:
                     os.truncate(file.path, file.whole_bytes)
         self._fail(why)
