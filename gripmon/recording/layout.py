@@ -9,8 +9,8 @@ from gripmon.recording import palette
 from gripmon.recording.overlay import IMAGE
 from gripmon.recording.wire import Scene
 
-_EYE = (0.78, -0.42, -0.04)  # beside and above, so that camera and gripper are both in sight
-_LOOK_AT = 0.7  # of the way from camera to TCP
+_EYE = (0.66, -0.36, -0.03)  # beside and above, so that camera and gripper are both in sight
+_LOOK_AT = 0.64  # of the way from camera to TCP
 _CLOSE_UP_MM = (-0.3, 0.3)
 _STATISTIC_SHOWN = (0.0, 2.0)  # a collision is hundreds of times the threshold; what matters is where it crosses 1
 
