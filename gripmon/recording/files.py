@@ -16,7 +16,7 @@ import rerun as rr
 
 from gripmon.recording.budget import DiskBudget, claim, space_missing
 from gripmon.recording.columns import Row
-from gripmon.recording.layout import make_blueprint
+from gripmon.recording.layout import layout_file
 from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
 from gripmon.recording.repair import repair
 from gripmon.recording.ring import Moments
@@ -71,6 +71,7 @@ class FileSeries:
     def __init__(self, scene: Scene, extra_sinks: Callable[[], Sequence[Any]] = tuple):
         rr.set_strict_mode(True)
         self._scene = scene
+        self._layout = layout_file(scene, APPLICATION_ID)
         self._settings = settings = scene.settings
         self._extra_sinks = extra_sinks
         self._directory = Path(scene.directory)
@@ -248,7 +249,7 @@ class FileSeries:
         try:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
-            stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
+            stream.log_file_from_contents("layout.rbl", self._layout)
             writer = RowWriter(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
@@ -263,6 +264,8 @@ class FileSeries:
         self._stream, self._writer = stream, writer
         self._file = _File(path, claim(path), time.monotonic())
         self.failure = None
+        # The streams of earlier files, which rerun would keep with their threads until the end.
+        rr.bindings.flush_and_cleanup_orphaned_recordings()  # type: ignore[attr-defined]
 
     def _room_missing(self) -> str:
         try:
