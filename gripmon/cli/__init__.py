@@ -22,6 +22,7 @@ from gripmon.cli import (
     send,
     simulate,
     teach,
+    view,
     watch,
 )
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
@@ -35,6 +36,7 @@ _COMMANDS = (
     schema,
     feed,
     replay,
+    view,
     report,
     export,
     correct,

@@ -47,6 +47,10 @@ class EventWriter:
         send.static("status/state", _configuration(palette.STATES))
         send.static("status/verdict", _configuration(palette.VERDICTS))
 
+    def repeat(self) -> None:
+        """Say state and verdict again with the next frame, changed or not."""
+        self._state = self._verdict = ""
+
     def write(self, rows: Sequence[Row], events: Events, more: Sequence[Line]) -> None:
         """``more`` are lines for the log that others have."""
         if rows:

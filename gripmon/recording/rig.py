@@ -52,6 +52,10 @@ class RigWriter:
         if len(self._triangles):
             send.static("rig/gripper/faces", _static_mesh(self._triangles))
 
+    def repeat(self) -> None:
+        """Draw the fingers again with the next frame, changed or not."""
+        self._drawn = None
+
     def write(self, rows: Sequence[Row]) -> None:
         posed = [row for row in rows if row.record.cam_T_grip is not None]
         if posed:

@@ -67,6 +67,11 @@ class RowWriter:
             self._rig.write(rows)
         self._events.write(rows, events, lines)
 
+    def repeat(self) -> None:
+        """Say again, with the next frame, what else is only said when it changes."""
+        self._events.repeat()
+        self._rig.repeat()
+
     def write_pictures(self, rows: Sequence[Row]) -> None:
         """Send the pictures of frames that were written before without them."""
         if rows:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from gripmon.recording.columns import Picture, Row
 from gripmon.recording.files import FileSeries
+from gripmon.recording.live import LiveStream, NoFiles
 from gripmon.recording.pins import pinned_by
 from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.settings import RecordingSettings
@@ -46,7 +47,8 @@ class RecordingLoop:
         self._memory_descriptor = memory_descriptor
         self._unframer = Unframer()
         self._scene: Scene | None = None
-        self._files: FileSeries
+        self._files: FileSeries | NoFiles
+        self._live: LiveStream | None = None
         self._ring: ImageRing
         self._moments: Moments
         self._before: PictureRing
@@ -76,14 +78,16 @@ class RecordingLoop:
                         self._files.write()
                         self._report()
             if self._scene is not None and (ended or time.monotonic() >= next_flush):
-                self._files.write()
+                for receiver in self._receivers():
+                    receiver.write()
                 next_report = time.monotonic()
                 next_flush = next_report + self._flush_period_s
             if time.monotonic() >= next_report:
                 self._report()
                 next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
-            self._files.close()
+            for receiver in self._receivers():
+                receiver.close()
             self._report()
 
     def _take(self, payload: bytes) -> None:
@@ -96,10 +100,12 @@ class RecordingLoop:
             self._around_ns = round(1e9 * scene.settings.around_alert_s)
             self._moments = Moments(self._around_ns)
             self._before = PictureRing(self._around_ns, scene.settings.ring_bytes)
-            self._files = FileSeries(scene)
+            self._files = FileSeries(scene) if scene.settings.enabled else NoFiles()
+            self._live = None if scene.view is None else LiveStream(scene, scene.view)
             return
         batch = self._decode(payload)
-        self._files.add_events(batch.events)
+        for receiver in self._receivers():
+            receiver.add_events(batch.events)
         for note in batch.frames:
             self._take_frame(note)
         for alert in batch.events.alerts:
@@ -124,7 +130,8 @@ class RecordingLoop:
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
-        self._files.add_frames([row])
+        for receiver in self._receivers():
+            receiver.add_frames([row])
 
     def _is_near(self, stamp_ns: int) -> bool:
         return self._around_ns > 0 and self._moments.near(stamp_ns)
@@ -136,7 +143,12 @@ class RecordingLoop:
         self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
         if self._around_ns > 0 and near_ns is not None:
             self._moments.add(near_ns)
-            self._files.add_pictures(self._before.take(self._moments))
+            pictures = self._before.take(self._moments)
+            for receiver in self._receivers():
+                receiver.add_pictures(pictures)
+
+    def _receivers(self) -> tuple[FileSeries | NoFiles | LiveStream, ...]:
+        return (self._files,) if self._live is None else (self._files, self._live)
 
     def _report(self) -> None:
         if self._scene is None:
@@ -148,6 +160,7 @@ class RecordingLoop:
             frames=files.frames_written,
             frames_lost=files.frames_lost,
             images_done=self._images_done,
+            view_failure=None if self._live is None else self._live.failure,
         )
         if self._parent_listens:
             try:

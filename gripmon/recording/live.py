@@ -1,0 +1,122 @@
+"""The recording as it is made, for viewers that connect: next to the files, never in their way.
+
+The server keeps what it has sent up to a limit, and drops the oldest: a viewer that stands still costs no more.  It is
+a stream of its own, so that files begin and end without a viewer's notice, and a viewer's end is none of the file's.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import rerun as rr
+
+from gripmon.recording.columns import Row
+from gripmon.recording.files import APPLICATION_ID
+from gripmon.recording.layout import make_blueprint
+from gripmon.recording.rows import RowWriter
+from gripmon.recording.view import LOOPBACK, ViewSettings
+from gripmon.recording.wire import Events, Scene
+
+_FLUSH_TIMEOUT_S = 1.0
+_REPEAT_S = 60.0  # what only changes say is said again, for viewers that join when it has been dropped
+_RETRY_S = 10.0
+
+
+class LiveStream:
+    """Serves the rows that it is given.  What can't be served is given up; ``failure`` says why, else it is None."""
+
+    def __init__(self, scene: Scene, settings: ViewSettings):
+        self._scene, self._settings = scene, settings
+        self._rows: list[Row] = []
+        self._late: list[Row] = []
+        self._events = Events()
+        self._newest_reference = scene.reference
+        self._stream: rr.RecordingStream | None = None
+        self._writer: RowWriter | None = None
+        self._repeat_at = self._retry_at = 0.0
+        self.failure: str | None = None
+
+    def add_frames(self, rows: Sequence[Row]) -> None:
+        self._rows += rows
+
+    def add_pictures(self, rows: Sequence[Row]) -> None:
+        """Pictures of frames that were added before without them."""
+        self._late += rows
+
+    def add_events(self, events: Events) -> None:
+        self._events += events
+        if events.references:
+            self._newest_reference = events.references[-1]
+
+    def write(self) -> None:
+        """Send what has been added; begin, or begin again, where that is due."""
+        now_s = time.monotonic()
+        rows, late, events = self._rows, self._late, self._events
+        self._rows, self._late, self._events = [], [], Events()
+        if self._writer is None and now_s < self._retry_at:
+            return
+        try:
+            stream, writer = self._begun()
+            if now_s >= self._repeat_at:
+                self._repeat_at = now_s + _REPEAT_S
+                writer.repeat()
+                if self._newest_reference not in events.references:
+                    events = Events(references=[self._newest_reference]) + events
+            writer.write(rows, events)
+            writer.write_pictures(late)
+            stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+            self.failure = None
+        except Exception as error:  # noqa: BLE001 - rerun raises its own kinds; none of them may touch the files
+            self._stream = self._writer = None
+            self._retry_at = now_s + _RETRY_S
+            reason = " ".join(str(error).split())
+            self.failure = f"the live view can't be served on {LOOPBACK}:{self._settings.port} ({reason})"
+
+    def close(self) -> None:
+        """Send the rest and end the server."""
+        if self._stream is not None:
+            self.write()
+        if self._stream is not None:
+            self._stream.disconnect()
+        self._stream = self._writer = None
+
+    def _begun(self) -> tuple[rr.RecordingStream, RowWriter]:
+        if self._stream is None or self._writer is None:
+            limit = f"{self._settings.memory_limit_bytes}B"
+            stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+            stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
+            stream.send_recording_name(f"{self._scene.name} (live)")
+            stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
+            self._stream, self._writer = stream, RowWriter(stream, self._scene, 0)
+            self._repeat_at = 0.0
+        return self._stream, self._writer
+
+
+class NoFiles:
+    """In the place of the files where recording is switched off and only the live view is wanted."""
+
+    path: str | None = None
+    failure: str | None = None
+    frames_lost = 0
+
+    def __init__(self) -> None:
+        self.frames_written = 0
+
+    def add_frames(self, rows: Sequence[Row]) -> None:
+        self.frames_written += len(rows)
+
+    def add_pictures(self, rows: Sequence[Row]) -> None:
+        pass
+
+    def add_events(self, events: Events) -> None:
+        pass
+
+    def pin(self, *_alert: object) -> None:
+        pass
+
+    def write(self) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
