@@ -86,9 +86,11 @@ class RecordingLoop:
                 self._report()
                 next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
-            for receiver in self._receivers():
-                receiver.close()
+            self._files.close()
+            released = self._live is None or self._live.close()
             self._report()
+            if not released:
+                os._exit(0)  # all is written, and rerun would wait for the viewer
 
     def _take(self, payload: bytes) -> None:
         if self._scene is None:
