@@ -23,7 +23,7 @@ from gripmon.recording.wire import Events, Scene
 _FLUSH_TIMEOUT_S = 1.0
 _REPEAT_S = 60.0  # what only changes say is said again, for viewers that join when it has been dropped
 _RETRY_S = 10.0
-_MOST_ROWS = 512  # that wait for the thread
+_MOST_ROWS, _WAITING_SHARE = 512, 0.25  # that wait for the thread, and the memory that their pictures may take
 _CLOSE_S = 2.0
 
 
@@ -49,16 +49,26 @@ class LiveStream:
 
     def add_frames(self, rows: Sequence[Row]) -> None:
         with self._lock:
-            self._rows = (self._rows + list(rows))[-_MOST_ROWS:]
+            self._rows = self._bounded(self._rows + list(rows))
 
     def add_pictures(self, rows: Sequence[Row]) -> None:
         """Pictures of frames that were added before without them."""
         with self._lock:
-            self._late = (self._late + list(rows))[-_MOST_ROWS:]
+            self._late = self._bounded(self._late + list(rows))
 
     def add_events(self, events: Events) -> None:
         with self._lock:
             self._events += events
+
+    def _bounded(self, rows: list[Row]) -> list[Row]:
+        """The newest of them, as many as may wait."""
+        left_bytes, kept = _WAITING_SHARE * self._settings.memory_limit_bytes, 0
+        for row in reversed(rows[-_MOST_ROWS:]):
+            left_bytes -= 0 if row.picture is None else len(row.picture.blob)
+            if left_bytes < 0:
+                break
+            kept += 1
+        return rows[len(rows) - kept :]
 
     def write(self) -> None:
         """Let the thread send what has been added; returns at once."""
