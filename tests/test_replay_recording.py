@@ -21,6 +21,7 @@ import rerun as rr
 import zenoh
 from loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
 from network_daemon import ENVIRONMENT
+from rerun.chunk import RrdReader
 
 from gripmon.cli import main
 from gripmon.cli.replay import _recorder
@@ -147,6 +148,7 @@ def test_a_run_with_commands_and_a_kept_state_is_decided_again_to_the_byte(
     source = "{kind: simulator, scenario: static, duration_s: 600.0, fps: 30.0, realtime: false}"
     config = configured(
         tmp_path, endpoint, source=source, state="{file: kept.json}", jaw="{source: zenoh}",
+        daemon="{stop_within_s: 120.0}",
         monitor="{jaw_sigma_m: 0.0001, recalibration: {mode: confirm}}",
     )  # fmt: skip
     done: dict[str, list[bool]] = {}
@@ -302,6 +304,50 @@ def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path,
     states = sum(a["state"] != b["state"] for a, b in pairs)
     verdicts = sum(a["verdict"] != b["verdict"] for a, b in pairs)
     assert f"{verdicts} another verdict, {states} another state" in said
+
+
+def contents(path: Path, entity: str, component: str) -> dict[int, Any]:
+    """The values of an entity by frame."""
+    values: dict[int, Any] = {}
+    for chunk in RrdReader(path).stream().filter(content=[f"/{entity}"], has_timeline="frame").to_chunks():
+        batch = chunk.to_record_batch()
+        values |= zip(batch.column("frame").to_pylist(), batch.column(component).to_pylist(), strict=True)
+    return values
+
+
+def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Drifts, limits, states and the log of both; what is replayed is a recording of its own, to be replayed again."""
+    then, both = tmp_path / "then.rrd", tmp_path / "both.rrd"
+    lines_then = replayed(
+        sequence, tmp_path / "then.jsonl", "--config", str(sequence_config(sequence)), "--recording", str(then)
+    )
+    text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
+    tight = sequence / "tight.yaml"
+    tight.write_text(text + "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004}, recalibration: {mode: 'off'}}\n")
+    lines_now = replayed(then, tmp_path / "now.jsonl", "--config", str(tight), "--recording", str(both))
+    shifts, scalars = "drift/tcp_shift_mm", "Scalars:scalars"
+    for entity, lines in ((f"recorded/{shifts}", lines_then), (shifts, lines_now)):
+        expected = {line["seq"]: line["drift"]["tcp_shift_m"] for line in map(json.loads, lines) if line["drift"]}
+        drawn = {seq: values for seq, values in contents(both, entity, scalars).items() if values}
+        assert drawn.keys() == expected.keys()
+        for seq, values in drawn.items():
+            assert values[:3] == pytest.approx([1e3 * v for v in expected[seq]], abs=1e-12), "mm"
+    policy = load_config(sequence / "config.yaml", check_source=False).settings.monitor.policy
+    for entity, limits_mm in (
+        ("drift/limits_mm", [0.1, 0.4]),
+        ("recorded/drift/limits_mm", [1e3 * policy.warn_m, 1e3 * policy.limit_m]),
+    ):
+        for drawn_mm in contents(both, entity, scalars).values():
+            assert drawn_mm == pytest.approx(limits_mm)
+    log = [text for (text,) in contents(both, "recorded/events", "TextLog:text").values()]
+    assert log and all(text.startswith("recorded: ") for text in log)
+    assert contents(both, "recorded/status/state", "StateChange:state") and contents(
+        both, "status/state", "StateChange:state"
+    )
+    assert replayed(both, tmp_path / "again.jsonl") == lines_now
+    capsys.readouterr()
+    replayed(then, tmp_path / "now.jsonl", "--recording", str(then), code=2)
+    assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is what is replayed; another file"]
 
 
 def test_another_calibration_begins_with_its_own_reference(

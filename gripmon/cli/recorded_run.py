@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,9 @@ from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.config import Config
+    from gripmon.recording.compared import ComparedRecorder
     from gripmon.recording.replayed import RecordedFrames
-    from gripmon.records import FrameRecord
+    from gripmon.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
 
@@ -88,6 +90,39 @@ class RecordedRun:
         judged = f"{self._verdicts} another verdict, {self._states} another state"
         return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}"
 
+    @contextlib.contextmanager
+    def compared_in(self, name: str) -> Iterator[ComparedRecorder]:
+        """A recorder into one file that shows what was recorded and what is replayed, overlaid."""
+        from gripmon.config.recorded import to_recorded
+        from gripmon.recording.compared import ComparedRecorder
+        from gripmon.recording.wire import make_scene
+
+        path, config = Path(name), self.config
+        if path.is_dir():
+            raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+        common.make_directory(path.parent, "--recording")
+        if path.resolve() in {source.resolve() for source in self.source.paths}:
+            raise common.CommandFailedError(f"--recording {path}: is what is replayed; another file", common.EXIT_USAGE)
+        part = path.with_name(f".{path.name}.part")
+        settings, reference = config.settings, config.reference
+        if self.past.state is not None:
+            reference = self.past.state.references[-1]
+        scene = make_scene(
+            settings.recording, str(path.parent), path.stem, settings.robot, settings.camera_name, config.camera,
+            config.gripper, reference, configuration=to_recorded(config, self.past.state),
+        )  # fmt: skip
+        try:
+            recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
+        except OSError as error:
+            raise common.not_writable(path, error, "--recording") from None
+        try:
+            yield recorder
+        finally:
+            recorder.close()
+            part.replace(path)
+        if recorder.failure:
+            print(f"replay: {path} isn't complete ({recorder.failure})", file=sys.stderr)
+
     def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
         from gripmon.config import ConfigError
         from gripmon.config.recorded import from_recorded
@@ -141,6 +176,17 @@ class RecordedRun:
                 "their records say",
                 file=sys.stderr,
             )
+
+
+def _limits(config: Config | None) -> Limits | None:
+    """Those that a configuration sets; what a monitor learns of a stream is not among them."""
+    from gripmon.records import Limits
+
+    if config is None:
+        return None
+    policy, nothing = config.settings.monitor.policy, (0.0,) * 6
+    of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
+    return Limits(*of_policy, nothing, None, None, None, nothing, nothing)
 
 
 def _holds_recordings(path: Path) -> bool:

@@ -58,16 +58,17 @@ def make_blueprint(scene: Scene) -> rrb.Blueprint:
         plot_legend=rrb.PlotLegend(visible=False),
     )
     status = rrb.StateTimelineView(origin="status", name="State and verdict", time_view=axis)
-    judged = rrb.Vertical(_rig(scene), drift, test, status, _details(scene, axis), row_shares=[3.9, 4, 2.1, 2, 2.6])
+    judged = rrb.Vertical(rig_view(scene), drift, test, status, _details(scene, axis), row_shares=[3.9, 4, 2.1, 2, 2.6])
     return rrb.Blueprint(
-        rrb.Horizontal(rrb.Vertical(_image(scene), _events(), row_shares=[7, 2.4]), judged, column_shares=[5, 4]),
+        rrb.Horizontal(rrb.Vertical(image_view(scene), _events(), row_shares=[7, 2.4]), judged, column_shares=[5, 4]),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="capture_time"),
     )
 
 
-def _image(scene: Scene) -> rrb.Spatial2DView:
+def image_view(scene: Scene) -> rrb.Spatial2DView:
+    """The image with its overlay."""
     bounds = rrb.VisualBounds2D(x_range=[-0.5, scene.width_px - 0.5], y_range=[-0.5, scene.height_px - 0.5])
     name = f"{scene.robot} / {scene.camera} (edge points: green used, red refused; corners yellow; predicted blue)"
     return rrb.Spatial2DView(origin="rig/camera", contents=f"{IMAGE}/**", name=name, visual_bounds=bounds)
@@ -78,7 +79,8 @@ def _events() -> rrb.TextLogView:
     return rrb.TextLogView(origin="events", name="Alerts and changes", columns=columns)
 
 
-def _rig(scene: Scene) -> rrb.Spatial3DView:
+def rig_view(scene: Scene) -> rrb.Spatial3DView:
+    """Camera and gripper in space."""
     tcp_m = np.array(scene.reference.cam_T_grip.translation_m)
     distance_m = float(np.linalg.norm(tcp_m))
     target_m = _LOOK_AT * tcp_m

@@ -179,12 +179,18 @@ def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> P
         _, blob = cv2.imencode(".png", exact, (cv2.IMWRITE_PNG_COMPRESSION, 1))
     else:
         _, blob = cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
+    return measured_picture(blob.tobytes(), f"image/{settings.image_format}", shown)
+
+
+def measured_picture(blob: bytes, media_type: str, image: NDArray[np.generic]) -> Picture:
+    """An encoded image with what tells of the quality of its pixels."""
+    shown = to_8_bit(image)
     grey = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY)
     mean, deviation = cv2.meanStdDev(grey)
     laplacian = cv2.Laplacian(grey, cv2.CV_16S)
     return Picture(
-        blob=blob.tobytes(),
-        media_type=f"image/{settings.image_format}",
+        blob=blob,
+        media_type=media_type,
         mean_grey=float(mean[0, 0]),
         contrast_grey=float(deviation[0, 0]),
         saturated_percent=100.0 * float(np.count_nonzero(grey >= 254)) / grey.size,
