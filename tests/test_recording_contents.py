@@ -55,6 +55,8 @@ LATE = msgspec.structs.replace(
     scatter=(4e-6, 5e-6, 6e-6, 1e-4, 2e-4, 3e-4),
 )
 RAISED = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved", AlertEvent.RAISED, "a-1")
+UPDATED = msgspec.structs.replace(RAISED, event=AlertEvent.UPDATED, text="still so")
+OTHER = msgspec.structs.replace(RAISED, event=AlertEvent.UPDATED, kind=AlertKind.CREEP, severity=Severity.WARNING)
 CLEARED = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.INFO, "back", AlertEvent.CLEARED, "a-1")
 CONFIGURATION = RecordedConfiguration(
     "arm.yaml",
@@ -64,13 +66,13 @@ CONFIGURATION = RecordedConfiguration(
 
 
 def told_of(i: int) -> FrameRecord:
-    """Frame 7 was refused; 4 raises an alert, 9 clears it."""
+    """Frame 7 was refused; 4 raises an alert, in 8 it becomes another, 9 clears it."""
     if i == 7:
         return record(i, cam_T_grip=None, covariance=None, drift=None, rms_px=None, reason="black")
     pose = record(i + 1000).cam_T_grip
     assert pose is not None
     covariance = tuple((0.25 * np.array(record(i).covariance)).tolist())
-    alerts = {4: (RAISED,), 9: (CLEARED,)}.get(i, ())
+    alerts = {4: (RAISED,), 5: (UPDATED,), 8: (OTHER,), 9: (CLEARED,)}.get(i, ())
     return record(i, alerts=alerts, smoothed=Smoothed(pose.translation_m, pose.rotation_xyzw, covariance))
 
 
@@ -207,6 +209,7 @@ def test_an_alert_marks_the_drift_where_it_is_raised(told: Recorded) -> None:
     marks = told.by_seq("drift/alerts/error", "scalars")
     assert set(marks) == {4}
     np.testing.assert_allclose(marks[4], [1e3 * float(np.linalg.norm(drift.tcp_shift_m))], rtol=1e-12)
+    assert set(told.by_seq("drift/alerts/warning", "scalars")) == {8}, "it became another one"
     assert not told.timed("drift/alerts/info"), "what is cleared is no news"
 
 

@@ -7,7 +7,7 @@
 ``drift/limits_mm``, ``_deg``       of that length and turn: for a warning, for an error and a new reference (of ``d``)
 ``drift/noticed_mm``, ``_deg``      between which two a constant shift along an axis passes unnoticed: x, y, z; x, y, z
 ``drift/truth_mm``, ``error_mm``    where a simulator tells the truth
-``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised or noted
+``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised, noted or another
 ``test/share``                      the drift test's largest statistic over its threshold;  ``test/alarm`` is 1
 ``transform``                       translation (m) and quaternion x, y, z, w, raw and smoothed
 ``sigma/…``                         standard deviations, raw and smoothed;  ``noise/…`` what was learnt of the stream's
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from gripmon.recording import palette
 from gripmon.recording.columns import Row, Sender
 from gripmon.recording.wire import Scene, TraceNote, pairs
-from gripmon.records import AlertEvent, FrameRecord, Limits, ReferenceRecord, Severity
+from gripmon.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 
 _XYZ = ["x", "y", "z"]
 _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
@@ -46,6 +46,7 @@ class CurveWriter:
         self._send = send
         self._corner_ids = scene.corner_ids
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
+        self._told: dict[str, tuple[AlertKind, Severity]] = {}  # of the alerts that are open
         self._newest: Row | None = None
         self._drawn_ns: int | None = None
         _log_styles(send, scene)
@@ -94,12 +95,26 @@ class CurveWriter:
             truths_mm = [self._shift_mm(r, r.truth_tcp_m) for r in rows]
             send.scalars("drift/truth_mm", rows, truths_mm)
             send.scalars("drift/error_mm", rows, list(map(_difference, shifts_mm, truths_mm)))
+        news = [self._news(r.record) for r in rows]
         for severity in Severity:
-            marked = [i for i, r in enumerate(rows) if _tells_news(r.record, severity)]
+            marked = [i for i, some in enumerate(news) if severity in some]
             if marked:
                 # Without a drift to mark it stands on the axis.
                 heights_mm = [with_length_mm[i][3] if with_length_mm[i] else 0.0 for i in marked]
                 send.curve(f"drift/alerts/{severity}", [rows[i] for i in marked], heights_mm)
+
+    def _news(self, record: FrameRecord) -> set[Severity]:
+        """Of alerts that are raised or noted, or have become another kind or severity: a creep that ends in a step."""
+        news = set()
+        for alert in record.alerts:
+            if alert.event is AlertEvent.CLEARED:
+                self._told.pop(alert.alert_id, None)
+                continue
+            if alert.event is not AlertEvent.UPDATED or self._told.get(alert.alert_id) != (alert.kind, alert.severity):
+                news.add(alert.severity)
+            if alert.alert_id:
+                self._told[alert.alert_id] = alert.kind, alert.severity
+        return news
 
     def _shift_mm(self, row: Row, tcp_m: tuple[float, float, float] | None) -> _Millimetres:
         """A TCP against the one of the reference that the frame names; empty where either is unknown."""
@@ -236,11 +251,6 @@ def _band_mm(record: FrameRecord) -> _Millimetres:
     shift_m = record.drift.tcp_shift_m
     sigma_m = [math.sqrt(variance) for variance in record.covariance[:21:7]]
     return [1e3 * (v + sign * s) for sign in (-1.0, 1.0) for v, s in zip(shift_m, sigma_m, strict=True)]
-
-
-def _tells_news(record: FrameRecord, severity: Severity) -> bool:
-    news = (AlertEvent.RAISED, AlertEvent.NOTED)
-    return any(alert.severity is severity and alert.event in news for alert in record.alerts)
 
 
 def _noticed(limits: Limits, axes: slice, scale: float) -> list[float]:
