@@ -104,10 +104,15 @@ def _changes(run: Run) -> list[changes.Found]:
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
-        changes.Found(*(int(good[k]) for k in (found.index, found.first, found.last)))
+        changes.Found(*(int(good[k]) for k in (found.index, found.first, found.last)), excess=found.excess)
         for found in changes.find(y, 3600.0 / run.frame_s)
-        if _is_sharp(y, found.index)
+        if (found.excess > changes.MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
+
+
+def _surely_moved(y: Array, index: int) -> bool:
+    before, after = y[max(index - RAMP_FRAMES, 0) : index].mean(axis=0), y[index : index + RAMP_FRAMES].mean(axis=0)
+    return float(((after - before) ** 2).sum()) > SURELY_MOVED
 
 
 def _is_sharp(y: Array, index: int) -> bool:
@@ -123,8 +128,7 @@ def _is_sharp(y: Array, index: int) -> bool:
         for shift in (-0.33, 0.0, 0.33)
     ]
     left = [_unexplained(part, law) for law in (step, *ramps)]
-    before, after = part[max(middle - 16, 0) : middle].mean(axis=0), part[middle : middle + 16].mean(axis=0)
-    return left[0] <= min(left[1:]) or float(((after - before) ** 2).sum()) > SURELY_MOVED
+    return left[0] <= min(left[1:]) or _surely_moved(y, index)
 
 
 def _unexplained(part: Array, law: Array) -> float:
