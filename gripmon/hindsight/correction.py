@@ -104,7 +104,7 @@ def _changes(run: Run) -> list[changes.Found]:
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
-        changes.Found(*(int(good[k]) for k in (found.index, found.first, found.last)), excess=found.excess)
+        changes.Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
         for found in changes.find(y, 3600.0 / run.frame_s)
         if (found.excess > changes.MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
