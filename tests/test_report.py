@@ -251,3 +251,50 @@ def test_a_long_run_is_short_on_the_page_and_loses_no_outlier():
     assert max(x.high) == pytest.approx(2e-3, abs=1e-4)
     near = [t for t in x.stamp_ns if abs(t - (START_NS + 30_000 * PERIOD_NS)) <= SECOND_NS]
     assert len(near) == 2 * FPS + 1, "around a motion every frame is there"
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_whatever_a_run_holds_there_is_a_report(seed: int):
+    """Frames with holes, wild clocks, covariances of zero, references nobody has, alerts in any order."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 120)) if seed % 3 else int(rng.integers(1, 6))
+    shifts_m = np.cumsum(rng.normal(size=(n, 3)) * (0.0, 1e-6, 1e-3)[seed % 3], axis=0)
+    shifts_m[rng.random(n) < 0.5 * rng.random()] = np.nan
+    run = records(shifts_m, seed)
+    for _ in range(6):
+        said(
+            run,
+            int(rng.integers(n)),
+            kind=list(AlertKind)[rng.integers(len(AlertKind))],
+            event=list(AlertEvent)[rng.integers(4)],
+            severity=list(Severity)[rng.integers(3)],
+            alert_id=("", "1", "2")[rng.integers(3)],
+            since_ns=(None, 5, 2**62)[rng.integers(3)],
+        )
+    if seed % 4 == 1:
+        run = [msgspec.structs.replace(r, stamp_ns=int(rng.integers(-(2**62), 2**62))) for r in run]
+    if seed % 4 == 2:
+        run = [msgspec.structs.replace(r, revision=int(rng.integers(-1, 2))) for r in run if rng.random() < 0.7]
+    if seed % 5 == 3:
+        run = [msgspec.structs.replace(r, covariance=(0.0,) * 36 if r.covariance else None) for r in run]
+    report, told = build([Run(run, references=(REFERENCE,) * (seed % 2), image_seqs=np.arange(0, 200, 3))])
+    assert msgspec.json.decode(to_json(report), type=Report).recordings[0].running.frames == len(run)
+    assert report.summary and (seed % 8 or page(report, told))
+
+
+def test_a_clock_that_jumps_by_years_stretches_nothing():
+    run = stepped()
+    year_ns = 365 * 86400 * SECOND_NS
+    run.records[300:] = [msgspec.structs.replace(r, stamp_ns=r.stamp_ns + year_ns) for r in run.records[300:]]
+    recording = only(run)
+    assert any("jumps ahead by 31536000 s at frame 300" in fault for fault in recording.faults)
+    assert recording.end_ns - recording.start_ns == 499 * PERIOD_NS
+
+
+def test_a_step_that_no_alert_told_of_is_found_afterwards():
+    shifts_m = np.zeros((800, 3))
+    shifts_m[500:, 1] = 1e-3
+    (event,) = only(Run(records(shifts_m))).events
+    assert event.kind == "step" and event.noticed_ns is None and event.onset.found_by == "hindsight"
+    assert event.onset.earliest_ns <= START_NS + 500 * PERIOD_NS <= event.onset.latest_ns
+    assert event.moved.size_m == pytest.approx(1e-3, abs=1e-5)

@@ -198,6 +198,17 @@ def test_nothing_usable_is_one_line(
     assert not (tmp_path / "page.html").exists()
 
 
+def test_another_application_s_recording_is_none(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    import rerun as rr
+
+    other = tmp_path / "other.rrd"
+    with rr.RecordingStream("somebody_else") as stream:
+        stream.save(other)
+        stream.log("points", rr.Points2D([[1.0, 2.0]]))
+    code, out, err = run(capsys, str(other), "--json", "-")
+    assert code == 3 and out == "" and len(err.splitlines()) == 1 and "somebody_else" in err
+
+
 def test_a_bad_file_beside_a_good_one_is_told(
     collision: tuple[Path, Simulator], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gripmon.report.formats import clock_time
 
 SECOND_NS = 1_000_000_000
+_LONGEST_NS = 7 * 86400 * SECOND_NS  # a pause within one run
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,25 +37,31 @@ class Clock:
 
 
 def straightened(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> tuple[Clock, tuple[str, ...]]:
-    """Where the clock was set back, time goes on as before by one frame's length; what was done, in words."""
-    steps = np.diff(stamp_ns)
-    back = np.flatnonzero(steps < 0)
-    if not back.size:
+    """Where the clock was set back, or ahead by more than a week, time goes on as before by one frame's length; what
+    was done, in words.
+    """
+    steps_ns = np.diff(stamp_ns.astype(np.float64))  # as integers those of absurd stamps would overflow
+    wrong = np.flatnonzero((steps_ns < 0.0) | (steps_ns > _LONGEST_NS))
+    absurd = bool(len(stamp_ns)) and not 0 <= int(stamp_ns[0]) < 2**62
+    if not wrong.size and not absurd:
         return Clock(seq, stamp_ns), ()
-    forward = steps[steps > 0]
-    usual = int(np.median(forward)) if forward.size else SECOND_NS // 30
-    offset = np.zeros(len(seq), np.int64)
-    offset[back + 1] = usual - steps[back]
-    out = stamp_ns + np.cumsum(offset)
-    return Clock(seq, out), (_told(seq, stamp_ns, back.tolist(), int(offset.sum())),)
+    sound = steps_ns[(steps_ns > 0.0) & (steps_ns <= _LONGEST_NS)]
+    steps = np.diff(stamp_ns)
+    steps[wrong] = int(np.median(sound)) if sound.size else SECOND_NS // 30
+    out = (0 if absurd else int(stamp_ns[0])) + np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
+    faults = ["the first frame's time is absurd; times are shown from 1970 on"] if absurd else []
+    if wrong.size:
+        faults.append(_told(seq, stamp_ns, wrong.tolist(), 1e-9 * (float(out[-1]) - float(stamp_ns[-1]))))
+    return Clock(seq, out), tuple(faults)
 
 
-def _told(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], back: Sequence[int], total_ns: int) -> str:
-    i = int(back[0])
-    by_s = 1e-9 * float(stamp_ns[i] - stamp_ns[i + 1])
-    more = f" and {len(back) - 1} more times" if len(back) > 1 else ""
+def _told(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], wrong: Sequence[int], off_s: float) -> str:
+    i = wrong[0]
+    by_s = 1e-9 * (float(stamp_ns[i + 1]) - float(stamp_ns[i]))
+    how = f"runs backwards by {-by_s:.3f} s" if by_s < 0.0 else f"jumps ahead by {by_s:.0f} s"
+    more = f" and {len(wrong) - 1} more times" if len(wrong) > 1 else ""
+    late = f"{abs(off_s):.3f} s {'later' if off_s > 0.0 else 'earlier'} than stamped"
     return (
-        f"time runs backwards by {by_s:.3f} s at frame {int(seq[i + 1])} (after {clock_time(int(stamp_ns[i]))}){more}: "
-        f"from there on times are shown as if the clock had gone on, at the end {1e-9 * total_ns:.3f} s later than "
-        "stamped"
+        f"time {how} at frame {int(seq[i + 1])} (after {clock_time(int(stamp_ns[i]))}){more}: from there on times are "
+        f"shown as if the clock had gone on, at the end {late}"
     )

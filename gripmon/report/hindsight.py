@@ -80,11 +80,12 @@ def look_back(source: Source, track: Track, said_ns: Sequence[int], limits: Limi
             continue
         matrices = table.matrices() if matrices is None else matrices
         try:
-            found = correct(track.stamp_ns[part], matrices[part], table.covariance[part], track.measured[part])
+            with np.errstate(all="ignore"):  # what comes of it is not finite, and left out below
+                found = correct(track.stamp_ns[part], matrices[part], table.covariance[part], track.measured[part])
         except (ValueError, np.linalg.LinAlgError):
             # Frames that repeat one another to the last digit have no noise to compare with: what they show has to do.
             continue
-        points += found.change_points
+        points += [p for p in found.change_points if np.isfinite(p.size).all()]
     return Hindsight(tuple(points))
 
 

@@ -127,7 +127,7 @@ def _line(
     )  # fmt: skip
     figure.add_scatter(
         x=x, y=y, mode="lines", line={"color": colour, "width": 1.6}, name=name, legendgroup=f"{row} {name}",
-        showlegend=legend, row=row, col=1, hovertemplate=f"{name}: %{{y:.3f}}<extra></extra>",
+        showlegend=legend, row=row, col=1, hovertemplate=f"{name}: %{{y:.3f}}<br>%{{x|%H:%M:%S.%L}} UTC<extra></extra>",
     )  # fmt: skip
 
 
