@@ -195,7 +195,8 @@ def test_several_robots_stand_on_one_axis_and_by_themselves():
     later = records(np.zeros((100, 3)), start_ns=START_NS + 3600 * SECOND_NS)
     report, told = build([Run(later, robot="other", recording_id="run-2"), stepped()])
     assert [r.robot for r in report.recordings] == ["arm", "other"]
-    assert report.summary.startswith("2 recordings of 2 cameras; the camera moved in 1 of them.")
+    assert report.summary.startswith("2 recordings of 2 cameras; the camera moved in 1 of them. arm / wrist moved once")
+    assert "at the end its TCP is 3 mm off" in report.summary
     shown = page(report, told)
     assert b'id="data-overview"' in shown and b'id="recording-2"' in shown
     assert "The camera of other / wrist did not move" in text_of(shown)

@@ -24,7 +24,7 @@ from gripmon.report.motions import motions_of
 from gripmon.report.running import running_of
 from gripmon.report.source import Source, main_text
 from gripmon.report.track import Track, displacement, make_track
-from gripmon.report.words import paragraph
+from gripmon.report.words import headline, paragraph
 
 _END_FRAMES = 15
 _NEIGHBOURS = 6
@@ -184,11 +184,11 @@ def _with_overlay(source: Source, seqs: NDArray[np.int64]) -> int:
 
 
 def _summary(reports: Sequence[RecordingReport]) -> str:
-    """One paragraph for all; of several the ones whose camera moved come first."""
+    """One paragraph for all: of several a sentence each for those whose camera moved."""
     if len(reports) == 1:
         return reports[0].summary
     robots = len({(r.robot, r.camera) for r in reports})
     moved = [r for r in reports if any(e.kind in MOTIONS for e in r.events)]
     which = f"{count(len(reports), 'recording')} of {count(robots, 'camera')}"
     head = f"{which}; the camera moved in {len(moved) or 'none'} of them."
-    return " ".join([head, *(r.summary for r in moved)])
+    return " ".join([head, *(headline(r) for r in moved)])

@@ -47,6 +47,22 @@ def paragraph(report: RecordingReport) -> str:
     return " ".join(part for part in parts if part)
 
 
+def headline(report: RecordingReport) -> str:
+    """The same in a sentence, for one recording among several."""
+    motions = [event for event in report.events if event.kind in MOTIONS]
+    largest = max(motions, key=lambda e: e.moved.size_m if e.moved else 0.0)
+    when = f"{date(largest.onset.stamp_ns)} {clock_time(largest.onset.stamp_ns)}"
+    most = "" if len(motions) == 1 else ", farthest"
+    text = f"{report.robot} / {report.camera} moved {_times(len(motions))}{most} at {when}"
+    text += f" by {size(largest.moved)}" if largest.moved else ""
+    end = "" if report.at_end is None else f"; at the end its TCP is {millimetres(report.at_end.size_m)} off"
+    return f"{text}: {cause_words(largest)}{end}."
+
+
+def _times(number: int) -> str:
+    return {1: "once", 2: "twice"}.get(number, f"{number} times")
+
+
 def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
     who = f"he camera of {report.robot} / {report.camera}"
     when = f"{date(report.start_ns)}, {clock_time(report.start_ns, 0)} to {clock_time(report.end_ns, 0)} UTC"
@@ -56,10 +72,9 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
         return f"T{who} did not move ({when}): no motion was reported in {span(report.start_ns, report.end_ns)}."
     told = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MOST_TOLD]
     told.sort(key=lambda e: e.onset.stamp_ns)
-    times = "once" if len(motions) == 1 else "twice" if len(motions) == 2 else f"{len(motions)} times"
     largest = " The largest:" if len(told) < len(motions) else ""
     sentences = " ".join(_motion(event, i == 0) for i, event in enumerate(told))
-    return f"T{who} moved {times} ({when}).{largest} {sentences}"
+    return f"T{who} moved {_times(len(motions))} ({when}).{largest} {sentences}"
 
 
 def _motion(event: Event, first: bool) -> str:
