@@ -1,6 +1,6 @@
 """Frames out of a recording, for replay through the same core.
 
-To the bit it only is what happened where every frame's image was kept without loss (``images: all``, ``image_format:
+To the bit it only is what happened where every frame's image was kept without loss (``image_every: 1``, ``image_format:
 png``); float images are recorded with 8 bits.  A recording holds fewer images by default, and as JPEG: replaying it
 comes close.
 
@@ -12,6 +12,7 @@ the stream would have seen in such pixels (that another camera delivers them) is
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -208,7 +209,9 @@ def _reader(path: Path) -> Any:
     from rerun.chunk import RrdReader
 
     try:
-        return RrdReader(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that a file has no footer, for one: its writer was killed
+            return RrdReader(path)
     except Exception as error:  # whatever rerun's reader raises: the file is at fault
         raise _unreadable(path, error) from error
 
