@@ -26,6 +26,8 @@ WILD_FREEDOM = 12.0
 """Student's degrees of freedom of a block's error."""
 SURELY_MOVED = 60.0
 """Squared size of a change, in units of what frames claim, that no background explains."""
+LEAST_KEPT = 0.3
+"""Least variance over the reported one: a background that stays as long as the recording shows nothing of its error."""
 RAMP_FRAMES = 32
 PASSES = 2
 
@@ -220,7 +222,7 @@ def _sizes(run: Run, fit: _Fit) -> list[float]:
 def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
     segment = _segments(run, fit.found)
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s, segment)
-    variance = variance + fit.shares.unseen
+    variance = np.maximum(variance + fit.shares.unseen, LEAST_KEPT)
     good = np.flatnonzero(run.usable)
     source = np.full(len(x), GAP, np.int8)
     source[good], source[wild] = SMOOTHED, DISBELIEVED
