@@ -22,7 +22,7 @@ from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
 from gripmon.records import Alert, AlertRecord, Limits
 
-_NICENESS = 10  # the loop goes first when both want the same core
+_NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0
 _FRAMES_A_WRITE = 128
 _REPORT_PERIOD_S = 1.0  # the daemon must hear something
