@@ -15,8 +15,8 @@ from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.config import Config
+    from gripmon.playback.replayed import RecordedFrames
     from gripmon.recording.compared import ComparedRecorder
-    from gripmon.recording.replayed import RecordedFrames
     from gripmon.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
@@ -51,13 +51,14 @@ class RecordedRun:
 
     def __init__(self, paths: list[Path], config_path: str | None, opened: contextlib.ExitStack) -> None:
         """``config_path`` None: the recorded configuration.  What is opened is closed with ``opened``."""
-        from gripmon.recording.replayed import RecordedFrames
-        from gripmon.sources import SourceError
+        from gripmon.playback.replayed import RecordedFrames, SeveralRunsError, UnusableError
 
         try:
             self.source: RecordedFrames = RecordedFrames(recording_files(paths))
-        except SourceError as error:
-            raise common.CommandFailedError(f"{paths[0]}: {error}", common.EXIT_USAGE) from None
+        except SeveralRunsError as error:
+            raise common.CommandFailedError(f"replay: {error}", common.EXIT_USAGE) from None
+        except UnusableError as error:
+            raise common.CommandFailedError(f"replay: {error}") from None
         self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self.recorded_config = self._recorded_config(opened)
         if config_path is not None:
@@ -77,7 +78,7 @@ class RecordedRun:
         import msgspec
 
         then = self.source.record
-        assert then is not None, "only frames with a record are replayed"
+        assert then is not None, "every replayed frame has a record"
         self._frames += 1
         self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == record
         self._verdicts += then.verdict is not record.verdict
@@ -85,10 +86,13 @@ class RecordedRun:
 
     def summary(self) -> str:
         """How many frames were judged otherwise than then."""
+        lost, damaged = self.source.passed_over, self.source.images_damaged
+        unread = f"; {lost} more could no longer be read" if lost else ""
+        unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
         if self._same == self._frames:
-            return f"replay: all {self._frames} as they were recorded, every number the same"
+            return f"replay: all {self._frames} as they were recorded, every number the same{unread}"
         judged = f"{self._verdicts} another verdict, {self._states} another state"
-        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}"
+        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}{unread}"
 
     @contextlib.contextmanager
     def compared_in(self, name: str) -> Iterator[ComparedRecorder]:
@@ -164,6 +168,8 @@ class RecordedRun:
 
     def _say_what_is_missing(self) -> None:
         source = self.source
+        for fault in source.faults:
+            print(f"replay: {fault}", file=sys.stderr)
         if source.frames_without_image:
             print(
                 f"replay: {self.name} holds images of {len(source) - source.stand_ins} frames; "

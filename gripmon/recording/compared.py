@@ -11,6 +11,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
+from gripmon.playback.replayed import RecordedFrames
 from gripmon.recording import palette
 from gripmon.recording.columns import Picture, Row, Sender
 from gripmon.recording.curves import CurveWriter
@@ -18,7 +19,6 @@ from gripmon.recording.events import EventWriter
 from gripmon.recording.files import APPLICATION_ID
 from gripmon.recording.layout import image_view, rig_view
 from gripmon.recording.recorder import Notes, Trace
-from gripmon.recording.replayed import RecordedFrames
 from gripmon.recording.rows import RowWriter
 from gripmon.recording.wire import Events, Scene, pack_trace
 from gripmon.recording.worker import measured_picture
