@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -105,6 +107,45 @@ def test_the_track_lies_on_the_recordings_timelines(estimates: Path, tmp_path: P
     np.testing.assert_allclose(written, [f["cam_T_grip"]["translation_m"] for f in frames], atol=1e-7)
     assert any(STEP_SEQ in b.column("frame").to_pylist() for b in found["/corrected/events"])
     assert "/corrected/raw_shift_mm" in found and "/corrected/smoothed_shift_mm" in found
+
+
+def test_several_runs_get_a_track_each_and_replace_nothing(estimates: Path, tmp_path: Path, capsys):
+    from rerun.chunk import RrdReader
+
+    again = tmp_path / "again.jsonl"
+    again.write_bytes(b"".join(estimates.read_bytes().splitlines(keepends=True)[:300]))
+    arguments = ["correct", str(estimates), str(again), "--out", str(tmp_path / "c.rrd")]
+    assert main(arguments) == 0
+    written = sorted(tmp_path.glob("*.rrd"))
+    assert [path.name for path in written] == ["c-1.rrd", "c-2.rrd"]
+    assert [line for line in capsys.readouterr().out.splitlines() if line.startswith("written")] == [
+        f"written: {path}" for path in written
+    ]
+    assert len({RrdReader(path).recordings()[0].recording_id for path in written}) == 2
+    before = [path.read_bytes() for path in written]
+    code, said = failed(arguments, capsys)
+    assert code == 2 and said.count("\n") == 1 and str(written[0]) in said
+    assert [path.read_bytes() for path in written] == before and sorted(tmp_path.glob("*.rrd")) == written
+
+
+@pytest.mark.parametrize("suffix", [".jsonl", ".parquet", ".rrd"])
+def test_a_full_disk_leaves_what_was_there(estimates: Path, tmp_path: Path, suffix: str):
+    """A limit on a file's length, in a process of its own, stands for the disk's end."""
+    out = tmp_path / f"c{suffix}"
+    out.write_bytes(b"an earlier one")
+    limited = (
+        "import resource, signal, sys\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\n"
+        "from gripmon.cli import main\n"
+        "sys.exit(main(sys.argv[1:]))"
+    )
+    command = [sys.executable, "-c", limited, "correct", str(estimates), "--out", str(out)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 3 and "Traceback" not in done.stderr
+    assert f"--out {out}: writing failed" in done.stderr.splitlines()[-1]
+    assert out.read_bytes() == b"an earlier one"
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([out.name, estimates.name])
 
 
 def test_given_instants(estimates: Path, tmp_path: Path, capsys):

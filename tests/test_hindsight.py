@@ -216,3 +216,51 @@ def test_instants_between_frames_lie_between_and_say_so():
     # In the frame of the step it may be on either side.
     assert np.sqrt(covariances[2, 1, 1]) == pytest.approx(0.5 * 20.0 * STEP[1], rel=0.1)
     assert np.isnan(poses[3]).all() and segments[3] == -1
+
+
+def odd_runs() -> dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Stamps, transforms and covariances that no estimator was made for, though recordings hold them."""
+    count, rng = 300, np.random.default_rng(4)
+    stamp_ns = START_NS + np.arange(count) * PERIOD_NS
+    still = np.tile(np.eye(4), (count, 1, 1))
+    still[:, 2, 3] = 0.11
+    shaking = still.copy()
+    shaking[:, :3, 3] += 1e-5 * rng.normal(size=(count, 3))
+    moved = still.copy()
+    moved[150:, 0, 3] += 1e-3
+    frozen = shaking.copy()
+    frozen[100:150] = frozen[100]
+    usual = np.tile(np.diag([1e-10] * 3 + [1e-8] * 3), (count, 1, 1))
+    some_singular = usual.copy()
+    some_singular[100:103] = 1e-10
+    return {
+        "repeated to the bit": (stamp_ns, still, usual),
+        "a step, without noise": (stamp_ns, moved, usual),
+        "repeated for a while": (stamp_ns, frozen, usual),
+        "no turn at all": (stamp_ns, shaking, usual),
+        "all at one time": (np.full(count, START_NS), shaking, usual),
+        "two frames a stamp": (START_NS + np.arange(count) // 2 * PERIOD_NS, shaking, usual),
+        "time backwards": (stamp_ns[::-1].copy(), shaking, usual),
+        "years between": (stamp_ns + np.where(np.arange(count) < 150, 0, 10**18), shaking, usual),
+        "singular covariances": (stamp_ns, shaking, some_singular),
+        "large covariances": (stamp_ns, shaking, 1e12 * usual),
+    }
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("name", odd_runs())
+def test_odd_recordings_are_corrected_without_a_fault(name: str):
+    stamp_ns, poses, covariance = odd_runs()[name]
+    made = correct(stamp_ns, poses, covariance, np.ones(len(poses), bool))
+    assert np.abs(made.cam_T_grip[:, :3, 3] - poses[:, :3, 3]).max() < 6e-5, "no farther away than frames scatter"
+    assert (np.linalg.eigvalsh(made.covariance)[:, 0] > 0.0).all()
+    assert [point.index for point in made.change_points] == [150] * (name == "a step, without noise")
+    said = {"time backwards": "backwards", "years between": "gaps", "singular covariances": "3 frames aren't positive"}
+    assert bool(made.faults) == (name in said) and all(said[name] in fault for fault in made.faults)
+
+
+def test_covariances_that_are_none_are_said():
+    stamp_ns, poses, covariance = odd_runs()["no turn at all"]
+    for wrong in (np.full_like(covariance, 1e-10), covariance * 1e-300, covariance - 3e-10 * np.eye(6)):
+        with pytest.raises(ValueError, match="aren't positive definite"):
+            correct(stamp_ns, poses, wrong, np.ones(len(poses), bool))

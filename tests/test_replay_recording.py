@@ -305,7 +305,7 @@ def test_a_damaged_recording_is_replayed_as_far_as_it_is_whole(
         records = [json.loads(line) for line in lines]
         lost = (i for i, r in enumerate(records) if r["seq"] != i or "damaged" in (r["reason"] or ""))
         whole_until = next(lost, len(lines))
-        assert 5 < whole_until < len(then), "something was lost"
+        assert 0 < whole_until < len(then), "something was lost"
         assert lines[:whole_until] == then[:whole_until]
         if name == "cut.rrd":
             assert f"replay: {tmp_path / name}: is cut short" in said

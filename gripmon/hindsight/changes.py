@@ -36,6 +36,8 @@ LEAST_SQUARE = 4.0
 SAME = 12
 """Frames within which there is one change only."""
 LIKELY = 0.95
+LEAST_NOISE = 1e-9
+"""Variance, in units of what frames claim, that is never doubted: frames may repeat one another to the bit."""
 
 
 @dataclass(frozen=True)
@@ -79,19 +81,19 @@ def surprises(y: Array, length: int) -> Array:
     moved = moved - np.repeat(coarse, stride, axis=0)[: len(moved)]
     squared = _mahalanobis(moved)
     usual = _local_median(squared, stride)
-    out[inside] = squared / np.maximum(usual / np.median(squared), 1.0)
+    out[inside] = squared / np.maximum(usual / max(float(np.median(squared)), LEAST_NOISE), 1.0)
     return out
 
 
 def _mahalanobis(moved: Array) -> Array:
     """By the covariance of the calm part, made right for normal numbers."""
     dof = moved.shape[1]
-    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + 1e-300)
+    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + LEAST_NOISE)
     for _ in range(6):
         squared = np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True)
         calm = squared <= np.quantile(squared, CALM)
         kept = stats.chi2.cdf(stats.chi2.ppf(CALM, dof), dof + 2) / CALM
-        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept
+        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept + LEAST_NOISE * np.eye(dof)
     return np.asarray(np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True))
 
 
@@ -151,4 +153,4 @@ def _place(y: Array, index: int, length: int) -> Found | None:
 def _own_noise(part: Array) -> Array:
     """Variance (a,) of frames about their neighbours."""
     step = np.diff(part, axis=0)
-    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + 1e-9)
+    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + LEAST_NOISE)

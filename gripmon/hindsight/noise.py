@@ -62,7 +62,7 @@ class Shares:
 def second_differences(time_s: Array, y: Array, segment: NDArray[np.int64], lag: int) -> Array:
     """(k, a), only of evenly spaced triples within a segment."""
     first, middle, last = slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None)
-    usual = lag * np.median(np.diff(time_s))
+    usual = lag * step_of(time_s)
     even = np.abs(time_s[middle] - time_s[first] - usual) < 0.2 * usual
     even &= np.abs(time_s[last] - time_s[middle] - usual) < 0.2 * usual
     even &= segment[first] == segment[last]
@@ -81,7 +81,9 @@ def mean_squares(differences: Array, trimmed: bool) -> Array:
 
 def step_of(time_s: Array) -> float:
     """Usual interval, s."""
-    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    steps = np.diff(time_s)
+    steps = steps[steps > 0.0]  # stamps may repeat
+    return float(np.median(steps)) if len(steps) else 1.0
 
 
 def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Array, trimmed: bool) -> Shares:
