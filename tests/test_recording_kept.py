@@ -263,6 +263,20 @@ def test_recording_pauses_when_pinned_files_fill_the_budget_until_one_is_unpinne
     assert files_in(tmp_path)[-1].name > kept[-1].name, "numbers go on"
 
 
+def test_pins_of_recordings_that_are_gone_go_with_the_next_start(tmp_path: Path) -> None:
+    """Only those of this robot and camera, of earlier runs; the series' own keep its numbers."""
+    gone, kept, other = (tmp_path / f"{name}.rrd" for name in (
+        "arm-wrist-20260101T000000Z-0001", "arm-wrist-20260101T000000Z-0002", "arm-tool-20260101T000000Z-0001"
+    ))  # fmt: skip
+    own = tmp_path / "run-0007.rrd"
+    kept.write_bytes(b"")
+    for path in (gone, kept, other, own):
+        pin_path(path).touch()
+    series(tmp_path).close()
+    assert sorted(path for path in (gone, kept, other, own) if is_pinned(path)) == sorted((kept, other, own))
+    assert files_in(tmp_path)[-1].name == "run-0008.rrd"
+
+
 def test_numbers_are_not_used_again(tmp_path: Path) -> None:
     files = series(tmp_path)
     write(files, 0, 5)

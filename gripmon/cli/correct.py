@@ -58,7 +58,10 @@ def add_parser(commands: Any) -> None:
         _EXAMPLES,
     )
     parser.add_argument(
-        "recordings", metavar="RECORDING", nargs="+", help="recordings (.rrd), folders of them, or estimates.jsonl"
+        "recordings",
+        metavar="RECORDING",
+        nargs="+",
+        help="recordings (.rrd), folders of them with all below, or estimates.jsonl",
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="FILE.jsonl, FILE.parquet or FILE.rrd")
     parser.add_argument(

@@ -35,10 +35,12 @@ def is_recording(paths: list[Path]) -> bool:
 
 
 def recording_files(paths: list[Path]) -> list[Path]:
-    """The files that are meant; a folder stands for those in it."""
+    """The files that are meant; a folder stands for those in it and below."""
+    from gripmon.playback import recordings_below
+
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
+        found = recordings_below(path) if path.is_dir() else [path]
         missing = path if not path.exists() else None if found else path
         if missing is not None:
             raise common.CommandFailedError(f"{path}: there is no recording; an {_ENDING} file", common.EXIT_USAGE)
@@ -197,5 +199,7 @@ def _limits(config: Config | None) -> Limits | None:
 
 def _holds_recordings(path: Path) -> bool:
     if path.is_dir():
-        return any(path.glob(f"*{_ENDING}"))
+        from gripmon.playback import recordings_below
+
+        return bool(recordings_below(path))
     return path.suffix.lower() == _ENDING

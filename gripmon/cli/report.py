@@ -35,7 +35,12 @@ def add_parser(commands: Any) -> None:
     parser = common.add_command(
         commands, "report", run, "what happened: when did the camera move, what is affected", _DESCRIPTION, _EXAMPLES
     )
-    parser.add_argument("recordings", nargs="+", metavar="RECORDING", help=".rrd files, or folders of them")
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help=".rrd files, folders of them with all below, or estimates.jsonl",
+    )
     parser.add_argument(
         "--out", metavar="FILE.html", help=f"the page (default: {_DEFAULT_PAGE}; none if there is only --json)"
     )

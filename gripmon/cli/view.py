@@ -45,7 +45,9 @@ def add_parser(commands: Any) -> None:
     parser = common.add_command(
         commands, "view", run, "recordings in rerun's viewer, native or in a browser", _DESCRIPTION, _EXAMPLES
     )
-    parser.add_argument("recordings", nargs="+", metavar="RECORDING", help=".rrd files, or folders of them")
+    parser.add_argument(
+        "recordings", nargs="+", metavar="RECORDING", help=".rrd files, or folders of them with all below"
+    )
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--web", action="store_true", help="as a page; the default where there is no display")
     where.add_argument("--native", action="store_true", help="in a window; the default where there is a display")

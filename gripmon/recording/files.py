@@ -302,10 +302,12 @@ class FileSeries:
         self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 
     def _mend(self) -> None:
-        """Earlier files of this robot and camera, whose writer may have been killed."""
+        """Earlier files of this robot and camera, whose writer may have been killed; pins of recordings that are gone."""
         with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
             for entry in self._budget.recordings():
                 repair(entry.path)
+            for pin in self._budget.orphaned_pins():
+                pin.unlink(missing_ok=True)
 
     def _next_number(self) -> int:
         """Above all that there were: a file that was deleted leaves its number unused.  0: they can't be listed."""
