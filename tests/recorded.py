@@ -25,6 +25,7 @@ from gripmon.records import (
     FrameRecord,
     MeasurementTrace,
     Origin,
+    RecordedConfiguration,
     ReferenceRecord,
     State,
     Verdict,
@@ -56,7 +57,11 @@ def settings(**changes: Any) -> RecordingSettings:
 
 
 def recorder(
-    directory: Path, truth: Callable[[int], Any] | None = None, patience_s: float = 0.0, **changes: Any
+    directory: Path,
+    truth: Callable[[int], Any] | None = None,
+    patience_s: float = 0.0,
+    configuration: RecordedConfiguration | None = None,
+    **changes: Any,
 ) -> ProcessRecorder:
     opened = open_recorder(
         settings(**changes),
@@ -69,6 +74,7 @@ def recorder(
         name="run",
         truth_tcp_m=truth,
         patience_s=patience_s,
+        configuration=configuration,
     )
     assert isinstance(opened, ProcessRecorder)
     return opened

@@ -23,6 +23,7 @@ from gripmon.records import (
     CommandReply,
     MonitorState,
     OpenAlert,
+    RecordedCommand,
     Severity,
 )
 from gripmon.sources import Waiting
@@ -221,6 +222,9 @@ def test_a_command_is_kept_and_published_before_it_is_answered():
     assert asker.answers == [CommandReply(CommandName.UNDO, True, "as you like", "plate-2", 4)]
     ((command, stamp_ns),) = bench.monitor.obeyed
     assert command == UNDO and abs(stamp_ns - time.time_ns()) < 60e9
+    assert bench.recording.commands == [
+        RecordedCommand(stamp_ns, -1, CommandName.UNDO, "", done=True, text="as you like")
+    ]
 
 
 def test_one_command_a_frame_also_while_none_comes():
@@ -245,6 +249,8 @@ def test_a_command_that_breaks_is_answered_and_the_loop_goes_on():
     asker = Asker([Command(CommandName.UNDO, "fail"), UNDO])
     assert bench.run(commands=asker) == 0
     broken, done = asker.answers
+    told = [(command.seq, command.done, command.text) for command in bench.recording.commands]
+    assert told == [(-1, False, "internal error: RuntimeError: out of order"), (0, True, "as you like")]
     assert broken == CommandError(CommandFault.INTERNAL, "internal error: RuntimeError: out of order")
     assert isinstance(done, CommandReply) and done.done
     assert len(bench.network.transforms) == 3

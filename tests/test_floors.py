@@ -30,7 +30,21 @@ FOREIGN = {
     "rosbags": {"ros2"},
     "prometheus_client": {"metrics"},
 }
-HEAVY = ("numpy", "scipy", "cv2", "zenoh", "rerun", "yaml", "msgspec", "tqdm", "rosbags", "rich", "pyarrow")
+HEAVY = (
+    "numpy",
+    "scipy",
+    "cv2",
+    "zenoh",
+    "rerun",
+    "yaml",
+    "msgspec",
+    "tqdm",
+    "rosbags",
+    "rich",
+    "pyarrow",
+    "plotly",
+    "jinja2",
+)
 
 
 def room_of(path: Path) -> str:

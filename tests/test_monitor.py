@@ -350,7 +350,7 @@ def lines_of(monitor: Monitor, scene: str, count: int | None = None, *, look: bo
         lines.append(to_json(monitor.process(frame)))
         if look:
             monitor.trace()
-            monitor.trace()
+            monitor.notes()
     return lines
 
 
@@ -359,7 +359,7 @@ def test_the_same_frames_give_the_same_bytes(scene: str):
     assert lines_of(new_monitor(), scene) == [to_json(record) for record in watched(scene).records]
 
 
-def test_looking_at_the_trace_changes_nothing():
+def test_looking_at_trace_and_notes_changes_nothing():
     assert lines_of(new_monitor(), "bump", 60, look=True) == lines_of(new_monitor(), "bump", 60)
 
 

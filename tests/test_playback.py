@@ -25,7 +25,7 @@ from playback_runs import (
 )
 from recorded import REFERENCE, frame, image, record, trace, wait_until
 
-from gripmon.playback import FrameTable, Recording, decode_image, open_recordings
+from gripmon.playback import FrameTable, Recording, decode_image, open_recordings, recordings_below
 from gripmon.records import to_json
 
 
@@ -204,3 +204,12 @@ def test_files_put_one_behind_the_other(run: Run, recording: Recording, tmp_path
     assert np.array_equal(found.image_seqs, recording.image_seqs)
     (fault,) = found.faults
     assert "its messages were read one by one" in fault
+
+
+def test_a_folder_stands_for_all_below_but_what_is_being_made(run: Run, tmp_path: Path):
+    for name in ("b/c/two.rrd", "one.rrd", ".scratch/hidden.rrd", "b/.part.rrd", "b/note.txt"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(run.files["two" in name].read_bytes())
+    assert recordings_below(tmp_path) == [tmp_path / "b/c/two.rrd", tmp_path / "one.rrd"]
+    (found,) = open_recordings([tmp_path]).recordings
+    assert found.frames.seq.tolist() == [*run.seqs[0], *run.seqs[1]]

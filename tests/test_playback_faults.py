@@ -134,6 +134,28 @@ def test_a_damaged_message_costs_its_own_frames_only(run: Run, tmp_path: Path, f
     assert [r.seq for r in found.records()] == found.frames.seq.tolist()
 
 
+def test_random_damage_never_raises_and_loses_nothing_silently(run: Run, tmp_path: Path):
+    """Bytes overwritten and cut out anywhere, in a process that native code would end if it were given them."""
+    rng = np.random.default_rng(20)
+    whole = run.files[0].read_bytes()
+    for _ in range(40):
+        data = bytearray(whole)
+        at = int(rng.integers(0, len(data)))
+        if rng.random() < 0.7:
+            data[at : at + 2000] = rng.integers(0, 256, len(data[at : at + 2000]), np.uint8).tobytes()
+        else:
+            del data[at : at + int(rng.integers(1, 50_000))]
+        path = tmp_path / "damaged.rrd"
+        path.write_bytes(data)
+        collection = open_recordings([path])
+        frames = sum(len(list(r.records())) for r in collection.recordings)
+        shots = [shot for r in collection.recordings for shot in r.shots()]
+        said = [*collection.faults, *(fault for r in collection.recordings for fault in r.faults)]
+        assert all(fault.startswith(str(path)) and "\n" not in fault for fault in said)
+        assert frames <= len(run.seqs[0]) and len(shots) <= len(run.seqs[0])
+        assert frames == len(run.seqs[0]) or said
+
+
 def test_a_damaged_frame_around_messages_ends_the_reading_there(run: Run, tmp_path: Path):
     data = run.files[0].read_bytes()
     end = next(offset for kind, offset, _ in messages(data) if kind == 0)

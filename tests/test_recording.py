@@ -146,24 +146,26 @@ def test_curves_have_people_s_units(told: Recorded) -> None:
     shift = told.by_seq("drift/tcp_shift_mm", "scalars")
     band = told.by_seq("drift/tcp_shift_sigma_mm", "scalars")
     d, delta = told.by_seq("drift/d_mm", "scalars"), told.by_seq("drift/delta_deg", "scalars")
-    rms, latency = told.by_seq("quality/rms_px", "scalars"), told.by_seq("timing/latency_us", "scalars")
+    rms, latency = told.by_seq("residual/rms_px", "scalars"), told.by_seq("timing/latency_us", "scalars")
     for i in set(range(COUNT)) - {20, 21}:
         expected = story(i)
         assert expected.drift is not None
         shift_mm = 1e3 * np.array(expected.drift.tcp_shift_m)
-        np.testing.assert_allclose(shift[i], shift_mm, rtol=1e-12)
+        np.testing.assert_allclose(shift[i], [*shift_mm, np.linalg.norm(shift_mm)], rtol=1e-12)
         sigma_mm = np.array([0.01, 0.02, 0.03])
         np.testing.assert_allclose(band[i], np.concatenate([shift_mm - sigma_mm, shift_mm + sigma_mm]), atol=1e-12)
         np.testing.assert_allclose(d[i], [1e3 * expected.drift.translation_m])
         np.testing.assert_allclose(delta[i], [np.degrees(expected.drift.rotation_rad)])
-        assert rms[i] == [expected.rms_px]
+        assert rms[i][0] == expected.rms_px
         np.testing.assert_allclose(latency[i], [1e-3 * expected.latency_ns])
 
 
 def test_what_is_unknown_leaves_a_gap(told: Recorded) -> None:
-    for path in ("drift/tcp_shift_mm", "drift/tcp_shift_sigma_mm", "drift/d_mm", "drift/delta_deg", "quality/rms_px"):
+    for path in ("drift/tcp_shift_mm", "drift/tcp_shift_sigma_mm", "drift/d_mm", "drift/delta_deg"):
         values = told.by_seq(path, "scalars")
         assert values[20] == [] and values[21] == [] and values[22] != []
+    rms = told.by_seq("residual/rms_px", "scalars")
+    assert np.isnan(rms[20][0]) and np.isnan(rms[21][0]) and not np.isnan(rms[22][0]), "edge points are known still"
 
 
 def test_truth_is_drawn_against_the_reference(told: Recorded) -> None:

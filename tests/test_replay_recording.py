@@ -21,6 +21,7 @@ import rerun as rr
 import zenoh
 from loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
 from network_daemon import ENVIRONMENT
+from rerun.chunk import RrdReader
 
 from gripmon.cli import main
 from gripmon.cli.replay import _recorder
@@ -147,6 +148,7 @@ def test_a_run_with_commands_and_a_kept_state_is_decided_again_to_the_byte(
     source = "{kind: simulator, scenario: static, duration_s: 600.0, fps: 30.0, realtime: false}"
     config = configured(
         tmp_path, endpoint, source=source, state="{file: kept.json}", jaw="{source: zenoh}",
+        daemon="{stop_within_s: 120.0}",
         monitor="{jaw_sigma_m: 0.0001, recalibration: {mode: confirm}}",
     )  # fmt: skip
     done: dict[str, list[bool]] = {}
@@ -266,10 +268,11 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
     assert replayed(paths["b"][::-1], tmp_path / "files.jsonl") == then
     capsys.readouterr()
     assert main(["replay", str(tmp_path / "a"), str(tmp_path / "b"), "--out", "-"]) == 2
-    assert capsys.readouterr().err.splitlines() == [
-        f"{tmp_path / 'a'}: path: these are files of 2 runs; the files of one"
-    ]
-    last = replayed(paths["b"][-1:], tmp_path / "last.jsonl")
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("replay: these are files of 2 runs (") and said.endswith("; the files of one")
+    assert str(paths["a"][0]) in said and str(paths["b"][0]) in said
+    with_frames = [path for path in paths["b"] if contents(path, "record", "json")]
+    last = replayed(with_frames[-1:], tmp_path / "last.jsonl")
     assert 0 < len(last) < len(then), "each file brings what it takes"
 
 
@@ -283,6 +286,35 @@ def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path
     counted = re.search(r"holds images of (\d+) frames; (\d+) more were recorded without", said)
     assert counted and int(counted[1]) == len(lines) < 30 and int(counted[1]) + int(counted[2]) == 30
     assert re.search(rf"replay: \d+ of {len(lines)} otherwise than recorded", said)
+
+
+def test_a_damaged_recording_is_replayed_as_far_as_it_is_whole(
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    """Cut anywhere, or damaged in the middle: the same lines, as many as are left; in words what was lost."""
+    recording = tmp_path / "then.rrd"
+    first = ["--config", str(sequence_config(sequence)), "--recording", str(recording)]
+    then, whole = replayed(sequence, tmp_path / "then.jsonl", *first), recording.read_bytes()
+    begin = whole.index(b"\x89PNG", len(whole) // 2) + 1000
+    damaged = whole[:begin] + bytes(30_000) + whole[begin + 30_000 :]
+    for name, data in (("cut.rrd", whole[: 2 * len(whole) // 3]), ("damaged.rrd", damaged)):
+        (tmp_path / name).write_bytes(data)
+        capsys.readouterr()
+        lines = replayed(tmp_path / name, tmp_path / "again.jsonl")
+        said = capsys.readouterr().err
+        records = [json.loads(line) for line in lines]
+        lost = (i for i, r in enumerate(records) if r["seq"] != i or "damaged" in (r["reason"] or ""))
+        whole_until = next(lost, len(lines))
+        assert 0 < whole_until < len(then), "something was lost"
+        assert lines[:whole_until] == then[:whole_until]
+        if name == "cut.rrd":
+            assert f"replay: {tmp_path / name}: is cut short" in said
+        else:
+            assert "; the recorded images of " in said and len(lines) == len(then)
+    (tmp_path / "head.rrd").write_bytes(whole[:100])
+    assert main(["replay", str(tmp_path / "head.rrd"), "--out", "-"]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is cut short before its recording begins" in line
 
 
 def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -302,6 +334,50 @@ def test_other_limits_are_tried_on_what_happened(sequence: Path, tmp_path: Path,
     states = sum(a["state"] != b["state"] for a, b in pairs)
     verdicts = sum(a["verdict"] != b["verdict"] for a, b in pairs)
     assert f"{verdicts} another verdict, {states} another state" in said
+
+
+def contents(path: Path, entity: str, component: str) -> dict[int, Any]:
+    """The values of an entity by frame."""
+    values: dict[int, Any] = {}
+    for chunk in RrdReader(path).stream().filter(content=[f"/{entity}"], has_timeline="frame").to_chunks():
+        batch = chunk.to_record_batch()
+        values |= zip(batch.column("frame").to_pylist(), batch.column(component).to_pylist(), strict=True)
+    return values
+
+
+def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """Drifts, limits, states and the log of both; what is replayed is a recording of its own, to be replayed again."""
+    then, both = tmp_path / "then.rrd", tmp_path / "both.rrd"
+    lines_then = replayed(
+        sequence, tmp_path / "then.jsonl", "--config", str(sequence_config(sequence)), "--recording", str(then)
+    )
+    text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
+    tight = sequence / "tight.yaml"
+    tight.write_text(text + "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004}, recalibration: {mode: 'off'}}\n")
+    lines_now = replayed(then, tmp_path / "now.jsonl", "--config", str(tight), "--recording", str(both))
+    shifts, scalars = "drift/tcp_shift_mm", "Scalars:scalars"
+    for entity, lines in ((f"recorded/{shifts}", lines_then), (shifts, lines_now)):
+        expected = {line["seq"]: line["drift"]["tcp_shift_m"] for line in map(json.loads, lines) if line["drift"]}
+        drawn = {seq: values for seq, values in contents(both, entity, scalars).items() if values}
+        assert drawn.keys() == expected.keys()
+        for seq, values in drawn.items():
+            assert values[:3] == pytest.approx([1e3 * v for v in expected[seq]], abs=1e-12), "mm"
+    policy = load_config(sequence / "config.yaml", check_source=False).settings.monitor.policy
+    for entity, limits_mm in (
+        ("drift/limits_mm", [0.1, 0.4]),
+        ("recorded/drift/limits_mm", [1e3 * policy.warn_m, 1e3 * policy.limit_m]),
+    ):
+        for drawn_mm in contents(both, entity, scalars).values():
+            assert drawn_mm == pytest.approx(limits_mm)
+    log = [text for (text,) in contents(both, "recorded/events", "TextLog:text").values()]
+    assert log and all(text.startswith("recorded: ") for text in log)
+    assert contents(both, "recorded/status/state", "StateChange:state") and contents(
+        both, "status/state", "StateChange:state"
+    )
+    assert replayed(both, tmp_path / "again.jsonl") == lines_now
+    capsys.readouterr()
+    replayed(then, tmp_path / "now.jsonl", "--recording", str(then), code=2)
+    assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is what is replayed; another file"]
 
 
 def test_another_calibration_begins_with_its_own_reference(
@@ -371,14 +447,18 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
     other.disconnect()
     (tmp_path / "empty").mkdir()
     cases = [
-        ([tmp_path / "old-0001.rrd"], "holds no configuration; the one to replay with, by --config"),
-        ([tmp_path / "other.rrd"], "is a recording of 'somebody_else'; one of gripmon's"),
-        ([tmp_path / "none.rrd"], "there is no recording; an .rrd file"),
-        ([tmp_path / "old-0001.rrd", sequence], "is no .rrd file; one input, or several .rrd files of one run"),
-        ([sequence], "only a recording brings its own configuration; --config CONFIG"),
+        ([tmp_path / "old-0001.rrd"], 2, "holds no configuration; the one to replay with, by --config"),
+        ([tmp_path / "other.rrd"], 3, "is a recording of the application 'somebody_else'"),
+        ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
+        ([tmp_path / "nothing.rrd"], 3, "is empty"),
+        ([tmp_path / "none.rrd"], 2, "there is no recording; an .rrd file"),
+        ([tmp_path / "old-0001.rrd", sequence], 2, "is no .rrd file; one input, or several .rrd files of one run"),
+        ([sequence], 2, "only a recording brings its own configuration; --config CONFIG"),
     ]
+    (tmp_path / "picture.rrd").write_bytes(next(sequence.glob("*.png")).read_bytes())
+    (tmp_path / "nothing.rrd").touch()
     capsys.readouterr()
-    for inputs, expected in cases:
-        assert main(["replay", *map(str, inputs), "--out", "-"]) == 2
+    for inputs, code, expected in cases:
+        assert main(["replay", *map(str, inputs), "--out", "-"]) == code
         (line,) = capsys.readouterr().err.splitlines()
         assert expected in line

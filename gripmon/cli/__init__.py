@@ -16,12 +16,14 @@ from gripmon.cli import (
     export,
     feed,
     replay,
+    report,
     router,
     run,
     schema,
     send,
     simulate,
     teach,
+    view,
     watch,
 )
 from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
@@ -35,6 +37,8 @@ _COMMANDS = (
     schema,
     feed,
     replay,
+    view,
+    report,
     export,
     correct,
     simulate,

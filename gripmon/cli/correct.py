@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import hashlib
 import sys
 from dataclasses import dataclass
@@ -22,7 +23,8 @@ frame in which it happened.  FILE's suffix says what is written:
 
   .jsonl    one line about the recordings and the change points, then one line a frame
   .parquet  the same as a table, units in the columns' names
-  .rrd      a track of transforms that a viewer lays over the recording (open both)
+  .rrd      a track of transforms that a viewer lays over the recording (open both); several runs
+            get a file each, FILE-1.rrd and on
 
 Covariances say what is left: also what frames claim and averaging can't take away."""
 
@@ -56,7 +58,10 @@ def add_parser(commands: Any) -> None:
         _EXAMPLES,
     )
     parser.add_argument(
-        "recordings", metavar="RECORDING", nargs="+", help="recordings (.rrd), folders of them, or estimates.jsonl"
+        "recordings",
+        metavar="RECORDING",
+        nargs="+",
+        help="recordings (.rrd), folders of them with all below, or estimates.jsonl",
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="FILE.jsonl, FILE.parquet or FILE.rrd")
     parser.add_argument(
@@ -89,23 +94,40 @@ def run(arguments: argparse.Namespace) -> int:
             raise common.CommandFailedError(f"--out {out}: is a recording to correct; another file", common.EXIT_USAGE)
     wanted_ns = None if arguments.stamps is None else _stamps(Path(arguments.stamps))
     common.make_directory(out.parent)
-    common.check_file(out)
+    if out.is_dir():
+        raise common.CommandFailedError(f"--out {out}: is a folder; a file", common.EXIT_USAGE)
     from gripmon.playback import open_recordings
 
     found = open_recordings(paths)
     for fault in found.faults:
         print(f"correct: {fault}", file=sys.stderr)
-    try:
-        runs = _corrected(found, wanted_ns)
-        _write(out, runs, _inputs(found))
-    except BaseException:
-        if not out.stat().st_size:
-            out.unlink()
-        raise
+    _check_targets(out, _targets(out, len(found.recordings)))
+    runs = _corrected(found, wanted_ns)
+    targets = _targets(out, len(runs))
+    _write(targets, runs, _inputs(found))
     for each in runs:
         print(_summary(each))
-    print(f"written: {out}")
+    for target in targets:
+        print(f"written: {target}")
     return common.EXIT_DONE
+
+
+def _targets(out: Path, runs: int) -> list[Path]:
+    """The files that are written: one, but a track for each run where there are several."""
+    if out.suffix.lower() != ".rrd" or runs < 2:
+        return [out]
+    return [out.with_name(f"{out.stem}-{number}{out.suffix}") for number in range(1, runs + 1)]
+
+
+def _check_targets(out: Path, targets: list[Path]) -> None:
+    """End the command before any work where it would replace a file that nobody named."""
+    for target in targets:
+        if target != out and target.exists():
+            raise common.CommandFailedError(
+                f"--out {out}: each of {len(targets)} runs gets a file of its own, and {target} is there already; "
+                "another name",
+                common.EXIT_USAGE,
+            )
 
 
 def _corrected(found: Collection, wanted_ns: Any) -> list[CorrectedRun]:
@@ -212,21 +234,28 @@ def _inputs(found: Collection) -> list[tuple[str, str]]:
     return out
 
 
-def _write(out: Path, runs: list[CorrectedRun], inputs: list[tuple[str, str]]) -> None:
+def _write(targets: list[Path], runs: list[CorrectedRun], inputs: list[tuple[str, str]]) -> None:
+    """Each file whole or not at all: what was there before stays until then."""
     from gripmon.cli import corrected
 
-    try:
-        if out.suffix.lower() == ".jsonl":
-            corrected.write_jsonl(out, runs, inputs)
-        elif out.suffix.lower() == ".parquet":
-            corrected.write_parquet(out, runs, inputs)
-        else:
-            from gripmon.recording.track import write_track
+    for number, target in enumerate(targets):
+        part = target.with_name(f".{target.name}.part")
+        try:
+            if target.suffix.lower() == ".jsonl":
+                corrected.write_jsonl(part, runs, inputs)
+            elif target.suffix.lower() == ".parquet":
+                corrected.write_parquet(part, runs, inputs)
+            else:
+                from gripmon.recording.track import write_track
 
-            about = corrected.provenance(runs, inputs)
-            write_track(out, [(r.recording.recording_id, r.recording.frames, r.correction) for r in runs], about)
-    except OSError as error:
-        raise common.CommandFailedError(f"--out {out}: writing failed ({error.strerror or error})") from None
+                recording, about = runs[number].recording, corrected.provenance(runs, inputs)
+                write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
+            part.replace(target)
+        except OSError as error:
+            raise common.CommandFailedError(f"--out {target}: writing failed ({error.strerror or error})") from None
+        finally:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
 
 
 def _name(recording: Recording) -> str:

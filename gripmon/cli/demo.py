@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.cli import common, viewing
 from gripmon.cli.run import run_daemon
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--seed", type=common.seed, default=1, metavar="N", help="random seed of the simulation (default 1)"
     )
+    viewing.add_option(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -96,7 +97,14 @@ def run(arguments: argparse.Namespace) -> int:
             receiver.connect()
             messages.enter_context(common.messages_above_bar("gripmon"))
 
-        code = run_daemon(config, out=out, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=on_network)
+        code = run_daemon(
+            config,
+            out=out,
+            recording_name="demo",
+            truth_tcp_m=truth_tcp_m,
+            on_network=on_network,
+            view=arguments.view,
+        )
     _summarise(out, simulator, receiver.count)
     return code
 
@@ -117,7 +125,13 @@ def _demo_config(arguments: argparse.Namespace) -> Config:
     except msgspec.ValidationError as error:
         raise common.CommandFailedError(f"demo: {error}", common.EXIT_USAGE) from None
     publish = msgspec.structs.replace(settings.publish, listen=(f"tcp/127.0.0.1:{_free_port()}",))
-    return dataclasses.replace(config, settings=msgspec.structs.replace(settings, source=source, publish=publish))
+    view = settings.view
+    if arguments.view is not None:
+        from gripmon.recording.viewer import free_port
+
+        view = msgspec.structs.replace(view, port=free_port(view.port), web_port=free_port(view.web_port))
+    settings = msgspec.structs.replace(settings, source=source, publish=publish, view=view)
+    return dataclasses.replace(config, settings=settings)
 
 
 def _free_port() -> int:

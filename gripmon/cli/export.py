@@ -66,9 +66,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _files(paths: Sequence[Path]) -> list[Path]:
     """The files that are meant, each once; what isn't there ends the command."""
+    from gripmon.playback import recordings_below
+
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.rglob("*.rrd")) if path.is_dir() else [path] * path.is_file()
+        found = recordings_below(path) if path.is_dir() else [path] * path.is_file()
         if not found:
             wrong = "no .rrd file in it" if path.is_dir() else "there is no such file"
             raise common.CommandFailedError(

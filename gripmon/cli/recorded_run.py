@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,9 @@ from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.recording.replayed import RecordedFrames
-    from gripmon.records import FrameRecord
+    from gripmon.playback.replayed import RecordedFrames
+    from gripmon.recording.compared import ComparedRecorder
+    from gripmon.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
 
@@ -33,10 +35,12 @@ def is_recording(paths: list[Path]) -> bool:
 
 
 def recording_files(paths: list[Path]) -> list[Path]:
-    """The files that are meant; a folder stands for those in it."""
+    """The files that are meant; a folder stands for those in it and below."""
+    from gripmon.playback import recordings_below
+
     files: list[Path] = []
     for path in paths:
-        found = sorted(path.glob(f"*{_ENDING}")) if path.is_dir() else [path]
+        found = recordings_below(path) if path.is_dir() else [path]
         missing = path if not path.exists() else None if found else path
         if missing is not None:
             raise common.CommandFailedError(f"{path}: there is no recording; an {_ENDING} file", common.EXIT_USAGE)
@@ -49,13 +53,14 @@ class RecordedRun:
 
     def __init__(self, paths: list[Path], config_path: str | None, opened: contextlib.ExitStack) -> None:
         """``config_path`` None: the recorded configuration.  What is opened is closed with ``opened``."""
-        from gripmon.recording.replayed import RecordedFrames
-        from gripmon.sources import SourceError
+        from gripmon.playback.replayed import RecordedFrames, SeveralRunsError, UnusableError
 
         try:
             self.source: RecordedFrames = RecordedFrames(recording_files(paths))
-        except SourceError as error:
-            raise common.CommandFailedError(f"{paths[0]}: {error}", common.EXIT_USAGE) from None
+        except SeveralRunsError as error:
+            raise common.CommandFailedError(f"replay: {error}", common.EXIT_USAGE) from None
+        except UnusableError as error:
+            raise common.CommandFailedError(f"replay: {error}") from None
         self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
         self.recorded_config = self._recorded_config(opened)
         if config_path is not None:
@@ -75,7 +80,7 @@ class RecordedRun:
         import msgspec
 
         then = self.source.record
-        assert then is not None, "only frames with a record are replayed"
+        assert then is not None, "every replayed frame has a record"
         self._frames += 1
         self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == record
         self._verdicts += then.verdict is not record.verdict
@@ -83,10 +88,46 @@ class RecordedRun:
 
     def summary(self) -> str:
         """How many frames were judged otherwise than then."""
+        lost, damaged = self.source.passed_over, self.source.images_damaged
+        unread = f"; {lost} more could no longer be read" if lost else ""
+        unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
         if self._same == self._frames:
-            return f"replay: all {self._frames} as they were recorded, every number the same"
+            return f"replay: all {self._frames} as they were recorded, every number the same{unread}"
         judged = f"{self._verdicts} another verdict, {self._states} another state"
-        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}"
+        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}{unread}"
+
+    @contextlib.contextmanager
+    def compared_in(self, name: str) -> Iterator[ComparedRecorder]:
+        """A recorder into one file that shows what was recorded and what is replayed, overlaid."""
+        from gripmon.config.recorded import to_recorded
+        from gripmon.recording.compared import ComparedRecorder
+        from gripmon.recording.wire import make_scene
+
+        path, config = Path(name), self.config
+        if path.is_dir():
+            raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+        common.make_directory(path.parent, "--recording")
+        if path.resolve() in {source.resolve() for source in self.source.paths}:
+            raise common.CommandFailedError(f"--recording {path}: is what is replayed; another file", common.EXIT_USAGE)
+        part = path.with_name(f".{path.name}.part")
+        settings, reference = config.settings, config.reference
+        if self.past.state is not None:
+            reference = self.past.state.references[-1]
+        scene = make_scene(
+            settings.recording, str(path.parent), path.stem, settings.robot, settings.camera_name, config.camera,
+            config.gripper, reference, configuration=to_recorded(config, self.past.state),
+        )  # fmt: skip
+        try:
+            recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
+        except OSError as error:
+            raise common.not_writable(path, error, "--recording") from None
+        try:
+            yield recorder
+        finally:
+            recorder.close()
+            part.replace(path)
+        if recorder.failure:
+            print(f"replay: {path} isn't complete ({recorder.failure})", file=sys.stderr)
 
     def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
         from gripmon.config import ConfigError
@@ -129,6 +170,8 @@ class RecordedRun:
 
     def _say_what_is_missing(self) -> None:
         source = self.source
+        for fault in source.faults:
+            print(f"replay: {fault}", file=sys.stderr)
         if source.frames_without_image:
             print(
                 f"replay: {self.name} holds images of {len(source) - source.stand_ins} frames; "
@@ -143,7 +186,20 @@ class RecordedRun:
             )
 
 
+def _limits(config: Config | None) -> Limits | None:
+    """Those that a configuration sets; what a monitor learns of a stream is not among them."""
+    from gripmon.records import Limits
+
+    if config is None:
+        return None
+    policy, nothing = config.settings.monitor.policy, (0.0,) * 6
+    of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
+    return Limits(*of_policy, nothing, None, None, None, nothing, nothing)
+
+
 def _holds_recordings(path: Path) -> bool:
     if path.is_dir():
-        return any(path.glob(f"*{_ENDING}"))
+        from gripmon.playback import recordings_below
+
+        return bool(recordings_below(path))
     return path.suffix.lower() == _ENDING

@@ -64,7 +64,7 @@ def add_parser(commands: Any) -> None:
         nargs="+",
         metavar="INPUT",
         help="a folder of images, taken in the order of their names, a video file, or a recording of ours: an .rrd "
-        "file, all files of one run, or a folder of them; a timestamps.csv may lie beside images, with the columns "
+        "file, all files of one run, or a folder of them with all below; a timestamps.csv may lie beside images, with the columns "
         "file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
     )
     parser.add_argument(
@@ -74,7 +74,10 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--out", required=True, metavar="FILE", help="JSON lines go here; - is standard output")
     parser.add_argument(
-        "--recording", metavar="FILE.rrd", help="also write a rerun recording (open it with: rerun FILE.rrd)"
+        "--recording",
+        metavar="FILE.rrd",
+        help="also write a rerun recording (open it with: gripmon view FILE.rrd); of a recording it shows both runs, "
+        "recorded and replayed",
     )
     parser.add_argument(
         "--fps",
@@ -96,7 +99,8 @@ def run(arguments: argparse.Namespace) -> int:
         source = recorded.source if recorded else _open_input(paths[0], arguments.fps)
         opened.callback(source.close)
         out = opened.enter_context(_output(arguments.out))
-        recorder = opened.enter_context(_recorder(arguments.recording, config))
+        overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
+        recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
         counts = _Counts()
         try:
             step = opened.enter_context(

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.cli import common, viewing
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -35,6 +35,7 @@ _EXAMPLES = """\
 
   gripmon run configs/live_camera.yaml --fresh-state     begin anew; the kept state is set aside
   gripmon send undo --robot arm1                         back to the reference before
+  gripmon run configs/live_camera.yaml --view web        watch it live in a browser, on this machine
 
 Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}.
 exit codes: 0 the source ended, the time was over, or SIGTERM; 2 wrong usage or configuration; 3 no
@@ -61,6 +62,7 @@ def add_parser(commands: Any) -> None:
         action="store_true",
         help="start from the configured reference; a kept state is set aside as <file>.replaced-<n>",
     )
+    viewing.add_option(parser)
     parser.add_argument("--verbose", action="store_true", help="say more on stderr")
 
 
@@ -75,6 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
         verbose=arguments.verbose,
         keep_state=True,
         fresh_state=arguments.fresh_state,
+        view=arguments.view,
     )
 
 
@@ -89,13 +92,14 @@ def run_daemon(
     on_network: Callable[[], None] = lambda: None,
     keep_state: bool = False,
     fresh_state: bool = False,
+    view: str | None = None,
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
     ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
     goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
     ``keep_state``: what survives a restart is read from the configuration's state file, unless ``fresh_state``, and
-    kept there.
+    kept there.  ``view`` is one of :data:`gripmon.cli.viewing.KINDS`.
     """
     import cv2
 
@@ -109,7 +113,8 @@ def run_daemon(
         common.check_file(estimates)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
-    with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
+    live = None if view is None else viewing.LiveView(settings.view, view, str(config.path))
+    with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None
         if kept is not None:
             opened.callback(kept.close)
@@ -123,8 +128,10 @@ def run_daemon(
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)
         on_network()
-        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m)
+        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live)
         opened.callback(recorder.close)
+        if live is not None:
+            live.open(viewed)
         source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run(
@@ -190,6 +197,7 @@ def _open_recorder(
     out: Path | None,
     name: str | None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
+    live: viewing.LiveView | None,
 ) -> Recorder:
     from gripmon.config.recorded import to_recorded
     from gripmon.recording import open_recorder
@@ -212,6 +220,7 @@ def _open_recorder(
             name=name,
             truth_tcp_m=truth_tcp_m,
             configuration=configuration,
+            view=None if live is None else live.settings,
         )
     except OSError as error:
         if out is not None:

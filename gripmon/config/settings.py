@@ -11,7 +11,7 @@ from gripmon.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.metrics import MetricsSettings
 from gripmon.monitor import MonitorSettings
-from gripmon.recording import RecordingSettings
+from gripmon.recording import RecordingSettings, ViewSettings
 from gripmon.ros2 import JointOpening, Ros2Settings
 from gripmon.sources import SourceSettings
 from gripmon.statefile import StateSettings
@@ -106,6 +106,7 @@ class Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     publish: PublishSettings = PublishSettings()
     ros2: Ros2Settings = Ros2Settings()
     recording: RecordingSettings = RecordingSettings()
+    view: ViewSettings = ViewSettings()
     metrics: MetricsSettings = MetricsSettings()
     daemon: DaemonSettings = DaemonSettings()
     state: StateSettings = StateSettings()

@@ -73,6 +73,7 @@ def held(values: Ints, where: Ints, count: int) -> Ints:
 def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
     """Times with more of them in long gaps, and before the first and after the last block; where the blocks are."""
     steps = np.diff(time_s)
+    steps = steps[steps > 0.0]
     usual = float(np.median(steps)) if len(steps) else 1.0
     extra = []
     edges = np.concatenate([[min(run.time_s[0], time_s[0])], time_s, [max(run.time_s[-1], time_s[-1])]])

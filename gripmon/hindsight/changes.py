@@ -8,7 +8,7 @@ one false alarm in an hour's frames at :data:`FALSE_ALARMS_PER_HOUR` for Student
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -16,11 +16,17 @@ from scipy.ndimage import median_filter
 
 from gripmon.records import Array
 
-LENGTHS = (4, 8, 16, 32)
+LENGTHS = (4, 8, 16)
 """Frames on each side."""
 FALSE_ALARMS_PER_HOUR = 0.02
-FREEDOM = 12.0
-"""Student's degrees of freedom of errors before clutter, on simulated images."""
+FREEDOM, FREEDOM_GROWTH = 12.0, 1.0 / 3.0
+"""Student's degrees of freedom of a frame's error before clutter, on simulated images, and the power of the number of
+frames with which those of a mean grow: as in the drift test.
+"""
+MARGIN = 2.5
+"""Factor on the threshold for changes that are no larger than what frames claim may explain: errors come in bursts (in
+streams simulated after images 2.2 was reached in 1.8 hours).
+"""
 CALM = 0.9
 """Part of the squared differences that is taken for noise, whatever happens in the rest."""
 LOCAL = 48
@@ -30,23 +36,26 @@ LEAST_SQUARE = 4.0
 SAME = 12
 """Frames within which there is one change only."""
 LIKELY = 0.95
+LEAST_NOISE = 1e-9
+"""Variance, in units of what frames claim, that is never doubted: frames may repeat one another to the bit."""
 
 
 @dataclass(frozen=True)
 class Found:
     """A change between the frames ``index - 1`` and ``index``; in all probability (:data:`LIKELY`) between the one
-    before ``first`` and ``last``.
+    before ``first`` and ``last``.  ``excess``: how many times its threshold it reached.
     """
 
     index: int
     first: int
     last: int
+    excess: float = 1.0
 
 
-def threshold(frames_per_hour: float, dof: int = 6) -> float:
-    """For squared distances of ``dof`` numbers."""
+def threshold(length: int, frames_per_hour: float, dof: int = 6) -> float:
+    """For squared distances of ``dof`` numbers, means of ``length`` frames."""
     chance = FALSE_ALARMS_PER_HOUR / max(frames_per_hour, 1.0) / len(LENGTHS)
-    return float(dof * stats.f.isf(chance, dof, FREEDOM))
+    return float(dof * stats.f.isf(chance, dof, FREEDOM * length**FREEDOM_GROWTH))
 
 
 def differences(y: Array, length: int) -> Array:
@@ -72,19 +81,19 @@ def surprises(y: Array, length: int) -> Array:
     moved = moved - np.repeat(coarse, stride, axis=0)[: len(moved)]
     squared = _mahalanobis(moved)
     usual = _local_median(squared, stride)
-    out[inside] = squared / np.maximum(usual / np.median(squared), 1.0)
+    out[inside] = squared / np.maximum(usual / max(float(np.median(squared)), LEAST_NOISE), 1.0)
     return out
 
 
 def _mahalanobis(moved: Array) -> Array:
     """By the covariance of the calm part, made right for normal numbers."""
     dof = moved.shape[1]
-    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + 1e-300)
+    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + LEAST_NOISE)
     for _ in range(6):
         squared = np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True)
         calm = squared <= np.quantile(squared, CALM)
         kept = stats.chi2.cdf(stats.chi2.ppf(CALM, dof), dof + 2) / CALM
-        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept
+        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept + LEAST_NOISE * np.eye(dof)
     return np.asarray(np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True))
 
 
@@ -96,13 +105,13 @@ def _local_median(squared: Array, stride: int) -> Array:
 
 def find(y: Array, frames_per_hour: float) -> list[Found]:
     """Changes in the frames ``y`` (n, a), whitened by what they claim."""
-    statistic = np.stack([surprises(y, length) for length in LENGTHS])
-    limit = threshold(frames_per_hour, y.shape[1])
+    limits = [threshold(length, frames_per_hour, y.shape[1]) for length in LENGTHS]
+    statistic = np.stack([surprises(y, length) / limit for length, limit in zip(LENGTHS, limits, strict=True)])
     found: list[Found] = []
-    for index in _peaks(statistic.max(axis=0), limit):
+    for index in _peaks(statistic.max(axis=0), 1.0):
         place = _place(y, index, int(LENGTHS[int(statistic[:, index].argmax())]))
         if place is not None and (not found or place.index - found[-1].index >= SAME // 2):
-            found.append(place)
+            found.append(replace(place, excess=float(statistic[:, index].max())))
     return found
 
 
@@ -144,4 +153,4 @@ def _place(y: Array, index: int, length: int) -> Found | None:
 def _own_noise(part: Array) -> Array:
     """Variance (a,) of frames about their neighbours."""
     step = np.diff(part, axis=0)
-    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + 1e-9)
+    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + LEAST_NOISE)

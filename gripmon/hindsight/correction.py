@@ -26,6 +26,8 @@ WILD_FREEDOM = 12.0
 """Student's degrees of freedom of a block's error."""
 SURELY_MOVED = 60.0
 """Squared size of a change, in units of what frames claim, that no background explains."""
+LEAST_KEPT = 0.3
+"""Least variance over the reported one: a background that stays as long as the recording shows nothing of its error."""
 RAMP_FRAMES = 32
 PASSES = 2
 
@@ -104,10 +106,15 @@ def _changes(run: Run) -> list[changes.Found]:
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
-        changes.Found(*(int(good[k]) for k in (found.index, found.first, found.last)))
+        changes.Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
         for found in changes.find(y, 3600.0 / run.frame_s)
-        if _is_sharp(y, found.index)
+        if (found.excess > changes.MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
+
+
+def _surely_moved(y: Array, index: int) -> bool:
+    before, after = y[max(index - RAMP_FRAMES, 0) : index].mean(axis=0), y[index : index + RAMP_FRAMES].mean(axis=0)
+    return float(((after - before) ** 2).sum()) > SURELY_MOVED
 
 
 def _is_sharp(y: Array, index: int) -> bool:
@@ -123,8 +130,7 @@ def _is_sharp(y: Array, index: int) -> bool:
         for shift in (-0.33, 0.0, 0.33)
     ]
     left = [_unexplained(part, law) for law in (step, *ramps)]
-    before, after = part[max(middle - 16, 0) : middle].mean(axis=0), part[middle : middle + 16].mean(axis=0)
-    return left[0] <= min(left[1:]) or float(((after - before) ** 2).sum()) > SURELY_MOVED
+    return left[0] <= min(left[1:]) or _surely_moved(y, index)
 
 
 def _unexplained(part: Array, law: Array) -> float:
@@ -175,7 +181,7 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
         variance = blocks.variance(shares.white) * extra[:, None]
         restarts = np.diff(blocks.segment, prepend=0) > 0
         if number < PASSES:
-            dynamics = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
+            dynamics, kinks_s = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
         time_s, where = with_gaps(run, blocks.time_s)
         full = Spread(where, len(time_s))
         smoothed = smooth(
@@ -183,6 +189,7 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
             full.of(blocks.mean, np.nan),
             full.of(variance, np.inf),
             full.of(restarts.astype(float)[:, None], 0.0)[:, 0] > 0.5,
+            _nearest(time_s, kinks_s),
             dynamics,
         )
         block_segment = held(blocks.segment, where, len(time_s))
@@ -193,6 +200,12 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
         quick, quick_error = motion.vibration(rest)
         swing = motion.swings(rest - quick, run.claimed[good])
     return _Fit(found, time_s, block_segment, smoothed, shares, dynamics, swing, quick, quick_error)
+
+
+def _nearest(time_s: Array, wanted_s: list[float]) -> Bools:
+    out = np.zeros(len(time_s), bool)
+    out[np.minimum(np.searchsorted(time_s, wanted_s), len(time_s) - 1)] = True
+    return out
 
 
 def _jump(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
@@ -209,7 +222,7 @@ def _sizes(run: Run, fit: _Fit) -> list[float]:
 def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
     segment = _segments(run, fit.found)
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s, segment)
-    variance = variance + fit.shares.unseen
+    variance = np.maximum(variance + fit.shares.unseen, LEAST_KEPT)
     good = np.flatnonzero(run.usable)
     source = np.full(len(x), GAP, np.int8)
     source[good], source[wild] = SMOOTHED, DISBELIEVED

@@ -14,15 +14,17 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from gripmon.records import Array
 
 WINDOW, HOP = 256, 64
-AVERAGED = 16
+AVERAGED = 32
 """Windows over which a spectrum is averaged."""
-FLOOR_BINS = 31
-"""Neighbouring frequencies whose median is the floor."""
-STANDS_OUT = 4.0
-"""How many times the floor the largest part of a spectrum is by more than chance."""
-LOWEST_BIN = 3
+BESIDE = (3, 12)
+"""Frequencies beside a line whose median is the floor; the higher one of both sides: the spectrum may fall steeply."""
+STANDS_OUT = 8.0
+"""So many times the floor the largest of six parts is by more than chance (of about twelve windows that don't overlap
+it is three times the floor on average).
+"""
+LOWEST_BIN = 5
 SWING_FRAMES = 12
-SWING_FROM, SWING_CLAIM = 8.0, 2.5
+SWING_FROM, SWING_CLAIM = 8.0, 5.0
 """Frames scatter so many times more than usual, and than they claim: the camera swings."""
 
 
@@ -55,7 +57,7 @@ def _stands_out(spectra: Array) -> tuple[Array, Array]:
     count = spectra.shape[1]
     cross = np.einsum("fwi,fwj->fij", spectra, spectra.conj()) / count
     power = np.real(np.einsum("fii->fi", cross))
-    floor = median_filter(power, size=(FLOOR_BINS, 1), mode="nearest") + 1e-300
+    floor = _floor(power) + 1e-300
     root = np.sqrt(floor)
     values, directions = np.linalg.eigh(cross / (root[:, :, None] * root[:, None, :]))
     share = np.where(values > STANDS_OUT, 1.0 - 1.0 / np.maximum(values, 1.0), 0.0)
@@ -64,6 +66,18 @@ def _stands_out(spectra: Array) -> tuple[Array, Array]:
     gain = root[:, :, None] * gain / root[:, None, :]
     error = np.einsum("fik,fk->fi", np.abs(directions) ** 2, share) * floor
     return gain, error
+
+
+def _floor(power: Array) -> Array:
+    """(f, a) what the spectrum is without lines."""
+    near, far = BESIDE
+    size = far - near
+    # The median of what lies around a place ``offset`` away.
+    middle = median_filter(power, size=(size, 1), mode="nearest")
+    offset = near + size // 2
+    below = np.concatenate([np.repeat(middle[:1], offset, axis=0), middle[:-offset]])
+    above = np.concatenate([middle[offset:], np.repeat(middle[-1:], offset, axis=0)])
+    return np.maximum(below, above)
 
 
 def swings(rest: Array, claimed: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gripmon.hindsight.smoother import MID_S, SLOW_S, Bools, Dynamics, log_likelihood
+from gripmon.hindsight.smoother import MID_S, SLOW_S, UNKNOWN_RATE, Bools, Dynamics, log_likelihood
 from gripmon.records import Array
 
 LONGEST_LAG_S = 30.0
@@ -36,7 +36,11 @@ WORTH_WANDER, WORTH_TURN, WORTH_SLOW = 6.0, 1.5, 1.0
 """By so much the logarithm of the likelihood has to grow for each step to the next.  Backgrounds that change look like
 wandering, hardly like a rate.
 """
-LIKELIHOOD_S, LIKELIHOOD_BLOCKS = 2.0, 2500
+KINK_PLACES, MOST_KINKS, WORTH_KINK = 48, 6, 20.0
+"""Places where the rate may have become another one that are tried, how many are believed at most, and by how much the
+logarithm of the likelihood has to grow for one.
+"""
+LIKELIHOOD_S, LIKELIHOOD_BLOCKS = 2.0, 600
 """Means of so many seconds at least, and no more of them, are what the likelihood is reckoned of: a background passes
 to the next one meanwhile.
 """
@@ -58,7 +62,7 @@ class Shares:
 def second_differences(time_s: Array, y: Array, segment: NDArray[np.int64], lag: int) -> Array:
     """(k, a), only of evenly spaced triples within a segment."""
     first, middle, last = slice(0, -2 * lag), slice(lag, -lag), slice(2 * lag, None)
-    usual = lag * np.median(np.diff(time_s))
+    usual = lag * step_of(time_s)
     even = np.abs(time_s[middle] - time_s[first] - usual) < 0.2 * usual
     even &= np.abs(time_s[last] - time_s[middle] - usual) < 0.2 * usual
     even &= segment[first] == segment[last]
@@ -77,7 +81,9 @@ def mean_squares(differences: Array, trimmed: bool) -> Array:
 
 def step_of(time_s: Array) -> float:
     """Usual interval, s."""
-    return float(np.median(np.diff(time_s))) if len(time_s) > 1 else 1.0
+    steps = np.diff(time_s)
+    steps = steps[steps > 0.0]  # stamps may repeat
+    return float(np.median(steps)) if len(steps) else 1.0
 
 
 def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Array, trimmed: bool) -> Shares:
@@ -119,25 +125,76 @@ def _seen(lag_s: float, correlation_s: float) -> float:
     return 1.0 - 4.0 / 3.0 * float(np.exp(-lag_s / correlation_s)) + float(np.exp(-2.0 * lag_s / correlation_s)) / 3.0
 
 
-def likeliest_dynamics(time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares) -> Dynamics:
-    """How the pose wanders, for each axis by itself."""
+def likeliest_dynamics(
+    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
+) -> tuple[Dynamics, list[float]]:
+    """How the pose wanders, for each axis by itself; and the times (s) at which its rate became another one."""
+    series = _Series(*_for_likelihood(time_s, y, variance, restarts, shares), shares.slow)
+    kinks: list[float] = []
+    dynamics, best = series.likeliest(kinks)
+    while len(kinks) < MOST_KINKS and len(series.time_s) > 8:
+        at_s = series.likeliest_kink(kinks)
+        other, likelihood = series.likeliest([*kinks, at_s])
+        if likelihood < best + WORTH_KINK:
+            break
+        kinks, dynamics, best = [*kinks, at_s], other, likelihood
+    return Dynamics(dynamics.slow, shares.mid, dynamics.wander, dynamics.turn, dynamics.rate), kinks
+
+
+def _for_likelihood(
+    time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
+) -> tuple[Array, Array, Array, Bools, Array]:
+    """Coarser means; what errors that last for less make of them is white."""
     group = max(round(LIKELIHOOD_S / step_of(time_s)), -(-len(time_s) // LIKELIHOOD_BLOCKS), 1)
-    if len(time_s) < 8 * group:
-        group = 1
-    mid = shares.mid
-    if group > 1:
-        # The mean of many of its correlation times: white.
-        variance = variance + mid * 2.0 * MID_S / step_of(time_s)
-        mid = np.full_like(mid, 1e-9)
-        time_s, y, variance, restarts = _coarser(time_s, y, variance, restarts, group)
-    tried, cost = _candidates()
-    series, many = y.shape[1], len(tried)
-    wander, turn, rate, factor = (np.repeat(column, series) for column in tried.T)
-    candidates = Dynamics(factor * np.tile(shares.slow, many), np.tile(mid, many), wander, turn, rate)
-    found = log_likelihood(time_s, np.tile(y, (1, many)), np.tile(variance, (1, many)), restarts, candidates)
-    best = (found.reshape(many, series) - cost[:, None]).argmax(axis=0)
-    wander, turn, rate, factor = tried[best].T
-    return Dynamics(factor * shares.slow, shares.mid, wander, turn, rate)
+    if group == 1 or len(time_s) < 8 * group:
+        return time_s, y, variance, restarts, shares.mid
+    variance = variance + shares.mid * 2.0 * MID_S / step_of(time_s)
+    return *_coarser(time_s, y, variance, restarts, group), np.full_like(shares.mid, 1e-9)
+
+
+@dataclass(frozen=True)
+class _Series:
+    time_s: Array
+    y: Array
+    variance: Array
+    restarts: Bools
+    mid: Array
+    slow: Array
+
+    def likeliest(self, kinks_s: list[float]) -> tuple[Dynamics, float]:
+        """The best dynamics with these kinks, and the logarithm of its likelihood, costs taken off, of all axes."""
+        tried, cost = _candidates()
+        axes = self.y.shape[1]
+        found = self._likelihoods(tried, self._kinks(kinks_s)[:, None]) - cost[:, None]
+        best = found.argmax(axis=0)
+        wander, turn, rate, factor = tried[best].T
+        return Dynamics(factor * self.slow, self.mid, wander, turn, rate), float(found[best, np.arange(axes)].sum())
+
+    def likeliest_kink(self, kinks_s: list[float]) -> float:
+        """Where one more helps most, with rates that are nearly constant between."""
+        places = np.unique(np.linspace(1, len(self.time_s) - 2, KINK_PLACES).astype(int))
+        tried = np.array([(WANDERS[0], turn, UNKNOWN_RATE, 1.0) for turn in (1e-6, 1e-2)])
+        kinks = np.repeat(self._kinks(kinks_s)[:, None], len(places), axis=1)
+        kinks[places, np.arange(len(places))] = True
+        kinks = np.repeat(kinks, len(tried), axis=1)
+        found = self._likelihoods(np.tile(tried, (len(places), 1)), kinks)
+        total = found.reshape(len(places), len(tried), -1).max(axis=1).sum(axis=1)
+        return float(self.time_s[places[total.argmax()]])
+
+    def _kinks(self, kinks_s: list[float]) -> Bools:
+        out = np.zeros(len(self.time_s), bool)
+        out[np.searchsorted(self.time_s, kinks_s)] = True
+        return out
+
+    def _likelihoods(self, tried: Array, kinks: Bools) -> Array:
+        """(c, a) of candidates (c, 4), with kinks (m, c) or (m, 1)."""
+        axes, many = self.y.shape[1], len(tried)
+        wander, turn, rate, factor = (np.repeat(column, axes) for column in tried.T)
+        dynamics = Dynamics(factor * np.tile(self.slow, many), np.tile(self.mid, many), wander, turn, rate)
+        y, variance = np.tile(self.y, (1, many)), np.tile(self.variance, (1, many))
+        if kinks.shape[1] > 1:
+            kinks = np.repeat(kinks, axes, axis=1)
+        return log_likelihood(self.time_s, y, variance, self.restarts, kinks, dynamics).reshape(many, axes)
 
 
 def _candidates() -> tuple[Array, Array]:

@@ -16,6 +16,10 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 LEAST_FRAMES = 3
+LONGEST_GAP_S = 3600.0
+"""Beyond, everything may have happened: more time in a gap says no more, and ends what numbers can hold."""
+LEAST_VARIANCE, LEAST_EIGENVALUE = 1e-24, 1e-9
+"""Of a covariance (m², rad²: a picometre, no camera's) and of its correlations: below, it is taken for none."""
 WILD, WILD_NEIGHBOURS, WILD_RUN = 8.0, 9, 2
 """A frame so many standard deviations off the median of its neighbours is wrong if no more than this many in a row
 are, and few are around."""
@@ -44,17 +48,24 @@ class Run:
 def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bools) -> Run:
     stamp_ns = np.asarray(stamp_ns, np.int64)
     usable = np.asarray(measured, bool) & np.isfinite(cam_T_grip).all(axis=(1, 2))
-    usable &= np.isfinite(covariance).all(axis=(1, 2)) & (np.einsum("nii->ni", covariance) > 0.0).all(axis=1)
-    if usable.sum() < LEAST_FRAMES:
-        raise ValueError(f"only {usable.sum()} frames were measured; at least {LEAST_FRAMES}")
+    known = usable & are_definite(covariance)
     faults = []
+    if (bad := int((usable & ~known).sum())) > 0:
+        faults.append(f"the covariances of {bad} frames aren't positive definite: these frames were not used")
+    usable = known
+    if usable.sum() < LEAST_FRAMES:
+        raise ValueError("; ".join([f"only {usable.sum()} frames were measured; at least {LEAST_FRAMES}", *faults]))
     step_ns = np.diff(stamp_ns)
     back = int((step_ns < 0).sum())
     if back:
         faults.append(f"time runs backwards {back} times: frames count in the order of their numbers there")
     ahead = step_ns[step_ns > 0]
     usual_ns = int(np.median(ahead)) if len(ahead) else 1
-    time_s = 1e-9 * np.concatenate([[0.0], np.cumsum(np.where(step_ns < 0, usual_ns, step_ns), dtype=float)])
+    if len(ahead) and ahead.max() > 1e9 * LONGEST_GAP_S:
+        often = int((ahead > 1e9 * LONGEST_GAP_S).sum())
+        faults.append(f"{often} gaps are longer than {LONGEST_GAP_S:.0f} s: each counts as that long")
+    step_ns = np.minimum(np.where(step_ns < 0, usual_ns, step_ns), round(1e9 * LONGEST_GAP_S))
+    time_s = 1e-9 * np.concatenate([[0.0], np.cumsum(step_ns, dtype=float)])
     good = np.flatnonzero(usable)
     origin_T = np.eye(4)
     some = good[:: max(len(good) // 2000, 1)]
@@ -71,6 +82,18 @@ def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bool
     y[good] = vectors @ inverse.T
     claimed[good] = np.einsum("ij,njk,ik->ni", inverse, own, inverse, optimize=True)
     return Run(time_s, origin_T, root, y, claimed, usable, faults)
+
+
+def are_definite(covariance: Array) -> Bools:
+    """Which of the matrices (n, 6, 6) are finite and positive definite, by the eigenvalues of their correlations."""
+    out = np.isfinite(covariance).all(axis=(1, 2))
+    out &= (np.einsum("nii->ni", covariance) > LEAST_VARIANCE).all(axis=1)
+    index = np.flatnonzero(out)
+    sigma = np.sqrt(np.einsum("nii->ni", covariance[index]))
+    correlation = covariance[index] / (sigma[:, :, None] * sigma[:, None, :])
+    symmetric = (np.abs(correlation - np.swapaxes(correlation, 1, 2)) < LEAST_EIGENVALUE**0.5).all(axis=(1, 2))
+    out[index] = symmetric & (np.linalg.eigvalsh(correlation)[:, 0] > LEAST_EIGENVALUE)
+    return out
 
 
 def wild_frames(run: Run) -> Bools:

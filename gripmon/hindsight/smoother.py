@@ -22,6 +22,9 @@ SLOW_S, MID_S = 15.0, 0.5
 UNKNOWN = 1e7
 """Variance of a state that nothing is known of, in units of the reported variance."""
 
+UNKNOWN_RATE = 100.0
+"""Likewise of a rate (1/s²)."""
+
 
 @dataclass(frozen=True)
 class Dynamics:
@@ -46,19 +49,21 @@ class Smoothed:
     log_likelihood: Array
 
 
-def smooth(time_s: Array, y: Array, variance: Array, restarts: Bools, dynamics: Dynamics) -> Smoothed:
+def smooth(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics) -> Smoothed:
     """Series ``y`` (m, a) with the variances (m, a) of v, infinite where nothing was measured, at the times (m,).
 
-    ``restarts`` (m,): x is another one from there on, all else stays.
+    ``restarts`` (m,): x is another one from there on, all else stays; ``kinks`` (m,) or (m, a): its rate is.
     """
-    forward = _filter(time_s, y, variance, restarts, dynamics)
+    forward = _filter(time_s, y, variance, restarts, kinks, dynamics)
     means, covariances = _backward(forward)
     return Smoothed(means[..., 0], means[..., 1], covariances[..., :2, :2], forward.log_likelihood)
 
 
-def log_likelihood(time_s: Array, y: Array, variance: Array, restarts: Bools, dynamics: Dynamics) -> Array:
+def log_likelihood(
+    time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics
+) -> Array:
     """(a,) natural logarithm of the series' probability density."""
-    return _filter(time_s, y, variance, restarts, dynamics).log_likelihood
+    return _filter(time_s, y, variance, restarts, kinks, dynamics).log_likelihood
 
 
 @dataclass
@@ -71,9 +76,9 @@ class _Forward:
     log_likelihood: Array
 
 
-def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, dynamics: Dynamics) -> _Forward:
+def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics) -> _Forward:
     steps, series = y.shape
-    transition, added = _steps(time_s, restarts, dynamics, series)
+    transition, added = _steps(time_s, restarts, kinks, dynamics, series)
     vectors, matrices = (steps, series, 4), (steps, series, 4, 4)
     out = _Forward(
         transition, np.empty(vectors), np.empty(matrices), np.empty(vectors), np.empty(matrices), np.zeros(series)
@@ -106,7 +111,7 @@ def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, dynamics:
     return out
 
 
-def _steps(time_s: Array, restarts: Bools, dynamics: Dynamics, series: int) -> tuple[Array, Array]:
+def _steps(time_s: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics, series: int) -> tuple[Array, Array]:
     """Transitions (m, 4, 4) and what they add (m, a, 4, 4)."""
     steps = len(time_s)
     elapsed = np.diff(time_s, prepend=time_s[0])
@@ -123,6 +128,7 @@ def _steps(time_s: Array, restarts: Bools, dynamics: Dynamics, series: int) -> t
     added[..., 2, 2] = dynamics.slow * (1.0 - fade[:, :1] ** 2)
     added[..., 3, 3] = dynamics.mid * (1.0 - fade[:, 1:] ** 2)
     added[restarts, :, 0, 0] += UNKNOWN
+    added[..., 1, 1] += UNKNOWN_RATE * (kinks if kinks.ndim == 2 else kinks[:, None])
     added[0] = 0.0
     added[0, :, 0, 0], added[0, :, 1, 1] = UNKNOWN, dynamics.rate
     added[0, :, 2, 2], added[0, :, 3, 3] = dynamics.slow, dynamics.mid

@@ -7,8 +7,17 @@ used.  No file is ever changed, and images stay in the files until they are aske
 
 from __future__ import annotations
 
-from gripmon.playback.opening import Collection, open_recordings
+from gripmon.playback.opening import Collection, open_recordings, recordings_below
 from gripmon.playback.recordings import Picture, Recording, Shot, decode_image
 from gripmon.playback.table import FrameTable
 
-__all__ = ["Collection", "FrameTable", "Picture", "Recording", "Shot", "decode_image", "open_recordings"]
+__all__ = [
+    "Collection",
+    "FrameTable",
+    "Picture",
+    "Recording",
+    "Shot",
+    "decode_image",
+    "open_recordings",
+    "recordings_below",
+]

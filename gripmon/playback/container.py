@@ -1,11 +1,11 @@
 """An ``.rrd`` file as a row of messages, of which any can be decoded by itself.
 
-rerun's reader takes a file as a whole: where one message is damaged or cut off it gives none of it, and where the
-footer is missing it reads everything.  Known here is only the frame around messages (a file header of 12 bytes, then
-for each message its kind and length, 8 bytes each, little endian); whole messages are handed to rerun's reader as a
-small file in memory, verbatim behind the header and the store's introduction.  So one image of an hour takes
-milliseconds, a cut loses only what it cut, and the original is never touched.  Where there is a footer, its manifest
-says which message holds what.
+rerun's reader takes a file as a whole: where one message is cut off it gives none of the file, where the footer is
+missing it reads everything, and damaged bytes can end the whole process (its native code panics).  So only footers,
+which have a check sum, are left to it: their manifest says which message holds what.  Messages are taken apart here:
+a file header of 12 bytes, then for each message its kind and length (8 bytes each, little endian) and a protobuf
+message of rerun's (``rerun.log_msg.v1alpha1``), in which a batch of Arrow lies that Arrow itself reads and checks.  One
+image of an hour takes milliseconds, damage costs what is damaged, and the original is never touched.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gripmon.playback import entities
+from gripmon.playback import entities, protobuf
 from gripmon.playback.table import IntArray
 
 MAGIC = b"RRF2"
@@ -32,6 +32,10 @@ _FOOTER_MARK = b"RRF2FOOT"
 _FOOTER_BYTES = 64  # the mark lies within the last so many
 _BLOCK_BYTES = 1 << 20
 _LARGEST_MESSAGE_BYTES = 1 << 31
+_PLAIN, _LZ4 = 1, 2
+_LARGEST_RATIO = 255  # of LZ4
+FRAME = "frame"
+"""The timeline of frames' numbers."""
 
 
 class UnreadableFileError(ValueError):
@@ -47,6 +51,17 @@ class Span(NamedTuple):
 
 Block = tuple[Span, ...]
 """What is decoded at once."""
+
+
+class Chunk(NamedTuple):
+    """Rows of one entity: ``batch`` is Arrow's, a column a timeline (unless it is static) or component."""
+
+    entity: str
+    batch: Any
+
+    @property
+    def is_static(self) -> bool:
+        return FRAME not in self.batch.schema.names
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,11 +95,10 @@ class RrdFile:
         self.path = path
         self.faults: list[str] = []
         self.damaged = 0
-        self._introductions: list[bytes] = []
         try:
             with path.open("rb") as file:
                 self.size = os.fstat(file.fileno()).st_size
-                self._header = self._checked_header(file.read(_FILE_HEADER_BYTES))
+                self._check_header(file.read(_FILE_HEADER_BYTES))
                 self.has_footer = _has_footer(file.fileno(), self.size)
                 self.stores = self._find_stores(file.fileno())
         except OSError as error:
@@ -128,54 +142,36 @@ class RrdFile:
 
     def record_texts(self, store: StoreName, block: Block) -> list[str]:
         """The frames' records in a block."""
-        chunks = self.decode(store, block, (f"/{entities.RECORD}",))
-        return [text for chunk in chunks for text in texts_of(chunk.to_record_batch(), "json")]
+        chunks = self.decode(store, block, (entities.RECORD,))
+        return [text for chunk in chunks for text in texts_of(chunk.batch, "json")]
 
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Any]:
-        """rerun's chunks of a store in some messages, only of entities in ``content`` (all where it is None).
+    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]:
+        """A store's chunks in some messages, only those of entities in ``content`` (all where it is None).
 
         Messages that are damaged are left out and counted.  Raises OSError where the file can't be read any more.
         """
         with self.path.open("rb") as file:
             parts = [os.pread(file.fileno(), span.size, span.offset) for span in block]
-            try:
-                return self._decode(store, parts, content)
-            except Exception:  # noqa: BLE001 - whatever rerun raises: find the message that it's about
-                messages = [m for part in parts for m in _messages(part)]
         chunks = []
-        self.damaged += max(0, len(block) - len(messages))
-        for message in messages:
-            try:
-                chunks += self._decode(store, [message], content)
-            except Exception:  # noqa: BLE001 - as above
-                self.damaged += 1
+        for part in parts:
+            offset = 0
+            while offset < len(part):
+                kind, size = _MESSAGE.unpack_from(part, offset) if offset + _MESSAGE.size <= len(part) else (_END, 0)
+                body = part[offset + _MESSAGE.size : offset + _MESSAGE.size + size]
+                offset += _MESSAGE.size + size
+                if offset > len(part) or kind not in (_CHUNK, _STORE_INFO, _BLUEPRINT):
+                    self.damaged += 1
+                    break
+                try:
+                    chunk = _chunk(body, store, content) if kind == _CHUNK else None
+                except Exception:  # noqa: BLE001 - whatever Arrow raises: this message is damaged, the others need not be
+                    self.damaged += 1
+                    continue
+                if chunk is not None:
+                    chunks.append(chunk)
         return chunks
 
-    def _decode(self, store: StoreName, parts: Sequence[bytes], content: Sequence[str] | None) -> list[Any]:
-        reader, descriptor = self._small_file(parts)
-        try:
-            entries = [e for e in reader.recordings() if e.recording_id == store.recording_id]
-            stream = reader.stream(store=entries[0])
-            return (stream if content is None else stream.filter(content=content)).to_chunks()
-        finally:
-            os.close(descriptor)
-
-    def _small_file(self, parts: Sequence[bytes]) -> tuple[Any, int]:
-        """rerun's reader of a file in memory, and its descriptor."""
-        from rerun.chunk import RrdReader
-
-        descriptor = os.memfd_create("gripmon-playback")
-        try:
-            with open(descriptor, "wb", closefd=False) as file:
-                file.writelines((self._header, *self._introductions, *parts))
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # that it has no footer
-                return RrdReader(f"/proc/self/fd/{descriptor}"), descriptor
-        except BaseException:
-            os.close(descriptor)
-            raise
-
-    def _checked_header(self, header: bytes) -> bytes:
+    def _check_header(self, header: bytes) -> None:
         if self.size == 0:
             raise UnreadableFileError("is empty")
         if header[: len(MAGIC)] != MAGIC:
@@ -183,27 +179,24 @@ class RrdFile:
         if len(header) < _FILE_HEADER_BYTES:
             raise UnreadableFileError("is cut short within its header")
         written, ours = header[4:7], _rerun_version()
-        if tuple(written) <= ours:
-            return header
-        # Said here; with the newer number rerun's reader would say so of every block.
-        newer, older = ".".join(map(str, written)), ".".join(map(str, ours))
-        self.faults.append(f"was written by rerun {newer}, newer than {older} here; what could be understood was used")
-        return header[:4] + bytes((*ours, 0)) + header[8:]
+        if tuple(written) > ours:
+            newer, older = ".".join(map(str, written)), ".".join(map(str, ours))
+            said = f"was written by rerun {newer}, newer than {older} here; what could be understood was used"
+            self.faults.append(said)
 
     def _find_stores(self, descriptor: int) -> list[StoreName]:
         """The recordings (not layouts) in the file; their introductions come before their first chunks."""
         expected = self._stores_of_footer() if self.has_footer else None
-        found: list[StoreName] = []
-        known = 0
+        found: dict[StoreName, None] = {}
         for kind, offset, size in _walk(descriptor, self.size):
-            if kind == _STORE_INFO:
-                self._introductions.append(os.pread(descriptor, size, offset))
-            elif known < len(self._introductions):
-                known = len(self._introductions)
-                found = self._introduced()
+            if kind != _STORE_INFO:
+                continue
+            name = _introduced(os.pread(descriptor, size, offset)[_MESSAGE.size :])
+            if name is not None:
+                found[name] = None
             if expected and len(found) >= len(expected):
                 break
-        return found
+        return list(found)
 
     def _stores_of_footer(self) -> list[StoreName]:
         from rerun.chunk import RrdReader
@@ -214,14 +207,6 @@ class RrdFile:
                 return _recordings(RrdReader(self.path))
         except Exception as error:  # noqa: BLE001 - whatever rerun raises
             self._distrust_footer(error)
-            return []
-
-    def _introduced(self) -> list[StoreName]:
-        try:
-            reader, descriptor = self._small_file(())
-            os.close(descriptor)
-            return _recordings(reader)
-        except Exception:  # noqa: BLE001 - a damaged introduction introduces nothing
             return []
 
     def _distrust_footer(self, error: Exception) -> None:
@@ -290,17 +275,36 @@ def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, in
             offset += next_file.start() + _FILE_HEADER_BYTES
 
 
-def _messages(part: bytes) -> Iterator[bytes]:
-    """The chunks' messages in some bytes, as far as they can be told apart."""
-    offset = 0
-    while offset + _MESSAGE.size <= len(part):
-        kind, size = _MESSAGE.unpack_from(part, offset)
-        end = offset + _MESSAGE.size + size
-        if kind > _BLUEPRINT or end > len(part):
-            return
-        if kind == _CHUNK:
-            yield part[offset:end]
-        offset = end
+def _chunk(body: bytes, store: StoreName, content: Sequence[str] | None) -> Chunk | None:
+    """The chunk in a message, None for another store's or entity's.  Raises where anything about it is wrong."""
+    import pyarrow as pa
+
+    fields = protobuf.fields(body)
+    if protobuf.store_name(fields[1]) != store.recording_id:
+        return None
+    payload = fields[5]
+    if fields.get(2, _PLAIN) == _LZ4:
+        if fields[3] > _LARGEST_RATIO * len(payload) + _MESSAGE.size:
+            raise ValueError("more bytes than can have been compressed into it")
+        payload = pa.Codec("lz4_raw").decompress(payload, fields[3])
+    reader = pa.ipc.open_stream(payload)
+    entity = reader.schema.metadata[b"rerun:entity_path"].decode().removeprefix("/")
+    if content is not None and entity not in content:
+        return None
+    batch = reader.read_next_batch()
+    batch.validate(full=True)
+    return Chunk(entity, batch)
+
+
+def _introduced(body: bytes) -> StoreName | None:
+    """The recording that a message introduces; None for a layout or a damaged message."""
+    try:
+        store = protobuf.fields(protobuf.fields(body)[2])[2]
+        recording_id = protobuf.store_name(store)
+        application = protobuf.fields(protobuf.fields(store)[3])[1].decode()
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return None if recording_id is None else StoreName(application, recording_id)
 
 
 def texts_of(batch: Any, component: str) -> list[str]:

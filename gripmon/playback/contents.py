@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 
 from gripmon.playback import entities
-from gripmon.playback.container import Block, Manifest, RrdFile, Span, StoreName, texts_of
+from gripmon.playback.container import FRAME, Block, Chunk, Manifest, RrdFile, Span, StoreName, texts_of
 from gripmon.playback.lenient import DECODING_ERRORS, read
-from gripmon.playback.table import FrameTable, IntArray, Line, TableBuilder
+from gripmon.playback.table import IntArray, Line, TableBuilder
 from gripmon.records import (
     AlertRecord,
     FrameRecord,
@@ -48,7 +48,7 @@ class Source(Protocol):
     damaged: int
 
     def record_texts(self, store: StoreName, block: Block) -> list[str] | list[bytes]: ...
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Any]: ...
+    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]: ...
 
 
 class Places:
@@ -75,13 +75,13 @@ class Places:
 
 @dataclass
 class Contents:
-    """What one file holds of one recording.  ``record_block`` (n,) says of each row of ``table`` in which of
+    """What one file holds of one recording.  ``record_block`` (n,) says of each row of ``frames`` in which of
     ``record_blocks`` it lies; ``events`` are decoded records by entity, ``alerting`` the frames' records with alerts.
     """
 
     source: Source
     store: StoreName
-    table: FrameTable
+    frames: TableBuilder
     record_blocks: list[Block] = field(default_factory=list)
     record_block: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     image_seqs: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
@@ -107,7 +107,7 @@ class Contents:
 
     @property
     def is_ours(self) -> bool:
-        return self.meta is not None or len(self.table) > 0 or self.about is not None
+        return self.meta is not None or len(self.frames) > 0 or self.about is not None
 
 
 def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], None]) -> Contents:
@@ -176,7 +176,7 @@ class Reading:
 
     def contents(self) -> Contents:
         """What was gathered."""
-        table = self._builder.table()
+        self._builder.close()
         for name in sorted(self._builder.unknown_names):
             self._notes.append(f"has frames with {name!r:.60}, which this version doesn't know")
         events = {entity: self._understood(entity) for entity in _EVENTS}
@@ -187,7 +187,7 @@ class Reading:
         return Contents(
             source=self._source,
             store=self._store,
-            table=table,
+            frames=self._builder,
             record_blocks=self._record_blocks,
             record_block=np.array(self._record_block, np.int64),
             image_seqs=seqs,
@@ -199,23 +199,23 @@ class Reading:
         )
 
     def _take(
-        self, block: Block, chunks: Sequence[Any], look_at_images: bool = False, keep_places: bool = False
+        self, block: Block, chunks: Sequence[Chunk], look_at_images: bool = False, keep_places: bool = False
     ) -> None:
         for chunk in chunks:
-            entity = chunk.entity_path.removeprefix("/")
+            entity = chunk.entity
             if keep_places and entity in self._places:
-                seqs = frame_numbers(chunk.to_record_batch())
+                seqs = frame_numbers(chunk.batch)
                 if len(seqs):
                     self._places[entity].add(block, int(seqs.min()), int(seqs.max()))
             if entity == entities.RECORD:
-                self.take_records(block, texts_of(chunk.to_record_batch(), "json"))
+                self.take_records(block, texts_of(chunk.batch, "json"))
             elif entity in self._texts:
-                self._texts[entity].update(dict.fromkeys(texts_of(chunk.to_record_batch(), "json")))
+                self._texts[entity].update(dict.fromkeys(texts_of(chunk.batch, "json")))
             elif entity == entities.ABOUT:
-                self._take_about(chunk.to_record_batch())
+                self._take_about(chunk.batch)
             elif entity == (entities.IMAGE if look_at_images else entities.IMAGE_MEAN):
                 component = "EncodedImage:blob" if look_at_images else "Scalars:scalars"
-                self._image_seqs.append(_seqs_with(chunk.to_record_batch(), component))
+                self._image_seqs.append(_seqs_with(chunk.batch, component))
 
     def take_records(self, block: Block, texts: Iterable[str | bytes]) -> None:
         """Frames' records, in order."""
@@ -294,9 +294,9 @@ def _gathered(manifest: Manifest, messages: Sequence[int]) -> list[Block]:
 
 def frame_numbers(batch: Any) -> IntArray:
     """(rows,) of a batch; empty where it isn't on the timeline of frames, the least number where a row isn't."""
-    if "frame" not in batch.schema.names:
+    if FRAME not in batch.schema.names:
         return np.empty(0, np.int64)
-    return batch.column("frame").cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
+    return batch.column(FRAME).cast("int64").fill_null(np.iinfo(np.int64).min).to_numpy(zero_copy_only=False)
 
 
 def _seqs_with(batch: Any, component: str) -> IntArray:

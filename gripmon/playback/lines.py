@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-from gripmon.playback.container import Block, Span, StoreName, UnreadableFileError
+from gripmon.playback.container import Block, Chunk, Span, StoreName, UnreadableFileError
 from gripmon.playback.contents import Contents, Reading
 
 _BLOCK_BYTES = 1 << 20
@@ -37,7 +36,7 @@ class LineFile:
                 texts += [line for line in file.read(span.size).split(b"\n") if line.strip()]
         return texts
 
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Any]:
+    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]:
         """Nothing of rerun's."""
         return []
 
@@ -54,6 +53,6 @@ def read_lines(file: LineFile, progress: Callable[[int], None]) -> Contents:
             offset += size
             progress(offset)
     contents = reading.contents()
-    if not len(contents.table):
+    if not len(contents.frames):
         raise UnreadableFileError("holds no frame records")
     return contents

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gripmon.playback import entities
 from gripmon.playback.container import Block
 from gripmon.playback.contents import Contents
-from gripmon.playback.table import FrameTable, IntArray
+from gripmon.playback.table import FrameTable, IntArray, TableBuilder
 from gripmon.records import (
     AlertRecord,
     FrameRecord,
@@ -58,7 +58,7 @@ def merge(contents: Sequence[Contents]) -> Merged:
     parts = tuple(sorted(contents, key=_place_in_run))
     faults = [f"{part.path}: {fault}" for part in parts for fault in part.faults]
     # The last file of a run was begun and got none: nothing is lost.
-    empty = [part for part in parts if not len(part.table) and (part is not parts[-1] or len(parts) == 1)]
+    empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
     faults += [f"{part.path}: holds no frames" for part in empty]
     faults += _missing_files(parts)
     meta = next((part.meta for part in parts if part.meta is not None), None)
@@ -69,8 +69,6 @@ def merge(contents: Sequence[Contents]) -> Merged:
     faults += _gaps(parts, table, rows_block, blocks)
     faults += _backwards(parts, table, rows_block, blocks)
     seqs = [part.image_seqs for part in parts]
-    for part in parts:
-        part.table = part.table.take(slice(0, 0))  # it stands in the run's table now
     return Merged(
         parts=parts,
         meta=meta,
@@ -98,20 +96,19 @@ def _number(part: Contents) -> int | None:
 
 
 def _place_in_run(part: Contents) -> tuple[int, int, str]:
-    first = int(part.table.seq.min()) if len(part.table) else np.iinfo(np.int64).max
-    return _number(part) or 0, first, str(part.path)
+    return _number(part) or 0, part.frames.first_seq, str(part.path)
 
 
 def _missing_files(parts: Sequence[Contents]) -> list[str]:
     """Numbers that are missing, where frames are missing there, too: files may have been put together."""
-    numbered = [(number, part) for part in parts if (number := _number(part)) is not None and len(part.table)]
+    numbered = [(number, part) for part in parts if (number := _number(part)) is not None and len(part.frames)]
     said = []
     before, last = 0, -1
     for number, part in numbered:
-        if number > before + 1 and part.table.seq.min() > last + 1:
+        if number > before + 1 and part.frames.first_seq > last + 1:
             which = f"number {number - 1} is" if number == before + 2 else f"numbers {before + 1} to {number - 1} are"
             said.append(f"{part.path}: is file {number} of its run, and {which} not there; the others were used")
-        before, last = number, int(part.table.seq.max())
+        before, last = number, part.frames.last_seq
     return said
 
 
@@ -163,7 +160,7 @@ def _frames(parts: Sequence[Contents]) -> tuple[FrameTable, IntArray, list[tuple
     for number, part in enumerate(parts):
         rows_block.append(part.record_block + len(blocks))
         blocks += [(number, block) for block in part.record_blocks]
-    table = FrameTable.concatenate([part.table for part in parts])
+    table = TableBuilder.join([part.frames for part in parts])
     of_rows = np.concatenate(rows_block)
     if np.all(np.diff(table.seq) > 0):
         return table, of_rows, blocks, []

@@ -26,7 +26,7 @@ class Collection:
 
 
 def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
-    """Everything but the images of the given files, and of all ``.rrd`` files directly in the given folders.
+    """Everything but the images of the given files, and of all ``.rrd`` files in the given folders and below.
 
     Files of several runs and robots may be mixed, in any order; those with one recording id become one recording.  An
     ``estimates.jsonl`` that is named itself is a recording without images.  Whatever the files are, this raises
@@ -52,13 +52,26 @@ def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> 
     return Collection(tuple(recordings), tuple(faults))
 
 
+def recordings_below(folder: Path) -> list[Path]:
+    """All ``.rrd`` files in a folder and its folders, by name; but none in hidden ones, where files are being made.
+
+    OSError where the folder itself can't be read.
+    """
+    os.scandir(folder).close()
+    found = []
+    for where, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        found += [Path(where, n) for n in names if not n.startswith(".") and Path(n).suffix.lower() == _SUFFIX]
+    return sorted(found)
+
+
 def _files(paths: Sequence[Path], faults: list[str]) -> Iterator[Path]:
     for path in paths:
         try:
             if not path.is_dir():
                 yield path
                 continue
-            found = sorted(p for p in path.iterdir() if p.suffix.lower() == _SUFFIX and not p.is_dir())
+            found = recordings_below(path)
         except OSError as error:
             faults.append(f"{path}: {error.strerror}; not used")
             continue

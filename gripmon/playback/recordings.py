@@ -161,16 +161,21 @@ class Recording:
             row = self._row(entities.IMAGE, seq)
             if row is None:
                 continue
-            jaw = self._row(entities.JAW_REPORTED, seq)
-            openings_m = None if jaw is None else jaw.value("Scalars:scalars").as_py()
             yield Shot(
                 seq=seq,
                 stamp_ns=_stamp_ns(row),
                 blob=_blob(row),
                 media_type=_media_type(row),
-                jaw_reported_m=openings_m[0] if openings_m else None,
+                jaw_reported_m=self.jaw_reported_m(seq),
                 record=record if record is not None and record.seq == seq else None,
             )
+
+    def jaw_reported_m(self, seq: int) -> float | None:
+        """The opening that was reported with a frame; None where there was none."""
+        row = self._row(entities.JAW_REPORTED, seq)
+        value = None if row is None else row.value("Scalars:scalars")
+        openings_m = None if value is None else value.as_py()
+        return openings_m[0] if openings_m else None
 
     def _records_of(self, part: int, block: Block, wanted: set[int]) -> dict[int, FrameRecord]:
         contents = self._parts[part]
@@ -203,15 +208,14 @@ class Recording:
         key = part, block
         if key not in self._kept:
             contents = self._parts[part]
-            content = [f"/{entity}" for entity in entities.ON_DEMAND]
             found: dict[str, list[Any]] = {}
             try:
-                chunks = contents.source.decode(contents.store, block, content)
+                chunks = contents.source.decode(contents.store, block, entities.ON_DEMAND)
             except OSError:
                 chunks = []
             for chunk in chunks:
                 if not chunk.is_static:
-                    found.setdefault(chunk.entity_path.removeprefix("/"), []).append(chunk.to_record_batch())
+                    found.setdefault(chunk.entity, []).append(chunk.batch)
             self._kept[key] = found
             if len(self._kept) > _BLOCKS_KEPT:
                 self._kept.popitem(last=False)

@@ -127,7 +127,7 @@ class FrameTable:
         builder = TableBuilder()
         for record in records:
             builder.add(record)
-        return builder.table()
+        return TableBuilder.join([builder])
 
     @staticmethod
     def from_jsonl(path: Path, faults: list[str] | None = None) -> FrameTable:
@@ -212,22 +212,44 @@ class TableBuilder:
 
     def __init__(self) -> None:
         self._rows: list[FrameRecord | Line] = []
-        self._blocks: list[FrameTable] = []
+        self._blocks: dict[str, list[NDArray[Any]]] = {name: [] for name in _COLUMNS}
         self._references: dict[str, int] = {}
+        self._count = 0
         self.unknown_names: set[str] = set()
+        self.first_seq = np.iinfo(np.int64).max
+        self.last_seq = np.iinfo(np.int64).min
+
+    def __len__(self) -> int:
+        return self._count
 
     def add(self, record: FrameRecord | Line) -> None:
         """One more row."""
         self._rows.append(record)
+        self._count += 1
+        self.first_seq, self.last_seq = min(self.first_seq, record.seq), max(self.last_seq, record.seq)
         if len(self._rows) >= _BLOCK_ROWS:
             self._close_block()
 
-    def table(self) -> FrameTable:
-        """All rows so far."""
+    def close(self) -> None:
+        """There are no more rows for the time being: all names are known."""
         if self._rows:
             self._close_block()
-        blocks = [dataclasses.replace(block, reference_ids=tuple(self._references)) for block in self._blocks]
-        return FrameTable.concatenate(blocks)
+
+    @staticmethod
+    def join(builders: Sequence[TableBuilder]) -> FrameTable:
+        """All rows of all, one builder's after the other's.  A builder gives its columns away one by one, so that what
+        is joined doesn't stand in memory twice; afterwards it is good for nothing.
+        """
+        places: dict[str, int] = {}
+        for builder in builders:
+            builder.close()
+            new = np.array([places.setdefault(name, len(places)) for name in builder._references], np.int32)
+            builder._blocks["reference"] = [new[block] for block in builder._blocks["reference"]]
+        columns: dict[str, Any] = {}
+        for name, shape in _COLUMNS.items():
+            blocks = [block for builder in builders for block in builder._blocks.pop(name)]
+            columns[name] = np.concatenate(blocks) if blocks else _empty(name, shape)
+        return FrameTable(**columns, reference_ids=tuple(places))
 
     def _close_block(self) -> None:
         rows, self._rows = self._rows, []
@@ -257,8 +279,8 @@ class TableBuilder:
             "corners_total": [len(r.corners) for r in rows],
             "refused": [r.reason is not None for r in rows],
         }
-        columns = {name: np.asarray(v, _TYPES.get(name, np.float64)) for name, v in values.items()}
-        self._blocks.append(FrameTable(**columns, reference_ids=()))
+        for name, v in values.items():
+            self._blocks[name].append(np.asarray(v, _TYPES.get(name, np.float64)))
 
     def _code(self, codes: dict[str, int], name: str, otherwise: str) -> int:
         code = codes.get(name)

@@ -10,5 +10,15 @@ from __future__ import annotations
 from gripmon.recording.feed import ProcessRecorder, open_recorder
 from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
 from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.view import ViewSettings
 
-__all__ = ["Notes", "NullRecorder", "ProcessRecorder", "Recorder", "RecordingSettings", "Trace", "open_recorder"]
+__all__ = [
+    "Notes",
+    "NullRecorder",
+    "ProcessRecorder",
+    "Recorder",
+    "RecordingSettings",
+    "Trace",
+    "ViewSettings",
+    "open_recorder",
+]

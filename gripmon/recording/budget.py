@@ -11,6 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from gripmon.recording.pins import SUFFIX
+
 _HEADROOM = 0.1  # of the budget is free when a file begins, or files would become ever smaller
 
 
@@ -32,6 +34,7 @@ class DiskBudget:
         self._directory = directory
         self._budget_bytes = budget_bytes
         usual = rf"{re.escape(f'{robot}-{camera}')}-\d{{8}}T\d{{6}}Z"
+        self._series = f"{name}-"
         self._belongs = re.compile(rf"(?:{usual}|{re.escape(name)})-\d{{4,}}\.rrd").fullmatch
         self._others_bytes = 0
 
@@ -65,8 +68,8 @@ class DiskBudget:
         if total <= limit:
             return ""
         return (
-            f"pinned recordings in {self._directory} leave no room: {total / 1e6:.0f} MB of budget_bytes "
-            f"{self._budget_bytes / 1e6:.0f} MB; move them away or delete their .pinned files{trouble}"
+            f"pinned recordings in {self._directory} leave no room: {total / 1e6:.0f} MB, nine tenths of budget_bytes "
+            f"{self._budget_bytes / 1e6:.0f} MB or more; move them away or delete their .pinned files{trouble}"
         )
 
     def recordings(self) -> list[_Entry]:
@@ -78,6 +81,19 @@ class DiskBudget:
                     about = found.stat()
                     entries.append(_Entry(about.st_mtime_ns, found.name, about.st_size, Path(found.path)))
         return sorted(entries)
+
+    def orphaned_pins(self) -> list[Path]:
+        """Pins of earlier runs whose recordings somebody has deleted or moved.
+
+        Those of the series ``name`` stay: they keep its numbers from being used again.
+        """
+        pins = [Path(found.path) for found in os.scandir(self._directory) if found.name.endswith(SUFFIX)]
+        recordings = [(pin, pin.with_name(pin.name.removesuffix(SUFFIX))) for pin in pins]
+        return [
+            pin
+            for pin, recording in recordings
+            if self._belongs(recording.name) and not recording.name.startswith(self._series) and not recording.exists()
+        ]
 
 
 def space_missing(directory: Path, wanted_bytes: int, factor: float = 1.0) -> str:

@@ -39,13 +39,19 @@ class Line:
 class EventWriter:
     """Writes ``status/…``, ``events``, ``alert``, ``command`` and ``state``."""
 
-    def __init__(self, send: Sender):
+    def __init__(self, send: Sender, whose: str = ""):
+        """``whose`` begins each line of the log, where there are two."""
         self._send = send
+        self._whose = f"{whose}: " if whose else ""
         self._state = ""
         self._verdict = ""
         self._newest_stamp_ns: int | None = None
         send.static("status/state", _configuration(palette.STATES))
         send.static("status/verdict", _configuration(palette.VERDICTS))
+
+    def repeat(self) -> None:
+        """Say state and verdict again with the next frame, changed or not."""
+        self._state = self._verdict = ""
 
     def write(self, rows: Sequence[Row], events: Events, more: Sequence[Line]) -> None:
         """``more`` are lines for the log that others have."""
@@ -55,7 +61,7 @@ class EventWriter:
         lines += [_of_alert(self._on_frames_clock(a.stamp_ns), a.seq, a) for a in events.alerts]
         lines += [_of_command(self._on_frames_clock(c.stamp_ns), c) for c in events.commands]
         if lines:
-            columns = rr.TextLog.columns(text=[e.text for e in lines], level=[e.level for e in lines])
+            columns = rr.TextLog.columns(text=[f"{self._whose}{e.text}" for e in lines], level=[e.level for e in lines])
             self._send.columns("events", [e.stamp_ns for e in lines], [e.seq for e in lines], columns)
         self._whole("alert", events.alerts)
         self._whole("command", events.commands)

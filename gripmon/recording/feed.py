@@ -19,6 +19,7 @@ from gripmon.recording.health import Health
 from gripmon.recording.process import WorkerProcess
 from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
 from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.view import ViewSettings
 from gripmon.recording.wire import EncodedBatch, Events, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
 from gripmon.records import (
     AlertRecord,
@@ -77,6 +78,7 @@ def open_recorder(
     truth_tcp_m: Truth | None = None,
     patience_s: float = 0.0,
     configuration: RecordedConfiguration | None = None,
+    view: ViewSettings | None = None,
 ) -> Recorder:
     """A recorder as configured; files are ``directory/name-0001.rrd`` and on, never overwriting one.
 
@@ -84,17 +86,20 @@ def open_recorder(
     which a simulator can give, maps a frame's ``seq`` to the TCP's true position in the camera frame; its shift against
     the reference is drawn beside the estimated one.  It is called by another thread than the loop's.  ``patience_s`` is
     for input that can wait, such as a folder: so long may ``offer`` wait for room before it drops a frame.  A camera
-    can't wait: 0.  ``configuration`` is written into every file.  Raises OSError when the directory can't be made.
+    can't wait: 0.  ``configuration`` is written into every file.  With ``view`` viewers may connect and see what is
+    recorded as it comes, also where nothing is recorded.  Raises OSError when the directory can't be made.
     """
-    if not settings.enabled:
+    if not settings.enabled and view is None:
         return NullRecorder()
     folder = Path(settings.directory) if directory is None else directory
-    folder.mkdir(parents=True, exist_ok=True)
+    if settings.enabled:
+        folder.mkdir(parents=True, exist_ok=True)
     if name is None:
         name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
     where = str(folder.resolve())
     has_truth = truth_tcp_m is not None
     scene = make_scene(settings, where, name, robot, camera_name, camera, gripper, reference, has_truth, configuration)
+    scene = msgspec.structs.replace(scene, view=view)
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
 
 
@@ -267,6 +272,8 @@ class ProcessRecorder:
             return
         worker.pump()
         worker.read_reports()
+        if worker.status.view_failure is not None and worker.status.view_failure != self._status.view_failure:
+            _log.warning("%s; the monitor and its recording go on", worker.status.view_failure)
         self._status = worker.status
         while worker.ready:
             batch = self._next_batch(worker)

@@ -16,8 +16,8 @@ import rerun as rr
 
 from gripmon.recording.budget import DiskBudget, claim, space_missing
 from gripmon.recording.columns import Row
-from gripmon.recording.layout import make_blueprint
-from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy
+from gripmon.recording.layout import layout_file
+from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
 from gripmon.recording.repair import repair
 from gripmon.recording.ring import Moments
 from gripmon.recording.rows import RowWriter
@@ -71,6 +71,7 @@ class FileSeries:
     def __init__(self, scene: Scene, extra_sinks: Callable[[], Sequence[Any]] = tuple):
         rr.set_strict_mode(True)
         self._scene = scene
+        self._layout = layout_file(scene, APPLICATION_ID)
         self._settings = settings = scene.settings
         self._extra_sinks = extra_sinks
         self._directory = Path(scene.directory)
@@ -99,6 +100,10 @@ class FileSeries:
     @property
     def path(self) -> str | None:
         return None if self._file is None else str(self._file.path)
+
+    @property
+    def frames_waiting(self) -> int:
+        return len(self._rows)
 
     def add_frames(self, rows: Sequence[Row]) -> None:
         self._rows += rows
@@ -130,22 +135,25 @@ class FileSeries:
         if self._stream is None or self._writer is None or self._file is None:
             self._lose()
             return
-        if self._stalled:
-            self._lose()  # what rerun holds already is written when the disk answers again
-        else:
-            rows, late, events = self._rows, self._late, self._events
-            self._rows, self._late, self._events = [], [], Events()
-            self._writer.write(rows, events)
-            for first in range(0, len(late), _PICTURES_A_CHUNK):
-                self._writer.write_pictures(late[first : first + _PICTURES_A_CHUNK])
-            self._unflushed += len(rows)
-            self._file.cover(rows)
-        if self._flush(self._stream, self._file):
+        if not self._stalled:  # what rerun holds already is written when the disk answers again
+            self._unflushed += len(self._rows)
+            self._file.cover(self._rows)
+            self._writer.write(self._rows, self._events)
+            self._rows, self._events = [], Events()
+        whole = self._flush(self._stream, self._file)
+        while whole and self._late:
+            late, self._late = self._late[:_PICTURES_A_CHUNK], self._late[_PICTURES_A_CHUNK:]
+            self._writer.write_pictures(late)
+            whole = self._flush(self._stream, self._file)
+        if whole:
             self._keep_house(self._file)
+        elif self._waiting_for_too_much():
+            self._lose()
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
-        if self._stream is not None:
+        if self._stream is not None and self._writer is not None:
+            self._writer.finish()
             self._stream.disconnect()
         self._leave()
         self._lose()
@@ -171,6 +179,12 @@ class FileSeries:
         self.failure = None
         self._retry_s = _FIRST_RETRY_S
         return True
+
+    def _waiting_for_too_much(self) -> bool:
+        """Whether more waits for a disk that doesn't answer than memory is there for."""
+        pictures = (row.picture for row in self._rows)
+        picture_bytes = sum(len(picture.blob) for picture in pictures if picture is not None)
+        return len(self._rows) > self._settings.queue_frames or picture_bytes > self._settings.ring_bytes
 
     def _keep_house(self, file: _File) -> None:
         """Pin what alerts touch, and begin the next file when this one is full, old, or breaks the budget."""
@@ -207,7 +221,8 @@ class FileSeries:
 
     def _end(self) -> None:
         """Complete the file before the next one; what waits stays for that."""
-        if self._stream is not None:
+        if self._stream is not None and self._writer is not None:
+            self._writer.finish()
             self._stream.disconnect()
         self._leave()
 
@@ -234,7 +249,7 @@ class FileSeries:
         try:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
-            stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
+            stream.log_file_from_contents("layout.rbl", self._layout)
             writer = RowWriter(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
@@ -249,6 +264,8 @@ class FileSeries:
         self._stream, self._writer = stream, writer
         self._file = _File(path, claim(path), time.monotonic())
         self.failure = None
+        # The streams of earlier files, which rerun would keep with their threads until the end.
+        rr.bindings.flush_and_cleanup_orphaned_recordings()  # type: ignore[attr-defined]
 
     def _room_missing(self) -> str:
         try:
@@ -268,6 +285,7 @@ class FileSeries:
             with contextlib.suppress(OSError):  # the same disk; a later start mends it
                 if file.frames == 0:
                     file.path.unlink(missing_ok=True)
+                    pin_path(file.path).unlink(missing_ok=True)
                 elif file.path.stat().st_size > file.whole_bytes:
                     os.truncate(file.path, file.whole_bytes)
         self._fail(why)
@@ -284,10 +302,12 @@ class FileSeries:
         self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 
     def _mend(self) -> None:
-        """Earlier files of this robot and camera, whose writer may have been killed."""
+        """Earlier files of this robot and camera, whose writer may have been killed; pins of recordings that are gone."""
         with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
             for entry in self._budget.recordings():
                 repair(entry.path)
+            for pin in self._budget.orphaned_pins():
+                pin.unlink(missing_ok=True)
 
     def _next_number(self) -> int:
         """Above all that there were: a file that was deleted leaves its number unused.  0: they can't be listed."""

@@ -21,6 +21,7 @@ CORNER_REFUSED: Colour = (255, 120, 60, 255)
 GRIPPER_FACE: Colour = (150, 160, 175, 110)
 REFERENCE: Colour = (255, 255, 255, 255)
 BACKGROUND: Colour = (16, 18, 22, 255)  # also where the viewer is set to a light theme: the reference is white
+WHOLE: Colour = (225, 228, 235, 255)  # a length or a share, beside its parts along the axes
 SHIFT: Colour = (255, 90, 200, 255)
 
 AXES: tuple[Colour, Colour, Colour] = ((240, 90, 90, 255), (90, 205, 105, 255), (95, 150, 255, 255))

@@ -19,6 +19,7 @@ _IMAGE_PLANE_SHARE = 1.35  # of the distance to the TCP: the image is a backdrop
 _AXIS_M = 0.012
 _LINE_M = 0.0004
 _SMALLEST_JAW_STEP_M = 2e-5
+_NOWHERE = np.empty((0, 3))
 
 
 class RigWriter:
@@ -51,6 +52,10 @@ class RigWriter:
         if len(self._triangles):
             send.static("rig/gripper/faces", _static_mesh(self._triangles))
 
+    def repeat(self) -> None:
+        """Draw the fingers again with the next frame, changed or not."""
+        self._drawn = None
+
     def write(self, rows: Sequence[Row]) -> None:
         posed = [row for row in rows if row.record.cam_T_grip is not None]
         if posed:
@@ -59,8 +64,16 @@ class RigWriter:
                 translation=[t.translation_m for t in transforms], quaternion=[t.rotation_xyzw for t in transforms]
             )
             self._send.frames("rig/gripper", posed, columns)
-        for row in rows:
-            self._write_fingers(row)
+        averaged = [row for row in rows if row.record.smoothed is not None]
+        if averaged:
+            poses = [row.record.smoothed for row in averaged if row.record.smoothed is not None]
+            columns = rr.Transform3D.columns(
+                translation=[p.translation_m for p in poses], quaternion=[p.rotation_xyzw for p in poses]
+            )
+            self._send.frames("rig/smoothed", averaged, columns)
+        redrawn = [row for row in rows if self._looks_different(row)]
+        if redrawn:
+            self._write_fingers(redrawn)
         pictured = [row for row in rows if row.picture is not None or row.record.reason is not None]
         if pictured:
             self._write_shift(pictured)
@@ -71,32 +84,44 @@ class RigWriter:
         columns = rr.Transform3D.columns(translation=[transform.translation_m], quaternion=[transform.rotation_xyzw])
         self._send.columns("rig/reference", [first.stamp_ns], [first.seq], columns)
 
-    def _write_fingers(self, row: Row) -> None:
-        """Redraw the fingers when the jaws moved or the verdict changed; without estimate there is nothing to show."""
-        record = row.record
-        opening_m = self._nominal_m if record.jaw_opening_m is None else record.jaw_opening_m
-        verdict = record.verdict if record.cam_T_grip is not None else Verdict.UNKNOWN
+    def _looks_different(self, row: Row) -> bool:
+        """Whether the jaws moved or the verdict changed since the fingers were drawn last."""
+        opening_m, verdict = self._look(row.record)
         if self._drawn is not None:
             same_opening = abs(opening_m - self._drawn[0]) < _SMALLEST_JAW_STEP_M
             if same_opening and verdict == self._drawn[1]:
-                return
+                return False
         self._drawn = (opening_m, verdict)
-        points_m = self._points_at(opening_m)
-        strips = points_m[self._edges] if record.cam_T_grip is not None else np.empty((0, 2, 3))
-        colours = [palette.VERDICTS[verdict]] * len(strips)
-        at = [record.stamp_ns], [record.seq]
-        edges = rr.LineStrips3D.columns(strips=list(strips), colors=colours, radii=[_LINE_M] * len(strips))
-        self._send.columns("rig/gripper/edges", *at, edges.partition([len(strips)]))
-        ghost = points_m[self._edges]
-        wires = rr.LineStrips3D.columns(
-            strips=list(ghost), colors=[palette.REFERENCE] * len(ghost), radii=[0.7 * _LINE_M] * len(ghost)
+        return True
+
+    def _look(self, record: FrameRecord) -> tuple[float, Verdict]:
+        opening_m = self._nominal_m if record.jaw_opening_m is None else record.jaw_opening_m
+        return opening_m, record.verdict if record.cam_T_grip is not None else Verdict.UNKNOWN
+
+    def _write_fingers(self, rows: Sequence[Row]) -> None:
+        """The fingers as they are and, white, at the reference; without estimate there is only that."""
+        looks = [self._look(row.record) for row in rows]
+        points_m = [self._points_at(opening_m) for opening_m, _ in looks]
+        posed = [row.record.cam_T_grip is not None for row in rows]
+        counts = [len(self._edges) * shown for shown in posed]
+        edges = rr.LineStrips3D.columns(
+            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[self._edges]],
+            colors=[palette.VERDICTS[v] for (_, v), n in zip(looks, counts, strict=True) for _ in range(n)],
+            radii=[_LINE_M] * sum(counts),
         )
-        self._send.columns("rig/reference/edges", *at, wires.partition([len(ghost)]))
+        self._send.frames("rig/gripper/edges", rows, edges.partition(counts))
+        ghosts = [strip for some in points_m for strip in some[self._edges]]
+        wires = rr.LineStrips3D.columns(
+            strips=ghosts, colors=[palette.REFERENCE] * len(ghosts), radii=[0.7 * _LINE_M] * len(ghosts)
+        )
+        self._send.frames("rig/reference/edges", rows, wires.partition([len(self._edges)] * len(rows)))
         if len(self._triangles):
-            vertices = points_m[self._face_points] if record.cam_T_grip is not None else np.empty((0, 3))
-            normals = _face_normals(vertices, self._triangles) if len(vertices) else vertices
-            mesh = rr.Mesh3D.columns(vertex_positions=vertices, vertex_normals=normals)
-            self._send.columns("rig/gripper/faces", *at, mesh.partition([len(vertices)]))
+            solids = [
+                some[self._face_points] if shown else _NOWHERE for some, shown in zip(points_m, posed, strict=True)
+            ]
+            normals = [_face_normals(each, self._triangles) if len(each) else each for each in solids]
+            mesh = rr.Mesh3D.columns(vertex_positions=np.concatenate(solids), vertex_normals=np.concatenate(normals))
+            self._send.frames("rig/gripper/faces", rows, mesh.partition([len(each) for each in solids]))
 
     def _write_shift(self, rows: Sequence[Row]) -> None:
         """An arrow from the reference's TCP to the estimated one, true to scale."""

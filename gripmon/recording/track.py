@@ -4,7 +4,6 @@ both files shows them as one, on the same timelines.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,23 +25,20 @@ PROVENANCE = "corrected/provenance"
 _ROWS = 65536
 
 
-def write_track(path: Path, runs: Sequence[tuple[str, Any, Any]], about: msgspec.Struct) -> None:
-    """Write runs of (recording id, frame table, correction) into one file; ``about`` is kept as JSON.
+def write_track(path: Path, recording_id: str, frames: Any, correction: Any, about: msgspec.Struct) -> None:
+    """Write a run's frame table and correction into a file; ``about`` is kept as JSON.
 
     Shifts of the TCP are against the first corrected frame, mm, camera axes; raw and smoothed are the live ones.
+    Raises OSError where the file can't be written.
     """
-    sink = None
-    for recording_id, frames, correction in runs:
-        stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
-        target = path if sink is None else path.with_name(f"{path.stem}-{recording_id[:8]}{path.suffix}")
-        sink = target
-        stream.set_sinks(rr.FileSink(target))
-        _static(stream, about)
-        for begin in range(0, len(correction.stamp_ns), _ROWS):
-            _columns(stream, frames, correction, slice(begin, begin + _ROWS))
-        _events(stream, frames, correction)
-        stream.flush(timeout_sec=60.0)
-        stream.disconnect()
+    stream = rr.RecordingStream(APPLICATION_ID, recording_id=recording_id)
+    memory = stream.memory_recording()  # rerun's files don't say that the disk is full
+    _static(stream, about)
+    for begin in range(0, len(correction.stamp_ns), _ROWS):
+        _columns(stream, frames, correction, slice(begin, begin + _ROWS))
+    _events(stream, frames, correction)
+    path.write_bytes(memory.drain_as_bytes())
+    stream.disconnect()
 
 
 def _static(stream: rr.RecordingStream, about: msgspec.Struct) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.settings import RecordingSettings
+from gripmon.recording.view import ViewSettings
 from gripmon.records import (
     AlertRecord,
     FrameRecord,
@@ -59,6 +60,7 @@ class Scene(msgspec.Struct, frozen=True):
     has_truth: bool
     version: str
     configuration: RecordedConfiguration | None
+    view: ViewSettings | None = None  # for whom it is served live, too
 
 
 class ImageNote(msgspec.Struct, frozen=True, array_like=True):
@@ -140,6 +142,7 @@ class Status(msgspec.Struct, frozen=True):
     frames: int
     frames_lost: int
     images_done: int
+    view_failure: str | None = None  # of the live view, which is no failure of the recording
 
 
 def make_scene(

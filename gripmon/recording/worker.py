@@ -15,14 +15,16 @@ from numpy.typing import NDArray
 
 from gripmon.recording.columns import Picture, Row
 from gripmon.recording.files import FileSeries
+from gripmon.recording.live import LiveStream, NoFiles
 from gripmon.recording.pins import pinned_by
 from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
 from gripmon.records import Alert, AlertRecord, Limits
 
-_NICENESS = 10  # the loop goes first when both want the same core
+_NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0
+_FRAMES_A_WRITE = 128
 _REPORT_PERIOD_S = 1.0  # the daemon must hear something
 
 
@@ -45,7 +47,8 @@ class RecordingLoop:
         self._memory_descriptor = memory_descriptor
         self._unframer = Unframer()
         self._scene: Scene | None = None
-        self._files: FileSeries
+        self._files: FileSeries | NoFiles
+        self._live: LiveStream | None = None
         self._ring: ImageRing
         self._moments: Moments
         self._before: PictureRing
@@ -70,8 +73,13 @@ class RecordingLoop:
                 ended = not part
                 for payload in self._unframer.feed(part):
                     self._take(payload)
+                    if self._scene is not None and self._files.frames_waiting >= _FRAMES_A_WRITE:
+                        # Who gathers more than he can write in time falls silent and grows.
+                        self._files.write()
+                        self._report()
             if self._scene is not None and (ended or time.monotonic() >= next_flush):
-                self._files.write()
+                for receiver in self._receivers():
+                    receiver.write()
                 next_report = time.monotonic()
                 next_flush = next_report + self._flush_period_s
             if time.monotonic() >= next_report:
@@ -79,7 +87,10 @@ class RecordingLoop:
                 next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
             self._files.close()
+            released = self._live is None or self._live.close()
             self._report()
+            if not released:
+                os._exit(0)  # all is written, and rerun would wait for the viewer
 
     def _take(self, payload: bytes) -> None:
         if self._scene is None:
@@ -91,10 +102,12 @@ class RecordingLoop:
             self._around_ns = round(1e9 * scene.settings.around_alert_s)
             self._moments = Moments(self._around_ns)
             self._before = PictureRing(self._around_ns, scene.settings.ring_bytes)
-            self._files = FileSeries(scene)
+            self._files = FileSeries(scene) if scene.settings.enabled else NoFiles()
+            self._live = None if scene.view is None else LiveStream(scene, scene.view)
             return
         batch = self._decode(payload)
-        self._files.add_events(batch.events)
+        for receiver in self._receivers():
+            receiver.add_events(batch.events)
         for note in batch.frames:
             self._take_frame(note)
         for alert in batch.events.alerts:
@@ -119,7 +132,8 @@ class RecordingLoop:
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
-        self._files.add_frames([row])
+        for receiver in self._receivers():
+            receiver.add_frames([row])
 
     def _is_near(self, stamp_ns: int) -> bool:
         return self._around_ns > 0 and self._moments.near(stamp_ns)
@@ -131,7 +145,12 @@ class RecordingLoop:
         self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
         if self._around_ns > 0 and near_ns is not None:
             self._moments.add(near_ns)
-            self._files.add_pictures(self._before.take(self._moments))
+            pictures = self._before.take(self._moments)
+            for receiver in self._receivers():
+                receiver.add_pictures(pictures)
+
+    def _receivers(self) -> tuple[FileSeries | NoFiles | LiveStream, ...]:
+        return (self._files,) if self._live is None else (self._files, self._live)
 
     def _report(self) -> None:
         if self._scene is None:
@@ -143,6 +162,7 @@ class RecordingLoop:
             frames=files.frames_written,
             frames_lost=files.frames_lost,
             images_done=self._images_done,
+            view_failure=None if self._live is None else self._live.failure,
         )
         if self._parent_listens:
             try:
@@ -159,12 +179,18 @@ def encode_picture(image: NDArray[np.generic], settings: RecordingSettings) -> P
         _, blob = cv2.imencode(".png", exact, (cv2.IMWRITE_PNG_COMPRESSION, 1))
     else:
         _, blob = cv2.imencode(".jpg", shown, (cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality))
+    return measured_picture(blob.tobytes(), f"image/{settings.image_format}", shown)
+
+
+def measured_picture(blob: bytes, media_type: str, image: NDArray[np.generic]) -> Picture:
+    """An encoded image with what tells of the quality of its pixels."""
+    shown = to_8_bit(image)
     grey = shown if shown.ndim == 2 else cv2.cvtColor(shown, cv2.COLOR_BGR2GRAY)
     mean, deviation = cv2.meanStdDev(grey)
     laplacian = cv2.Laplacian(grey, cv2.CV_16S)
     return Picture(
-        blob=blob.tobytes(),
-        media_type=f"image/{settings.image_format}",
+        blob=blob,
+        media_type=media_type,
         mean_grey=float(mean[0, 0]),
         contrast_grey=float(deviation[0, 0]),
         saturated_percent=100.0 * float(np.count_nonzero(grey >= 254)) / grey.size,

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import options
+
 _DESCRIPTION = """\
 Runs the monitor, by edges and by corners, over simulated scenes of every condition (clutter, occlusion, blur, noise,
 light, jaws, bumps …) and over the rendered sequences beside the checkout, if they are there; compares with the truth:
@@ -34,31 +36,26 @@ class Plan:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "accuracy",
-        help="errors, honesty and time of the transform in every condition; against others",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "errors, honesty and time of the transform in every condition; against others",
+        _DESCRIPTION,
+        quick="three scenes of each condition",
+        seed=True,
     )
-    parser.add_argument("--quick", action="store_true", help="three scenes of each condition")
     parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="rows whose name starts so")
     parser.add_argument("--list", action="store_true", help="print the names of all rows and end")
-    parser.add_argument("--scenes", type=_count, metavar="N", help="scenes of each condition")
-    parser.add_argument("--frames", type=_count, metavar="N", help="frames of each scene")
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--jobs", type=_count, default=2, metavar="N", help="rows at the same time (default 2)")
+    parser.add_argument("--scenes", type=options.positive, metavar="N", help="scenes of each condition")
+    parser.add_argument("--frames", type=options.positive, metavar="N", help="frames of each scene")
+    parser.add_argument(
+        "--jobs", type=options.positive, default=2, metavar="N", help="rows at the same time (default 2)"
+    )
     parser.add_argument("--no-peers", action="store_true", help="only our own monitor")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write accuracy.md, accuracy.json and accuracy/*.png there"
     )
-    parser.set_defaults(handler=run)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}; at least 1")
-    return value
 
 
 def run(arguments: argparse.Namespace) -> int:

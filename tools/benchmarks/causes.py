@@ -7,8 +7,9 @@ import dataclasses
 import json
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Lets one thing go wrong at a time before simulated cameras, at random: the mount moves (0.1 to 10 mm, 0.05 to 5
@@ -44,24 +45,17 @@ class Outcome:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "causes",
-        help="is the right cause named when something goes wrong",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "is the right cause named when something goes wrong",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write every trial",
     )
-    parser.add_argument("--trials", type=_count, default=200, metavar="N", help="of each cause (default 200)")
+    parser.add_argument("--trials", type=options.positive, default=200, metavar="N", help="of each cause (default 200)")
     parser.add_argument("--only", metavar="ROWS", help="rows, separated by commas (default: all)")
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every trial")
-    parser.set_defaults(handler=run)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}; at least 1")
-    return value
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -271,6 +271,37 @@ def markdown(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
+def draw(path: Path, seed: int) -> None:
+    """Truth, live and corrected along camera y, of two scenarios."""
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    from benchmarks.noise_model import NoiseModel
+    from gripmon.hindsight import correct
+
+    wanted = [s for s in scenarios() if s.regime == "working" and s.name in ("five steps", "creep of 0.1 mm/min")]
+    figure, axes = plt.subplots(len(wanted), 1, figsize=(10, 7), constrained_layout=True)
+    for scenario, axis in zip(wanted, axes, strict=True):
+        rng = np.random.default_rng(seed)
+        noise = NoiseModel.load(scenario.regime).streams(1, rng).next(round(scenario.seconds * FPS))
+        covariance = noise.covariance[:, 0]
+        stamp_ns, true_T, measured_T, measured = stream(scenario, noise.error[:, 0], 0.0, rng)
+        correction = correct(stamp_ns, measured_T, covariance, measured)
+        smoothed_T, raw_T = live(measured_T, covariance, measured)
+        time_s, start_m = 1e-9 * (stamp_ns - stamp_ns[0]), true_T[0, 1, 3]
+        shifts = [1e6 * (T[:, 1, 3] - start_m) for T in (raw_T, smoothed_T, true_T, correction.cam_T_grip)]
+        sigma = 2e6 * np.sqrt(correction.covariance[:, 1, 1])
+        axis.plot(time_s, shifts[0], color="0.8", lw=0.5, label="raw (live)")
+        axis.plot(time_s, shifts[1], color="tab:orange", lw=0.9, label="smoothed (live)")
+        axis.plot(time_s, shifts[2], color="black", lw=2.5, alpha=0.4, label="truth")
+        axis.fill_between(time_s, shifts[3] - sigma, shifts[3] + sigma, color="tab:blue", alpha=0.25, lw=0)
+        axis.plot(time_s, shifts[3], color="tab:blue", lw=1.2, label="corrected, ±2σ")
+        axis.set(title=f"{scenario.regime}: {scenario.name}", xlabel="s", ylabel="TCP along camera y, µm")
+        axis.legend(loc="best", fontsize=8)
+    figure.savefig(path, dpi=80)
+    plt.close(figure)
+
+
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
     parser = commands.add_parser(
@@ -283,6 +314,7 @@ def add_parser(commands: Any) -> None:
     parser.add_argument("--seed", type=int, default=1, metavar="N", help="of everything random (default 1)")
     parser.add_argument("--only", default="", metavar="TEXT", help="scenarios whose regime: name contains it")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw two scenarios instead of measuring")
     parser.set_defaults(handler=run)
 
 
@@ -295,6 +327,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.streams < 1 or arguments.seed < 0:
         print("correction: --streams must be at least 1 and --seed at least 0", file=sys.stderr)
         return 2
+    if arguments.picture is not None:
+        draw(arguments.picture, arguments.seed)
+        return 0
     about, rows = machine.description(), []
     wanted = [s for s in scenarios() if arguments.only in f"{s.regime}: {s.name}"]
     if not wanted:

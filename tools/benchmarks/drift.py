@@ -6,8 +6,9 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from benchmarks import options
 
 if TYPE_CHECKING:
     import numpy as np
@@ -44,40 +45,37 @@ LOOK_FRAMES, CREEP_FRAMES = 600, 36_000
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "drift",
-        help="false alarms and delays of the drift test",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "false alarms and delays of the drift test",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write all figures",
     )
     parser.add_argument(
-        "--frames", type=_count, default=10_000_000, metavar="N", help="of false alarms, each regime (default 10^7)"
+        "--frames",
+        type=options.positive,
+        default=10_000_000,
+        metavar="N",
+        help="of false alarms, each regime (default 10^7)",
     )
     parser.add_argument(
         "--streams",
-        type=_count,
+        type=options.positive,
         default=STREAMS,
         metavar="N",
         help=f"side by side (default {STREAMS}); fewer are longer",
     )
     parser.add_argument(
         "--warm-up",
-        type=_count,
+        type=options.positive,
         default=WARM_UP,
         metavar="N",
         help=f"frames before a motion begins (default {WARM_UP})",
     )
     parser.add_argument("--no-creep", action="store_true", help="leave out creeps, which take longest")
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all figures")
-    parser.set_defaults(handler=run)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value}; at least 1")
-    return value
 
 
 def run(arguments: argparse.Namespace) -> int:

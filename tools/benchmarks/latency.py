@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import sys
 import tempfile
@@ -12,6 +11,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Times the daemon's own loop (gripmon.daemon.run with a Zenoh publisher and a subscriber in another process) on
@@ -46,16 +47,16 @@ QUICK = Plan(ring=60, frames=2000, staged=1000, paced_block=120, paced_blocks=4,
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    options.add_command(
+        commands,
         "latency",
-        help="time from frame to published transform, memory, recording; against AprilTags",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "time from frame to published transform, memory, recording; against AprilTags",
+        _DESCRIPTION,
+        quick="a shorter run",
+        as_json="write everything that was measured",
+        markdown=True,
     )
-    parser.add_argument("--quick", action="store_true", help="a shorter run")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the report as a Markdown file")
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -63,12 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     from benchmarks import report
 
     results = measure(QUICK if arguments.quick else Plan())
-    text = report.as_text(results)
-    print(text)
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
-    if arguments.markdown is not None:
-        arguments.markdown.write_text(f"# `tools/bench latency`\n\n```\n{text}\n```\n")
+    options.deliver(arguments, "latency", report.as_text(results), results)
     return 0
 
 

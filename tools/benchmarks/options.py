@@ -1,4 +1,4 @@
-"""What benchmarks parse alike: how long, and where the results go."""
+"""What benchmarks parse alike: how long, from which seed, and where the results go."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def add_command(
     description: str,
     *,
     quick: str = "",
+    seed: bool = False,
     as_json: str = "",
     markdown: bool = False,
 ) -> argparse.ArgumentParser:
@@ -26,6 +27,8 @@ def add_command(
     )
     if quick:
         parser.add_argument("--quick", action="store_true", help=quick)
+    if seed:
+        parser.add_argument("--seed", type=count, default=1, metavar="N", help="of everything random (default 1)")
     if as_json:
         parser.add_argument("--json", type=Path, metavar="FILE", help=as_json)
     if markdown:
@@ -36,9 +39,18 @@ def add_command(
 
 def count(text: str) -> int:
     """A whole number from 0, as an argument's type."""
+    return _at_least(0, text)
+
+
+def positive(text: str) -> int:
+    """A whole number from 1."""
+    return _at_least(1, text)
+
+
+def _at_least(lowest: int, text: str) -> int:
     value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value}; at least 0")
+    if value < lowest:
+        raise argparse.ArgumentTypeError(f"{value}; at least {lowest}")
     return value
 
 

@@ -8,8 +8,9 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Knocks a simulated camera at random, by up to 15 mm at the TCP and 8 degrees, uniform in size and in direction, and lets
@@ -62,24 +63,19 @@ class Outcome:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "recalibration",
-        help="what becomes the reference after the camera was knocked",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "what becomes the reference after the camera was knocked",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write every trial",
     )
-    parser.add_argument("--trials", type=_count, default=1000, metavar="N", help="knocks (default %(default)s)")
-    parser.add_argument("--first", type=_count, default=0, metavar="N", help="number of the first one (default 0)")
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every trial")
-    parser.set_defaults(handler=run)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value}; at least 0")
-    return value
+    parser.add_argument("--trials", type=options.count, default=1000, metavar="N", help="knocks (default %(default)s)")
+    parser.add_argument(
+        "--first", type=options.count, default=0, metavar="N", help="number of the first one (default 0)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:

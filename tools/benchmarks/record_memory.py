@@ -65,7 +65,6 @@ def measure(path: Path, plan: Plan) -> dict[str, Any]:
         "written": recorder.frames_written,
         "dropped": recorder.dropped,
         "files": max(numbers),
-        "files_left": len(numbers),
         "looks": looks,
         "slopes": {who: slope(looks, who, plan.warm_up) for who in ("daemon_mib", "process_mib")},
     }

@@ -121,7 +121,7 @@ def _killed(killed: dict[str, Any]) -> list[str]:
 def _memory(memory: dict[str, Any]) -> list[str]:
     lines = [
         f"memory over {memory['frames']:,} frames, {memory['hours']:g} h at 60/s, in {memory['took_s']:.0f} s",
-        f"  {memory['written']:,} written, {memory['dropped']} dropped; {memory['files']} files, {memory['files_left']} left",
+        f"  {memory['written']:,} written, {memory['dropped']} dropped; files: {memory['files']}",
         f"  {'hours':>8s} {'daemon side':>14s} {'recording process':>20s}   MiB",
     ]
     looks = memory["looks"]

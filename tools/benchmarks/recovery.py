@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Knocks the simulated camera about at random, up to 10 mm at the TCP and 4 degrees in any direction, and counts in how
@@ -60,11 +60,15 @@ class Outcome:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "recovery",
-        help="back on track after jumps of the camera, and never at a wrong place",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "back on track after jumps of the camera, and never at a wrong place",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write everything that was measured",
+        markdown=True,
     )
     plan = Plan()
     for name, what in (
@@ -73,19 +77,12 @@ def add_parser(commands: Any) -> None:
         ("absent", "views without the gripper"),
     ):
         parser.add_argument(
-            f"--{name}", type=_count, default=getattr(plan, name), metavar="N", help=f"{what} (default %(default)s)"
+            f"--{name}",
+            type=options.count,
+            default=getattr(plan, name),
+            metavar="N",
+            help=f"{what} (default %(default)s)",
         )
-    parser.add_argument("--seed", type=_count, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the report as a Markdown file")
-    parser.set_defaults(handler=run)
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{value}; at least 0")
-    return value
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -95,13 +92,9 @@ def run(arguments: argparse.Namespace) -> int:
     plan = Plan(arguments.trials, arguments.beyond, arguments.absent, seed=arguments.seed)
     described = machine.description()
     results = measure(plan)
+    rows = {name: [_plain(outcome) for outcome in outcomes] for name, outcomes in results.items()}
     text = as_text(described, plan, results)
-    print(text)
-    if arguments.json is not None:
-        rows = {name: [_plain(outcome) for outcome in outcomes] for name, outcomes in results.items()}
-        arguments.json.write_text(json.dumps({"machine": described, "rows": rows}, indent=1) + "\n")
-    if arguments.markdown is not None:
-        arguments.markdown.write_text(f"# `tools/bench recovery`\n\n```\n{text}\n```\n")
+    options.deliver(arguments, "recovery", text, {"machine": described, "rows": rows})
     return 0
 
 

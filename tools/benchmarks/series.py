@@ -23,8 +23,9 @@ import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Runs the two series of image pairs of the self-viewing paper (gripmon simulate series1, series2; and the rendered one
@@ -171,15 +172,15 @@ _CELLS = ("mean x", "mean y", "mean z", "max x", "max y", "max z")
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    options.add_command(
+        commands,
         "series",
-        help="the self-viewing paper's two series of image pairs, its tables beside ours",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "the self-viewing paper's two series of image pairs, its tables beside ours",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write all lines, mm",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the simulated series (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all lines, mm")
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -14,8 +14,9 @@ import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Root mean square error of the TCP, raw and smoothed, and the normalised error squared (NEES, 6 if the covariance is
@@ -179,16 +180,16 @@ def markdown(quiet: list[Quiet], events: list[Event]) -> str:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "smoothing",
-        help="the smoothed transform beside the raw one: quiet time, steps, creep",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "the smoothed transform beside the raw one: quiet time, steps, creep",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write all rows",
     )
     parser.add_argument("--streams", type=int, default=32, metavar="N", help="streams of each regime (default 32)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of everything random (default 1)")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows")
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 from pathlib import Path
 from statistics import median
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Runs the daemon's own loop on frames of the demo's scene, rendered beforehand, at 60 frames/s, and times
@@ -30,15 +31,15 @@ _TITLES = {
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    options.add_command(
+        commands,
         "wire",
-        help="time from frame to another process's callback; stalled subscribers, a router, its restart",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "time from frame to another process's callback; stalled subscribers, a router, its restart",
+        _DESCRIPTION,
+        quick="a shorter run",
+        as_json="write everything that was measured",
     )
-    parser.add_argument("--quick", action="store_true", help="a shorter run")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything that was measured")
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,9 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from benchmarks.wire_runs import QUICK, Plan
 
     results = measure(QUICK if arguments.quick else Plan())
-    print(as_text(results))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps(results, indent=2) + "\n")
+    options.deliver(arguments, "wire", as_text(results), results)
     return 0 if all(met for _, _, met in verdicts(results)) else 1
 
 

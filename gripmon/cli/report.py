@@ -1,0 +1,163 @@
+"""``gripmon report``: after a failed shift, what moved, when, how far, why, and what is affected."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.playback import Collection
+
+_DESCRIPTION = """\
+Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
+with it, what did it, whether it is still so, and which times are affected. The answer in one
+paragraph is printed; FILE.html shows it with plots, pictures and tables, in one file that needs no
+network. Recordings of several runs and robots go on one time axis."""
+
+_EXAMPLES = """\
+  gripmon demo --out demo && gripmon report demo/*.rrd --out demo/report.html
+  gripmon report recordings/ --limit-mm 0.5      what is off by less than 0.5 mm doesn't matter
+  gripmon report recordings/ --json - | jq .recordings[].affected
+
+exit codes: 0 done, if only a part could be used, too (stderr says which); 2 wrong usage, no such file,
+or no recording; 3 nothing in them can be used; 130 interrupted"""
+
+_DEFAULT_PAGE = "report.html"
+
+
+def add_parser(commands: Any) -> None:
+    """Add the subcommand."""
+    parser = common.add_command(
+        commands, "report", run, "what happened: when did the camera move, what is affected", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument(
+        "recordings",
+        nargs="+",
+        metavar="RECORDING",
+        help=".rrd files, folders of them with all below, or estimates.jsonl",
+    )
+    parser.add_argument(
+        "--out", metavar="FILE.html", help=f"the page (default: {_DEFAULT_PAGE}; none if there is only --json)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="the same as data (SI units); - for stdout")
+    parser.add_argument(
+        "--limit-mm",
+        type=common.positive_number,
+        metavar="MM",
+        help="a calibration that is off by more at the TCP counts as affected (mm; default: what the recording's "
+        "configuration calls worth a warning, monitor.policy.warn_m)",
+    )
+    parser.add_argument(
+        "--limit-deg", type=common.positive_number, metavar="DEG", help="likewise for its turn (degrees; warn_rad)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon report``."""
+    page_path = _page_path(arguments)
+    json_path = None if arguments.json in (None, "-") else Path(arguments.json)
+    for path, option in ((page_path, "--out"), (json_path, "--json")):
+        _check_folder(path, option)
+    collection = _read([Path(name) for name in arguments.recordings])
+    from gripmon.atomic import write_atomically
+    from gripmon.records import to_json
+    from gripmon.report import build
+
+    millimetres, degrees = arguments.limit_mm, arguments.limit_deg
+    report, told = build(
+        collection.recordings,
+        collection.faults,
+        None if millimetres is None else 1e-3 * millimetres,
+        None if degrees is None else math.radians(degrees),
+    )
+    _say_faults(report.faults, told)
+    if arguments.json == "-":
+        print(to_json(report).decode())
+    elif json_path is not None:
+        _write(write_atomically, json_path, to_json(report) + b"\n", "--json")
+    if page_path is not None:
+        from gripmon.report.page import page
+
+        with common.progress_bar(len(told), "recording") as step:
+            data = page(report, told, step)
+        _write(write_atomically, page_path, data, "--out")
+    if arguments.json != "-":
+        print(report.summary)
+        print("\n".join(f"written: {path}" for path in (page_path, json_path) if path is not None))
+    return common.EXIT_DONE
+
+
+def _page_path(arguments: argparse.Namespace) -> Path | None:
+    if arguments.out is None:
+        return Path(_DEFAULT_PAGE) if arguments.json is None else None
+    return Path(arguments.out)
+
+
+def _check_folder(path: Path | None, option: str) -> None:
+    """Before any work; the file itself stays as it is until the new one is whole."""
+    if path is None:
+        return
+    if path.is_dir():
+        raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+    common.make_directory(path.parent, option)
+
+
+def _write(write: Any, path: Path, data: bytes, option: str) -> None:
+    try:
+        write(path, data)
+    except OSError as error:
+        raise common.not_writable(path, error, option) from None
+
+
+def _read(paths: list[Path]) -> Collection:
+    """All recordings; ends the command where there is none, or nothing in them."""
+    from gripmon.playback import open_recordings
+
+    for path in paths:
+        if not path.exists():
+            raise common.CommandFailedError(
+                f"report: {path}: there is no such file; recordings (.rrd), or folders of them", common.EXIT_USAGE
+            )
+    with _Bytes() as progress:
+        collection = open_recordings(paths, progress)
+    if not collection.recordings:
+        reasons = "; ".join(collection.faults) or "no recording (.rrd) there"
+        # A recording that is damaged, or another application's, isn't the user's mistake; any other file is.
+        recordings = any(path.suffix.lower() in (".rrd", ".jsonl") for path in paths)
+        raise common.CommandFailedError(f"report: {reasons}", common.EXIT_FAILED if recordings else common.EXIT_USAGE)
+    if not any(len(recording.frames) for recording in collection.recordings):
+        faults = [*collection.faults, *(fault for r in collection.recordings for fault in r.faults)]
+        raise common.CommandFailedError(
+            f"report: no frame could be read: {'; '.join(faults) or 'the recordings are empty'}", common.EXIT_FAILED
+        )
+    return collection
+
+
+def _say_faults(faults: tuple[str, ...], told: Any) -> None:
+    for fault in [*faults, *(fault for each in told for fault in each.report.faults)]:
+        print(f"report: {fault}", file=sys.stderr)
+
+
+class _Bytes:
+    """A progress bar on stderr of what is read, for a person."""
+
+    def __enter__(self) -> Any:
+        if not sys.stderr.isatty():
+            return None
+        from tqdm import tqdm
+
+        self._bar = tqdm(unit="B", unit_scale=True, file=sys.stderr, dynamic_ncols=True, desc="reading", leave=False)
+        return self._show
+
+    def __exit__(self, *_exception: object) -> None:
+        if hasattr(self, "_bar"):
+            self._bar.close()
+
+    def _show(self, done: int, total: int) -> None:
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)

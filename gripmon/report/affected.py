@@ -1,0 +1,148 @@
+"""When should something not be relied on?"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records import Array
+from gripmon.report.clock import SECOND_NS
+from gripmon.report.content import AffectedRange, Displacement, Event, Limits
+from gripmon.report.lives import MOTIONS
+from gripmon.report.track import Track, displacement
+
+_MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
+_RELIEF = 0.8  # of the limit, below which it is over
+_SHORTEST_NS = SECOND_NS // 10
+_MEANING = {
+    "old_calibration": "Grasps and data that used the calibration from the beginning are off by up to this much. "
+    "gripmon correct gives the transform for every instant.",
+    "stale_reference": "Who used the monitor's reference instead of its live transforms was off by up to this much.",
+    "suspect": "Transforms were given as suspect: motions begun by them are doubtful.",
+    "unknown": "No transform was given: what was done in this time was done without one.",
+}
+
+
+def motion_ranges(
+    track: Track, table_keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
+) -> list[AffectedRange]:
+    """Where a calibration didn't hold: the one from the beginning, and, if that was replaced, the one in force.
+
+    ``table_keys``: id and revision of the references, as ``track.reference`` counts them.
+    """
+    if not track.measured.any():
+        return []
+    old = _past(track, track.against_first, limits, np.zeros(len(track), np.int64))
+    out = [_motion_range("old_calibration", track, track.against_first, run, table_keys[0], events) for run in old]
+    if len(table_keys) > 1:
+        stale = _past(track, track.against_reference, limits, track.reference)
+        for run in stale:
+            key = table_keys[int(track.reference[run[0]])]
+            out.append(_motion_range("stale_reference", track, track.against_reference, run, key, events))
+    return out
+
+
+def verdict_ranges(
+    track: Track, names: Sequence[str], verdict: NDArray[np.int8], keys: Sequence[tuple[str, int]]
+) -> list[AffectedRange]:
+    """Where transforms were suspect or there were none, for a tenth of a second or more."""
+    out = []
+    for name in ("suspect", "unknown"):
+        for first, last in runs(verdict == names.index(name)):
+            open_end = last + 1 >= len(track)
+            end_ns = int(track.stamp_ns[last if open_end else last + 1])
+            if end_ns - int(track.stamp_ns[first]) < _SHORTEST_NS:
+                continue
+            reference_id, revision = keys[int(track.reference[first])]
+            out.append(
+                AffectedRange(
+                    what=name,
+                    start_ns=int(track.stamp_ns[first]),
+                    end_ns=end_ns,
+                    ended_by="end_of_recording" if open_end else "measured_again",
+                    reference_id=reference_id,
+                    revision=revision,
+                    frames=last - first + 1,
+                    meaning=_MEANING[name],
+                )
+            )
+    return out
+
+
+def runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """First and last index of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
+    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _past(track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First and last frame of each time past the limits, in one group each; it is over only when a frame was measured
+    that is clearly within.
+    """
+    from scipy.ndimage import median_filter
+
+    frames = np.flatnonzero(track.measured)
+    smooth = np.empty((len(frames), 6))
+    for part in runs_of_equal(group[frames]):  # a median over a change of reference would mix two
+        smooth[part] = median_filter(vectors[frames[part]], size=(_MEDIAN_FRAMES, 1), mode="nearest")
+    size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
+    excess = np.maximum(size, np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad)
+    out: list[tuple[int, int]] = []
+    start: int | None = None
+    for i, frame in enumerate(frames.tolist()):
+        same = start is None or group[frame] == group[start]
+        if start is not None and (excess[i] < _RELIEF or not same):
+            out.append((start, frame - 1))
+            start = None
+        if start is None and excess[i] >= 1.0:
+            start = frame
+    if start is not None:
+        out.append((start, len(track) - 1))
+    return [(a, b) for a, b in out if int(track.measured[a : b + 1].sum()) > _MEDIAN_FRAMES // 2]
+
+
+def runs_of_equal(values: NDArray[np.int64]) -> list[slice]:
+    """Slices over which a value stays the same."""
+    cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
+    return [slice(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+
+
+def _motion_range(
+    what: str, track: Track, vectors: Array, run: tuple[int, int], key: tuple[str, int], events: Sequence[Event]
+) -> AffectedRange:
+    first, last = run
+    limit_ns = int(track.stamp_ns[first])
+    begun = [
+        event.onset.stamp_ns
+        for event in events
+        if event.kind in MOTIONS and event.onset.stamp_ns <= limit_ns <= (event.end_ns or limit_ns) + SECOND_NS
+    ]
+    at_end = last >= len(track) - 1
+    renewed = not at_end and track.reference[last + 1] != track.reference[first]
+    ended_by = "end_of_recording" if at_end else "recalibration" if renewed and what == "stale_reference" else "return"
+    return AffectedRange(
+        what=what,
+        start_ns=min([limit_ns, *begun[-1:]]),
+        limit_ns=limit_ns,
+        end_ns=int(track.stamp_ns[min(last + 1, len(track) - 1)]),
+        ended_by=ended_by,
+        reference_id=key[0],
+        revision=key[1],
+        frames=last - first + 1,
+        largest=_largest(track, vectors, first, last),
+        meaning=_MEANING[what],
+    )
+
+
+def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacement:
+    """The farthest of the medians over a few frames: a single wild frame is none."""
+    frames = first + np.flatnonzero(track.measured[first : last + 1])
+    blocks = [frames[i : i + _MEDIAN_FRAMES] for i in range(0, len(frames), _MEDIAN_FRAMES)]
+    if len(blocks) > 1 and len(blocks[-1]) < _MEDIAN_FRAMES // 2:
+        blocks.pop()
+    levels = np.array([np.median(vectors[block], axis=0) for block in blocks])
+    i = int(np.argmax(np.linalg.norm(levels[:, :3], axis=1)))
+    return displacement(levels[i], np.median(track.sigma[blocks[i]], axis=0))

@@ -1,0 +1,49 @@
+"""Limits, from the configuration that the recording holds."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import yaml
+
+from gripmon.policy import PolicySettings
+from gripmon.report.content import Limits
+
+
+def limits_of(main_text: str | None, affected_m: float | None, affected_rad: float | None) -> Limits:
+    """From the text of the configuration's main file; defaults where it names none, or is none.
+
+    ``affected_m`` and ``affected_rad`` are a person's own; None: what is worth a warning.
+    """
+    policy, origin = _policy(main_text)
+    if affected_m is not None or affected_rad is not None:
+        origin += "; what counts as affected was given with the command"
+    return Limits(
+        affected_m=policy.warn_m if affected_m is None else affected_m,
+        affected_rad=policy.warn_rad if affected_rad is None else affected_rad,
+        warn_m=policy.warn_m,
+        warn_rad=policy.warn_rad,
+        limit_m=policy.limit_m,
+        limit_rad=policy.limit_rad,
+        origin=origin,
+    )
+
+
+def excess(size_m: float, turn_rad: float, limits: Limits) -> float:
+    """How many times as large as what counts as affected; NaN counts as nothing."""
+    parts = (size_m / limits.affected_m, turn_rad / limits.affected_rad)
+    return max((part for part in parts if math.isfinite(part)), default=0.0)
+
+
+def _policy(main_text: str | None) -> tuple[PolicySettings, str]:
+    if main_text is None:
+        return PolicySettings(), "gripmon's defaults: the recording holds no configuration"
+    try:
+        document: Any = yaml.safe_load(main_text)
+        known = {field.name for field in msgspec.structs.fields(PolicySettings)}
+        said = {k: v for k, v in ((document.get("monitor") or {}).get("policy") or {}).items() if k in known}
+        return msgspec.convert(said, PolicySettings), "the recording's configuration"
+    except (yaml.YAMLError, msgspec.ValidationError, AttributeError, TypeError):
+        return PolicySettings(), "gripmon's defaults: the recording's configuration can't be read"

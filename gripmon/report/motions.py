@@ -1,0 +1,192 @@
+"""The camera's motions: when each began, how far it went, and what did it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from gripmon.records import AlertKind, Array, Severity
+from gripmon.report.clock import SECOND_NS
+from gripmon.report.content import Displacement, Event, Moment, Onset
+from gripmon.report.lives import Life, Said, explained, probability, worst
+from gripmon.report.onsets import drift_onset, frame_noise, step_onset
+from gripmon.report.track import Track, displacement
+
+_SIDE_FRAMES = 15  # that a level is the median of
+_SETTLED = 0.95
+_RINGING_NS = 2 * SECOND_NS  # a mount that was knocked swings, about where it comes to rest
+_SURE = 5.0  # standard deviations
+TITLES = {
+    AlertKind.STEP: "The camera moved at once",
+    AlertKind.CREEP: "The camera crept",
+    AlertKind.DRIFT: "The camera drifted",
+}
+
+Refine = Callable[[Onset, Displacement | None], Onset]
+"""A better onset than the one given, for a step of this size; the same if there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """What was said of one motion: a step is one of its own, also within the life of one alert."""
+
+    said: tuple[Said, ...]
+    life: Life
+    until_ns: int  # the next one was noticed, the alert was cleared, or the recording ends
+    ended: bool  # by being cleared
+
+    @property
+    def kind(self) -> AlertKind:
+        """A drift that once showed how it moves is that."""
+        kinds = [each.alert.kind for each in self.said]
+        return next((k for k in (AlertKind.STEP, AlertKind.CREEP) if k in kinds), AlertKind.DRIFT)
+
+
+def motions_of(track: Track, lives: Sequence[Life], refine: Refine = lambda onset, _moved: onset) -> list[Event]:
+    """An event for each step, creep or drift, in order of time."""
+    stretches = sorted(
+        (s for life in lives if life.is_motion for s in _stretches(life, track)), key=lambda s: s.said[0].stamp_ns
+    )
+    noise = frame_noise(track)
+    events: list[Event] = []
+    not_before_ns = int(track.stamp_ns[0]) if len(track) else 0
+    for i, stretch in enumerate(stretches):
+        following = stretches[i + 1] if i + 1 < len(stretches) else None
+        event = _event(track, stretch, following, not_before_ns, noise, refine)
+        if not _is_new(event, events[-1] if events else None):
+            events[-1] = msgspec.structs.replace(
+                events[-1], story=(*events[-1].story, *event.story), end_text=event.end_text
+            )
+            continue
+        events.append(event)
+        not_before_ns = event.onset.latest_ns
+    return events
+
+
+def _stretches(life: Life, track: Track) -> list[_Stretch]:
+    said = [each for each in life.said if each.alert.event != "cleared"]
+    if not said:
+        return []
+    starts = [0, *(i for i in range(1, len(said)) if _stepped(said[i - 1], said[i]))]
+    end_ns = int(track.stamp_ns[-1]) if len(track) else said[-1].stamp_ns
+    last_ns = end_ns if life.over is None else life.over.stamp_ns
+    out = []
+    for start, stop in zip(starts, [*starts[1:], len(said)], strict=True):
+        until_ns = said[stop].stamp_ns if stop < len(said) else last_ns
+        out.append(_Stretch(tuple(said[start:stop]), life, until_ns, stop == len(said) and life.over is not None))
+    return out
+
+
+def _stepped(before: Said, now: Said) -> bool:
+    """It says of a step that was not said of before."""
+    if now.alert.kind is not AlertKind.STEP:
+        return False
+    old_m, new_m = before.alert.tcp_shift_m, now.alert.tcp_shift_m
+    if before.alert.kind is not AlertKind.STEP or old_m is None or new_m is None:
+        return before.alert.kind is not AlertKind.STEP
+    return float(np.linalg.norm(np.subtract(new_m, old_m))) > 0.5 * float(np.linalg.norm(old_m))
+
+
+def _is_new(event: Event, before: Event | None) -> bool:
+    """Not the step before it, which was only measured better."""
+    if before is None or event.kind != AlertKind.STEP or before.kind != event.kind or before.alert_id != event.alert_id:
+        return True
+    return event.moved is None or event.moved.sigma_m is None or event.moved.size_m > _SURE * event.moved.sigma_m
+
+
+def _event(
+    track: Track, stretch: _Stretch, following: _Stretch | None, not_before_ns: int, noise: Array, refine: Refine
+) -> Event:
+    kind, noticed_ns = stretch.kind, stretch.said[0].stamp_ns
+    onset = _onset(track, stretch, not_before_ns, noise)
+    until_ns = stretch.until_ns
+    if following is not None and following.said[0].stamp_ns == until_ns:
+        next_onset = step_onset(track, until_ns, onset.latest_ns, noise)
+        until_ns = until_ns if next_onset is None else next_onset.earliest_ns
+    moved, moved_in_s, at_rest_ns = _size(track, onset, until_ns, kind)
+    if kind is AlertKind.STEP:
+        onset = refine(onset, moved)
+        at_rest_ns = onset.stamp_ns
+    alert = explained(stretch.said)
+    assert alert is not None, "a stretch has something said"
+    rates = [each.alert.rate_m_per_min for each in stretch.said if each.alert.rate_m_per_min is not None]
+    over = stretch.life.over if stretch.ended else None
+    return Event(
+        kind=kind,
+        title=TITLES[kind],
+        severity=worst(stretch.said),
+        onset=onset,
+        noticed_ns=noticed_ns,
+        end_ns=at_rest_ns,
+        end_text="" if over is None else over.alert.text,
+        cause=alert.cause,
+        cause_probability=probability(alert),
+        part=alert.part,
+        causes=alert.causes,
+        moved=moved or _said_size(stretch),
+        moved_in_s=moved_in_s,
+        rate_m_per_min=rates[-1] if rates else None,
+        alert_id=alert.alert_id,
+        story=tuple(
+            Moment(s.stamp_ns, f"{s.alert.event}: {s.alert.text}") for s in (*stretch.said, *([over] if over else []))
+        ),
+    )
+
+
+def _onset(track: Track, stretch: _Stretch, not_before_ns: int, noise: Array) -> Onset:
+    noticed_ns = stretch.said[0].stamp_ns
+    if stretch.kind is AlertKind.STEP:
+        found = step_onset(track, noticed_ns, not_before_ns, noise)
+    else:
+        found = drift_onset(track, noticed_ns, not_before_ns, _level_at(track, not_before_ns), noise)
+    return found or Onset(noticed_ns, not_before_ns, noticed_ns, "alert")
+
+
+def _level_at(track: Track, stamp_ns: int) -> Array:
+    """(6,) median of the first frames measured from a time on."""
+    start = track.index_at(stamp_ns)
+    frames = start + np.flatnonzero(track.measured[start : start + 20 * _SIDE_FRAMES])[:_SIDE_FRAMES]
+    return np.median(track.against_first[frames], axis=0) if frames.size else np.zeros(6)
+
+
+def _size(track: Track, onset: Onset, until_ns: int, kind: AlertKind) -> tuple[Displacement | None, float | None, int]:
+    """How far it went, within which time (s), and when it had gone so far."""
+    measured = np.flatnonzero(track.measured)
+    stamps = track.stamp_ns[measured]
+    before = measured[stamps <= onset.earliest_ns][-_SIDE_FRAMES:]
+    since = measured[(stamps >= onset.stamp_ns) & (stamps <= max(until_ns, onset.stamp_ns))]
+    if kind is AlertKind.STEP:  # what follows may be another motion
+        after = since[track.stamp_ns[since] <= onset.stamp_ns + _RINGING_NS]
+    else:
+        after = since[-_SIDE_FRAMES:]
+    if not before.size or not after.size:
+        return None, None, onset.stamp_ns
+    level = np.median(track.against_first[before], axis=0)
+    vector = np.median(track.against_first[after], axis=0) - level
+    # The systematic part of the error is the same before and after: the sum is cautious.
+    sigma = np.hypot(np.median(track.sigma[before], axis=0), np.median(track.sigma[after], axis=0))
+    moved = displacement(vector, sigma)
+    if kind is AlertKind.STEP:
+        return moved, 0.0, onset.stamp_ns
+    along = (track.against_first[since] - level)[:, :3] @ vector[:3]
+    reached = np.flatnonzero(along < _SETTLED * float(vector[:3] @ vector[:3]))
+    settled = since[min(int(reached[-1]) + 1, len(since) - 1)] if reached.size else since[0]
+    settled_ns = int(track.stamp_ns[settled])
+    return moved, 1e-9 * (settled_ns - onset.stamp_ns), settled_ns
+
+
+def _said_size(stretch: _Stretch) -> Displacement | None:
+    """Against the reference, as the last alert that knows has it; without an uncertainty."""
+    for each in reversed(stretch.said):
+        shift = each.alert.tcp_shift_m
+        if shift is not None:
+            return Displacement(shift, float(np.linalg.norm(shift)), None, each.alert.rotation_rad)
+    return None
+
+
+def is_harmful(event: Event) -> bool:
+    """More than information."""
+    return event.severity != Severity.INFO

@@ -1,0 +1,61 @@
+"""What a report is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
+
+from gripmon.records import AlertRecord, Meta, RecordedCommand, RecordedConfiguration, ReferenceRecord, StateRecord
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from gripmon.playback import FrameTable, Picture
+
+
+class Source(Protocol):
+    """One run of one monitor, as :class:`gripmon.playback.Recording` is."""
+
+    @property
+    def recording_id(self) -> str: ...
+    @property
+    def meta(self) -> Meta | None: ...
+    @property
+    def robot(self) -> str: ...
+    @property
+    def camera(self) -> str: ...
+    @property
+    def files(self) -> Sequence[Path]: ...
+    @property
+    def frames(self) -> FrameTable: ...
+    @property
+    def alerts(self) -> Sequence[AlertRecord]: ...
+    @property
+    def references(self) -> Sequence[ReferenceRecord]: ...
+    @property
+    def commands(self) -> Sequence[RecordedCommand]: ...
+    @property
+    def states(self) -> Sequence[StateRecord]: ...
+    @property
+    def configuration(self) -> RecordedConfiguration | None: ...
+    @property
+    def faults(self) -> Sequence[str]: ...
+    @property
+    def image_seqs(self) -> NDArray[np.int64]: ...
+    def picture(self, seq: int) -> Picture | None:
+        """The image of a frame with its overlay; None if it isn't recorded."""
+
+
+def main_text(source: Source) -> str | None:
+    """The text of the recorded configuration's main file; None if there is none."""
+    configuration = source.configuration
+    file = None if configuration is None else configuration.files.get(configuration.main)
+    if file is None:
+        return None
+    try:
+        return file.data.decode("utf-8", "replace")
+    except ValueError:
+        return None

@@ -1,0 +1,301 @@
+"""What a report says of runs whose every number is known."""
+
+from __future__ import annotations
+
+import html
+import re
+
+import msgspec
+import numpy as np
+import pytest
+from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
+
+from gripmon.records import (
+    AlertEvent,
+    AlertKind,
+    Cause,
+    RecordedConfiguration,
+    Severity,
+    Verdict,
+    to_json,
+)
+from gripmon.records.recorded import RecordedFile
+from gripmon.report import Report, build
+from gripmon.report.page import page
+
+SECOND_NS = 1_000_000_000
+
+
+def only(run: Run, **limits: float):
+    report, _ = build([run], **limits)
+    (recording,) = report.recordings
+    return recording
+
+
+def text_of(data: bytes) -> str:
+    """What a person reads: without scripts, styles and tags."""
+    markup = re.sub(r"(?s)<(script|style)\b.*?</\1>", " ", data.decode())
+    plain = html.unescape(re.sub(r"<[^>]+>", " ", markup)).replace("\u00a0", " ")
+    return re.sub(r"\s+", " ", plain)
+
+
+def test_a_step_is_placed_at_its_frame_with_its_size_and_cause():
+    recording = only(stepped())
+    (event,) = recording.events
+    assert event.kind == "step" and event.cause == "camera_mount_moved" and event.cause_probability == 0.9
+    assert event.onset.stamp_ns == START_NS + 250 * PERIOD_NS
+    assert event.onset.earliest_ns == START_NS + 249 * PERIOD_NS
+    assert event.noticed_ns == START_NS + 253 * PERIOD_NS
+    assert event.moved.size_m == pytest.approx(3e-3, abs=3e-6)
+    assert event.moved.tcp_shift_m == pytest.approx((0.0, 3e-3, 0.0), abs=8e-6)
+    (old,) = recording.affected
+    assert (old.what, old.ended_by) == ("old_calibration", "end_of_recording")
+    assert (old.start_ns, old.end_ns) == (START_NS + 250 * PERIOD_NS, START_NS + 499 * PERIOD_NS)
+    assert old.largest.size_m == pytest.approx(3e-3, abs=1e-5)
+    assert "moved once" in recording.summary and "still so" in recording.summary
+
+
+def test_a_step_and_its_return_end_the_affected_time():
+    shifts_m = np.zeros((600, 3))
+    shifts_m[200:400, 0] = 1e-3
+    run = records(shifts_m)
+    said(run, 203)
+    said(run, 420, event=AlertEvent.CLEARED, severity=Severity.INFO, text="the camera is where the reference has it")
+    recording = only(Run(run))
+    (old,) = recording.affected
+    assert old.ended_by == "return"
+    assert old.start_ns == START_NS + 200 * PERIOD_NS
+    # A median over nine frames follows within half of them.
+    assert abs(old.end_ns - (START_NS + 400 * PERIOD_NS)) <= 5 * PERIOD_NS
+    assert "not so any more" in recording.summary
+
+
+def test_a_creep_begins_where_it_left_its_noise_and_lasts_until_it_rests():
+    t = np.arange(1000) / FPS
+    shifts_m = np.zeros((1000, 3))
+    shifts_m[:, 1] = np.clip(t - 5.0, 0.0, 6.0) * 2e-4  # from 5 to 11 s by 1.2 mm
+    run = records(shifts_m)
+    said(run, 300, kind=AlertKind.DRIFT, severity=Severity.WARNING, cause=Cause.UNKNOWN, causes=())
+    said(run, 400, kind=AlertKind.CREEP, event=AlertEvent.UPDATED, rate_m_per_min=0.012)
+    (event,) = only(Run(run)).events
+    assert event.kind == "creep" and event.severity == "error" and event.rate_m_per_min == 0.012
+    assert event.cause == "camera_mount_moved"
+    began_s = 1e-9 * (event.onset.stamp_ns - START_NS)
+    assert began_s == pytest.approx(5.0, abs=0.15)
+    assert event.onset.earliest_ns <= event.onset.stamp_ns <= event.onset.latest_ns
+    assert event.moved.size_m == pytest.approx(1.2e-3, abs=1e-5)
+    assert event.moved_in_s == pytest.approx(0.95 * 6.0, abs=0.2)
+
+
+def test_two_steps_of_one_alert_are_two_events():
+    shifts_m = np.zeros((800, 3))
+    shifts_m[200:, 0] = 1e-3
+    shifts_m[500:, 1] = 4e-3
+    run = records(shifts_m)
+    said(run, 204)
+    said(run, 310, event=AlertEvent.UPDATED, text="measured better")
+    said(run, 503, event=AlertEvent.UPDATED)
+    first, second = only(Run(run)).events
+    assert [round((e.onset.stamp_ns - START_NS) / PERIOD_NS) for e in (first, second)] == [200, 500]
+    assert first.moved.size_m == pytest.approx(1e-3, abs=5e-6)
+    assert second.moved.size_m == pytest.approx(4e-3, abs=5e-6)
+
+
+def test_a_new_reference_ends_what_the_old_one_was_off_by_but_not_what_the_calibration_is():
+    run = stepped()
+    renewed = msgspec.structs.replace(
+        REFERENCE,
+        reference_id="second",
+        revision=2,
+        cam_T_grip=msgspec.structs.replace(
+            REFERENCE.cam_T_grip,
+            translation_m=tuple(np.add(REFERENCE.cam_T_grip.translation_m, (0.0, 3e-3, 0.0)).tolist()),
+        ),
+        accepted_by="operator",
+        parent="first",
+    )
+    run.records[400:] = [msgspec.structs.replace(r, reference_id="second", revision=2) for r in run.records[400:]]
+    run.references = (REFERENCE, renewed)
+    recording = only(run)
+    ranges = {a.what: a for a in recording.affected}
+    assert ranges["old_calibration"].ended_by == "end_of_recording"
+    assert ranges["stale_reference"].ended_by == "recalibration"
+    assert ranges["stale_reference"].end_ns == START_NS + 400 * PERIOD_NS
+    assert [r.reference_id for r in recording.references] == ["first", "second"]
+    assert recording.references[1].step.size_m == pytest.approx(3e-3)
+    assert recording.at_end.size_m == pytest.approx(3e-3, abs=1e-5)
+    assert recording.at_end_against_reference.size_m < 2e-5
+    assert "accepted by the operator" in recording.summary and "which holds" in recording.summary
+
+
+def test_the_error_of_a_configured_calibration_is_no_motion():
+    configured = msgspec.structs.replace(
+        REFERENCE, origin="configuration", covariance=tuple(np.diag([1e-7] * 3 + [1e-5] * 3).ravel().tolist())
+    )
+    off_m = np.tile([0.0, 5e-4, 0.0], (300, 1))  # 1.6 standard deviations
+    recording = only(Run(records(off_m), references=(configured,)))
+    assert not recording.affected and recording.at_end.size_m < 2e-5
+    assert "did not move" in recording.summary
+    # One that is measured is known better: the same shift is a motion.
+    assert only(Run(records(off_m))).affected
+
+
+def test_what_was_lost_is_told():
+    run = stepped(at=450)
+    run.records[100:200] = [
+        msgspec.structs.replace(r, verdict=Verdict.UNKNOWN, cam_T_grip=None, covariance=None, drift=None)
+        for r in run.records[100:200]
+    ]
+    del run.records[300:400]
+    recording = only(run)
+    unknown = next(a for a in recording.affected if a.what == "unknown")
+    assert (unknown.start_ns, unknown.end_ns) == (START_NS + 100 * PERIOD_NS, START_NS + 200 * PERIOD_NS)
+    gap = next(e for e in recording.events if e.kind == "gap")
+    assert gap.end_ns - gap.onset.stamp_ns == 101 * PERIOD_NS and "100 frames" in gap.story[0].text
+    assert recording.running.frames_dropped == 100
+    assert recording.running.gaps == 1
+    assert "for 2.0 s there was no transform" in recording.summary
+    assert "100 frames (20 %) are missing" in recording.summary
+
+
+def test_noise_rate_latency_and_shares_are_those_of_the_frames():
+    running = only(stepped(n=2000)).running
+    assert running.noise.position_m == pytest.approx(NOISE_M, rel=0.1)
+    assert running.noise.claimed_position_m == pytest.approx((1e-5, 2e-5, 3e-5))
+    assert running.frames_per_s == pytest.approx(FPS)
+    latencies_s = 1e-9 * (2_000_000 + 1000 * np.arange(2000))
+    assert running.latency_median_s == pytest.approx(np.median(latencies_s))
+    assert running.latency_p99_s == pytest.approx(np.percentile(latencies_s, 99))
+    assert [(s.name, s.frames) for s in running.verdicts] == [("valid", 2000)]
+    assert sum(s.frames for s in running.slices) == 2000
+
+
+def test_limits_come_from_the_recorded_configuration_or_from_the_command():
+    text = "monitor:\n  policy:\n    warn_m: 0.005\n    limit_m: 0.02\n"
+    configuration = RecordedConfiguration("main.yaml", {"main.yaml": RecordedFile(text)})
+    run = stepped(configuration=configuration)
+    assert only(run).limits.affected_m == 0.005
+    assert not only(run).affected, "3 mm are within 5 mm"
+    assert only(run, affected_m=1e-3).affected
+    broken = stepped(configuration=RecordedConfiguration("main.yaml", {"main.yaml": RecordedFile("a: [")}))
+    assert only(broken).limits.affected_m == 1e-4
+    assert "can't be read" in only(broken).limits.origin
+
+
+def test_time_that_runs_backwards_is_straightened_and_told():
+    run = stepped()
+    run.records[300:] = [msgspec.structs.replace(r, stamp_ns=r.stamp_ns - 60 * SECOND_NS) for r in run.records[300:]]
+    recording = only(run)
+    assert any("runs backwards by 59.980 s at frame 300" in fault for fault in recording.faults)
+    assert recording.end_ns - recording.start_ns == 499 * PERIOD_NS
+    assert recording.events[0].onset.stamp_ns == START_NS + 250 * PERIOD_NS
+
+
+def test_several_robots_stand_on_one_axis_and_by_themselves():
+    later = records(np.zeros((100, 3)), start_ns=START_NS + 3600 * SECOND_NS)
+    report, told = build([Run(later, robot="other", recording_id="run-2"), stepped()])
+    assert [r.robot for r in report.recordings] == ["arm", "other"]
+    assert report.summary.startswith("2 recordings of 2 cameras; the camera moved in 1 of them. arm / wrist moved once")
+    assert "at the end its TCP is 3 mm off" in report.summary
+    shown = page(report, told)
+    assert b'id="data-overview"' in shown and b'id="recording-2"' in shown
+    assert "The camera of other / wrist did not move" in text_of(shown)
+
+
+def test_empty_runs_and_runs_without_a_measurement_are_told():
+    blind = Run(records(np.full((50, 3), np.nan)), robot="blind")
+    report, told = build([Run([], robot="nobody"), blind])
+    assert "no frame could be read" in next(r for r in report.recordings if r.robot == "nobody").summary
+    assert "in no frame" in next(r for r in report.recordings if r.robot == "blind").summary
+    assert b"nobody / wrist" in page(report, told)
+
+
+def test_hostile_texts_stay_texts():
+    evil = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&amp;"
+    run = stepped(robot=evil, faults=(evil,))
+    said(run.records, 260, kind=AlertKind.IMAGE, text=evil, alert_id="2-b", part=evil, cause=Cause(evil))
+    run.references = (msgspec.structs.replace(REFERENCE, accepted_by=evil),)
+    report, told = build([run, stepped(robot="plain")], (evil,))
+    shown = page(report, told).decode()
+    assert evil not in shown and "<img src=x" not in shown
+    assert shown.count("<script") == shown.count("</script>"), "nothing ends a script before its end"
+    assert evil in text_of(shown.encode())
+
+
+def test_the_data_are_what_the_page_shows_and_come_back_from_json():
+    report, told = build([stepped()])
+    again = msgspec.json.decode(to_json(report), type=Report)
+    assert again == report
+    recording = again.recordings[0]
+    shown = text_of(page(report, told))
+    assert re.sub(r"\s+", " ", again.summary) in shown
+    event, old = recording.events[0], recording.affected[0]
+    for stamp_ns in (event.onset.stamp_ns, old.start_ns, old.end_ns):
+        assert str(np.datetime64(stamp_ns, "ns"))[11:21] in shown
+    assert f"{1e3 * event.moved.size_m:.2f}" in shown and "camera's mount moved (90 %)" in shown
+    assert (
+        re.findall(r"(?:https?:)?//[\w.]+", re.sub(r"(?s)<script\b.*?</script>", "", page(report, told).decode())) == []
+    )
+
+
+def test_a_long_run_is_short_on_the_page_and_loses_no_outlier():
+    n = 40_000
+    shifts_m = np.zeros((n, 3))
+    shifts_m[12_345, 0] = 2e-3  # one wild frame
+    shifts_m[30_000:, 1] = 1e-3
+    run = records(shifts_m)
+    said(run, 30_002)
+    recording = only(Run(run))
+    assert len(recording.affected) == 1, "one frame affects nothing"
+    x = next(c for c in recording.curves if c.name == "x_m")
+    assert len(x.stamp_ns) < 4000
+    assert max(x.high) == pytest.approx(2e-3, abs=1e-4)
+    near = [t for t in x.stamp_ns if abs(t - (START_NS + 30_000 * PERIOD_NS)) <= SECOND_NS]
+    assert len(near) == 2 * FPS + 1, "around a motion every frame is there"
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_whatever_a_run_holds_there_is_a_report(seed: int):
+    """Frames with holes, wild clocks, covariances of zero, references nobody has, alerts in any order."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 120)) if seed % 3 else int(rng.integers(1, 6))
+    shifts_m = np.cumsum(rng.normal(size=(n, 3)) * (0.0, 1e-6, 1e-3)[seed % 3], axis=0)
+    shifts_m[rng.random(n) < 0.5 * rng.random()] = np.nan
+    run = records(shifts_m, seed)
+    for _ in range(6):
+        said(
+            run,
+            int(rng.integers(n)),
+            kind=list(AlertKind)[rng.integers(len(AlertKind))],
+            event=list(AlertEvent)[rng.integers(4)],
+            severity=list(Severity)[rng.integers(3)],
+            alert_id=("", "1", "2")[rng.integers(3)],
+            since_ns=(None, 5, 2**62)[rng.integers(3)],
+        )
+    if seed % 4 == 1:
+        run = [msgspec.structs.replace(r, stamp_ns=int(rng.integers(-(2**62), 2**62))) for r in run]
+    if seed % 4 == 2:
+        run = [msgspec.structs.replace(r, revision=int(rng.integers(-1, 2))) for r in run if rng.random() < 0.7]
+    if seed % 5 == 3:
+        run = [msgspec.structs.replace(r, covariance=(0.0,) * 36 if r.covariance else None) for r in run]
+    report, told = build([Run(run, references=(REFERENCE,) * (seed % 2), image_seqs=np.arange(0, 200, 3))])
+    assert msgspec.json.decode(to_json(report), type=Report).recordings[0].running.frames == len(run)
+    assert report.summary and (seed % 8 or page(report, told))
+
+
+def test_a_clock_that_jumps_by_years_stretches_nothing():
+    run = stepped()
+    year_ns = 365 * 86400 * SECOND_NS
+    run.records[300:] = [msgspec.structs.replace(r, stamp_ns=r.stamp_ns + year_ns) for r in run.records[300:]]
+    recording = only(run)
+    assert any("jumps ahead by 31536000 s at frame 300" in fault for fault in recording.faults)
+    assert recording.end_ns - recording.start_ns == 499 * PERIOD_NS
+
+
+def test_a_step_that_no_alert_told_of_is_found_afterwards():
+    shifts_m = np.zeros((800, 3))
+    shifts_m[500:, 1] = 1e-3
+    (event,) = only(Run(records(shifts_m))).events
+    assert event.kind == "step" and event.noticed_ns is None and event.onset.found_by == "hindsight"
+    assert event.onset.earliest_ns <= START_NS + 500 * PERIOD_NS <= event.onset.latest_ns
+    assert event.moved.size_m == pytest.approx(1e-3, abs=1e-5)

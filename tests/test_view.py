@@ -1,0 +1,292 @@
+"""Looking at a monitor that runs and at recordings: a viewer in another process, and what becomes of the file."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import psutil
+import pytest
+import recorded
+import rerun_cli
+from headless import needs_chromium, picture_of
+from loopback import WAIT_S, free_endpoint, wait_until
+from network_daemon import ENVIRONMENT
+from rerun.chunk import RrdReader
+
+from gripmon.config import builtin_config
+from gripmon.recording import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
+
+VIEWER = Path(rerun_cli.__file__).parent / "rerun"
+GRIPMON = (sys.executable, "-m", "gripmon")
+MAGENTA = (255, 0, 255)
+
+
+def free_port() -> int:
+    return int(free_endpoint().rsplit(":", 1)[1])
+
+
+def live_recorder(folder: Path, view: ViewSettings, settings: RecordingSettings) -> ProcessRecorder:
+    opened = open_recorder(
+        settings, robot="arm", camera_name="wrist", camera=recorded.CAMERA, gripper=recorded.GRIPPER,
+        reference=recorded.REFERENCE, directory=folder, name="live", patience_s=30.0, view=view,
+    )  # fmt: skip
+    assert isinstance(opened, ProcessRecorder)
+    return opened
+
+
+@contextmanager
+def receiver(view: ViewSettings, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """rerun's own program, that receives a stream and saves what it gets."""
+    command = [str(VIEWER), view.stream_url, "--save", str(out), "--bind", "127.0.0.1", "--port", "auto"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def seqs_of(path: Path, entity: str = "record") -> set[int]:
+    """The frames that a file holds, whether or not it is complete yet."""
+    try:
+        chunks = RrdReader(path).stream().filter(content=[f"/{entity}"], has_timeline="frame").to_chunks()
+    except Exception:  # noqa: BLE001  just begun
+        return set()
+    return {seq for chunk in chunks for seq in chunk.to_record_batch().column("frame").to_pylist()}
+
+
+def monitor_config(folder: Path, port: int, web_port: int, recording: str) -> Path:
+    text = builtin_config("demo.yaml").read_text()
+    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
+    sections = {
+        "publish": "{enabled: false}",
+        "source": "{kind: simulator, scenario: static, duration_s: 600.0, fps: 15.0, realtime: true}",
+        "recording": recording,
+        "view": f"{{port: {port}, web_port: {web_port}}}",
+    }
+    for name, section in sections.items():
+        text = re.sub(rf"(?ms)^{name}:.*?(?=^\w|\Z)", "", text) + f"{name}: {section}\n"
+    path = folder / "monitor.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("enabled", [True, False])
+def test_another_process_sees_what_a_monitor_does(tmp_path: Path, enabled: bool):
+    """With and without files beside it."""
+    view = ViewSettings(port=free_port(), web_port=free_port())
+    config = monitor_config(
+        tmp_path, view.port, view.web_port, f"{{enabled: {str(enabled).lower()}, min_free_bytes: 0}}"
+    )
+    out = tmp_path / "out"
+    command = [*GRIPMON, "run", str(config), "--out", str(out), "--view", "server"]
+    with (tmp_path / "said.txt").open("wb") as said, subprocess.Popen(command, stderr=said, env=ENVIRONMENT) as process:
+        try:
+            wait_until(lambda: listens(view.port) or process.poll() is not None, "the stream")
+            with receiver(view, tmp_path / "seen.rrd"):
+                wait_until(lambda: len(seqs_of(tmp_path / "seen.rrd")) >= 30, "thirty frames in the other process")
+                assert seqs_of(tmp_path / "seen.rrd", "rig/camera/image"), "images, too"
+            process.terminate()
+            assert process.wait(WAIT_S) == 0, (tmp_path / "said.txt").read_text()
+        finally:
+            process.kill()
+    lines = [json.loads(line) for line in (out / "estimates.jsonl").read_bytes().splitlines()]
+    judged = {line["seq"] for line in lines}
+    assert seqs_of(tmp_path / "seen.rrd") <= judged
+    files = sorted(out.glob("*.rrd"))
+    assert bool(files) is enabled
+    if enabled:
+        assert set().union(*map(seqs_of, files)) == judged, "the viewer's end was none of the file's"
+
+
+def test_a_viewer_that_stands_still_costs_neither_frames_nor_memory(tmp_path: Path):
+    view = ViewSettings(port=free_port(), web_port=free_port(), memory_limit_bytes=10_000_000)
+    settings = recorded.settings(image_format="png", image_every=1, around_alert_s=0.0, queue_images=64)
+    recorder = live_recorder(tmp_path, view, settings)
+    rng = np.random.default_rng(1)
+    frames = 0
+
+    def offer(count: int) -> None:
+        nonlocal frames
+        for _ in range(count):
+            noise = rng.integers(0, 256, (recorded.HEIGHT_PX, recorded.WIDTH_PX), np.uint8)  # 77 kB
+            recorder.offer(recorded.frame(frames, noise), recorded.record(frames), lambda: None)
+            frames += 1
+        wait_until(lambda: recorder.frames_written == frames, "all on disk")
+
+    offer(1)
+    wait_until(lambda: listens(view.port), "the stream")
+    assert recorder.process_id is not None
+    worker = psutil.Process(recorder.process_id)
+    with receiver(view, tmp_path / "seen.rrd") as viewer:
+        wait_until(lambda: seqs_of(tmp_path / "seen.rrd"), "the viewer is there")
+        os.kill(viewer.pid, signal.SIGSTOP)
+        offer(1500)
+        before = worker.memory_info().rss
+        offer(600)
+        grown = worker.memory_info().rss - before
+        os.kill(viewer.pid, signal.SIGCONT)
+        last = frames
+
+        def goes_on() -> bool:
+            offer(10)
+            return max(seqs_of(tmp_path / "seen.rrd"), default=-1) >= last
+
+        wait_until(goes_on, "the viewer goes on")
+    recorder.close(timeout_s=60.0)
+    assert grown < 30_000_000, f"{grown} bytes more for a viewer that stood still, while 46 MB were recorded"
+    assert recorder.dropped == 0 and recorder.images_dropped == 0
+    (file,) = tmp_path.glob("live-*.rrd")
+    assert seqs_of(file) == seqs_of(file, "rig/camera/image") == set(range(frames))
+
+
+def test_a_live_view_that_cannot_be_served_costs_nothing_else(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        view = ViewSettings(port=other.getsockname()[1], web_port=free_port())
+        recorder = live_recorder(tmp_path, view, recorded.settings())
+        for seq in range(20):
+            recorder.offer(recorded.frame(seq), recorded.record(seq), lambda: None)
+        wait_until(lambda: "the live view can't be served" in caplog.text, "it is said")
+        wait_until(lambda: recorder.frames_written == 20, "all on disk")
+        assert recorder.failure is None
+        recorder.close(timeout_s=60.0)
+    (file,) = tmp_path.glob("live-*.rrd")
+    assert seqs_of(file) == set(range(20)) and recorder.dropped == 0
+
+
+def refused(*arguments: str) -> str:
+    """The one line that a command says which can't start."""
+    environment = {k: v for k, v in ENVIRONMENT.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    done = subprocess.run([*GRIPMON, *arguments], capture_output=True, text=True, timeout=WAIT_S, env=environment)
+    assert done.returncode in (2, 3), done.stderr
+    (line,) = done.stderr.splitlines()
+    return line
+
+
+def test_what_cannot_be_shown_is_said_in_one_line(tmp_path: Path):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "text.rrd").write_text("no recording")
+    (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
+    assert refused("view", str(tmp_path / "none.rrd")).endswith("none.rrd: there is no recording; an .rrd file")
+    assert refused("view", str(tmp_path / "empty")).endswith("empty: there is no recording; an .rrd file")
+    assert refused("view", str(tmp_path / "text.rrd")).endswith("text.rrd: is no recording; an .rrd file of gripmon's")
+    native = refused("view", str(tmp_path / "right.rrd"), "--native")
+    assert native == "view: there is no display for a window; the web viewer needs none"
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        assert refused("view", str(tmp_path / "right.rrd"), "--web", "--port", str(port)) == (
+            f"--port {port}: is in use on 127.0.0.1; another port, or none for any"
+        )
+        config = monitor_config(tmp_path, port, free_port(), "{enabled: false}")
+        assert refused("run", str(config), "--view") == (
+            f"{config}: view.port: {port} is in use on 127.0.0.1; another port"
+        )
+        config = monitor_config(tmp_path, free_port(), port, "{enabled: false}")
+        assert refused("run", str(config), "--view", "web") == (
+            f"{config}: view.web_port: {port} is in use on 127.0.0.1; another port"
+        )
+        assert refused("run", str(config), "--view", "native") == "--view native: there is no display; --view web"
+
+
+@pytest.fixture(scope="module")
+def two_files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run in two files, its images magenta."""
+    folder = tmp_path_factory.mktemp("run")
+    settings = msgspec.structs.replace(recorded.settings(image_every=1, max_file_bytes=100_000), flush_period_s=0.05)
+    opened = open_recorder(
+        settings, robot="arm", camera_name="wrist", camera=recorded.CAMERA, gripper=recorded.GRIPPER,
+        reference=recorded.REFERENCE, directory=folder, name="shift", patience_s=30.0,
+    )  # fmt: skip
+    assert isinstance(opened, ProcessRecorder)
+    image = np.full((recorded.HEIGHT_PX, recorded.WIDTH_PX, 3), MAGENTA, np.uint8)
+    seq = 0
+    while len(list(folder.glob("*.rrd"))) < 2:
+        opened.offer(recorded.frame(seq, image), recorded.record(seq), lambda: None)
+        seq += 1
+        wait_until(lambda count=seq: opened.frames_written >= count - 20, "it is written")
+    opened.close(timeout_s=60.0)
+    return folder
+
+
+@contextmanager
+def viewing(folder: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """``gripmon view`` on a folder, and the address that it printed."""
+    command = [*GRIPMON, "view", str(folder), "--web"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    try:
+        assert process.stdout is not None and process.stderr is not None
+        url = process.stdout.readline().strip()
+        assert url.startswith("http://127.0.0.1:"), process.stderr.read()
+        yield process, url
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def ports_of(url: str) -> list[int]:
+    return [int(port) for port in re.findall(r"127\.0\.0\.1:(\d+)", urllib.parse.unquote(url))]
+
+
+def test_view_serves_the_files_to_its_page_alone_and_leaves_nothing_running(two_files: Path):
+    with viewing(two_files) as (process, url):
+        wanted = urllib.parse.parse_qs(urllib.parse.urlsplit(url).query)["url"]
+        files = sorted(two_files.glob("*.rrd"))
+        assert len(wanted) == len(files) >= 2
+        for source, path in zip(wanted, files, strict=True):
+            with urllib.request.urlopen(source) as answer:
+                assert answer.read() == path.read_bytes()
+                assert answer.headers["Access-Control-Allow-Origin"] == f"http://127.0.0.1:{ports_of(url)[0]}"
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(f"http://127.0.0.1:{ports_of(url)[1]}/etc/passwd")
+        children = psutil.Process(process.pid).children(recursive=True)
+        assert children, "the page is served by a process of its own"
+        addresses = {c.laddr.ip for p in (psutil.Process(process.pid), *children) for c in p.net_connections("tcp")}
+        assert addresses == {"127.0.0.1"}, "nobody else can see it"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WAIT_S) == 130
+        assert not [child for child in children if child.is_running()]
+        assert not any(listens(port) for port in ports_of(url))
+
+
+def test_a_view_that_is_killed_leaves_nothing_running_either(two_files: Path):
+    with viewing(two_files) as (process, url):
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
+        process.wait()
+        psutil.wait_procs(children, timeout=WAIT_S)
+        assert not [child for child in children if child.is_running()]
+        assert not any(listens(port) for port in ports_of(url))
+
+
+@needs_chromium
+def test_the_page_shows_the_recording_in_a_browser(two_files: Path):
+    with viewing(two_files) as (_, url):
+        for wait_s in (8.0, 20.0, 60.0, 120.0):
+            picture = picture_of(url, wait_s).astype(int)
+            magenta = (picture[..., 0] > 180) & (picture[..., 1] < 90) & (picture[..., 2] > 180)
+            if magenta.mean() > 0.02:
+                break
+        assert magenta.mean() > 0.02, "the recorded image is on the page"
