@@ -159,7 +159,7 @@ def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
     across, along = 0.5 * ((c - a) + (d - b)), 0.5 * ((b - a) + (d - c))
     sides = np.array([np.hypot(*across), np.hypot(*along)])
     if sides.min() < 1e-4:
-        raise CalibrationError("the innermost corners coincide, or have each other's names; two on each finger, by their names")
+        raise CalibrationError("the innermost corners coincide, or have each other's names; two on each finger")
     # With z into the plate, y lies a quarter turn clockwise of x for who looks at it: x cross y is z.
     turning = float(across[0] * along[1] - across[1] * along[0]) / float(sides.prod())
     if turning < -0.5:
