@@ -18,10 +18,22 @@ from numpy.typing import NDArray
 from gripmon.calibration.bundle import DEGENERATE, Bundle, BundleProblem
 from gripmon.calibration.doubts import USELESS_FOCAL, check_fit, doubts_of
 from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
+from gripmon.calibration.plate_pose import lens_vector, merit, model_of, plate_pose, plate_pose_start
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.camera import LensSettings, make_camera
 from gripmon.geometry import log_rotation
 from gripmon.records import Array
+
+__all__ = [
+    "IntrinsicsResult",
+    "calibrate",
+    "calibrate_best",
+    "calibrate_single_view",
+    "cross_validate",
+    "lens_vector",
+    "model_of",
+    "plate_pose",
+]
 
 FEWEST_POINTS = 8
 """In a view; a plane's pose needs four."""
@@ -71,17 +83,22 @@ class IntrinsicsResult:
 
 
 def calibrate(
-    sightings: Sequence[Sighting], model: ModelName, *, fixed: frozenset[str] = frozenset()
+    sightings: Sequence[Sighting],
+    model: ModelName,
+    *,
+    fixed: frozenset[str] = frozenset(),
+    near: LensSettings | None = None,
 ) -> IntrinsicsResult:
     """A camera from views of a plane, all of one size; parameters named in ``fixed`` keep their start (the principal
-    point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.
+    point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.  ``near``: a camera of this
+    model to start from, where one is known.
 
     Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
     no convergence, or a lens that can't be meant.
     """
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
-    names, free, bundle, held = _supported(lens_model, sightings, fixed)
+    names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
     poses = range(len(sightings))
@@ -189,10 +206,14 @@ def cross_validate(
         return None
     folds = min(folds, len(sightings))
     squares, count = 0.0, 0
+    try:
+        near = calibrate(sightings, model, fixed=fixed).camera
+    except CalibrationError:
+        return None
     for fold in range(folds):
         others = [s for k, s in enumerate(sightings) if k % folds != fold]
         try:
-            camera = calibrate(others, model, fixed=fixed)
+            camera = calibrate(others, model, fixed=fixed, near=near)
         except CalibrationError:
             step()
             continue
@@ -206,57 +227,8 @@ def cross_validate(
     return math.sqrt(squares / count) if count else None
 
 
-def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
-    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes), the camera
-    being exact; and the fit that it comes from.  Raises :class:`CalibrationError`.
-    """
-    if len(sighting) < 4:
-        raise CalibrationError(f"{len(sighting)} points of the plate; at least 4")
-    lens_model, parameters = LensModel(model_of(camera), camera.width_px, camera.height_px), lens_vector(camera)
-    start = plate_pose_start(lens_model, parameters, sighting)
-    bundle = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0))).solve(parameters, [start])
-    return bundle.cam_T_plate[0], bundle.covariance, bundle
-
-
-def model_of(camera: LensSettings) -> ModelName:
-    """The calibration's name of a camera's model.  :class:`CalibrationError` for lenses that aren't calibrated here."""
-    tag = camera.__struct_config__.tag
-    if tag == "brown_conrady":
-        count = len(camera.coefficients)  # type: ignore[union-attr]
-        if count > 5:
-            raise CalibrationError(f"a lens with {count} coefficients; with 4 or 5")
-        return "brown_conrady" if count == 4 else "brown_conrady_5"
-    return "paper" if tag == "paper" else "fisheye"
-
-
-def plate_pose_start(lens_model: LensModel, parameters: Array, sighting: Sighting) -> Array:
-    """``cam_T_plate`` (4, 4) in closed form, from ideal coordinates (Collins and Bartoli, "Infinitesimal plane-based
-    pose estimation", 2014).  :class:`CalibrationError` where the lens doesn't map the points or they lie on a line.
-    """
-    xy = lens_model.camera(parameters).undistort(sighting.uv_px)
-    good = np.isfinite(xy).all(axis=1)
-    if good.sum() < 4:
-        raise CalibrationError("the start is outside of what the lens model maps")
-    # Centred and scaled, as the solver wants it.
-    middle = sighting.plate_m[good].mean(axis=0)
-    points = sighting.plate_m[good] - middle
-    spread = np.linalg.svd(points[:, :2], compute_uv=False)
-    if spread[1] < 1e-3 * spread[0]:
-        raise CalibrationError("all points of the plate lie on a line; points that span an area")
-    # Only the first of the two solutions: the other one is worse.
-    found, turns, shifts, _ = cv2.solvePnPGeneric(
-        points, np.ascontiguousarray(xy[good]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
-    if not found:
-        raise CalibrationError("the plate's pose can't be found")
-    out = np.eye(4)
-    out[:3, :3] = cv2.Rodrigues(turns[0])[0]
-    out[:3, 3] = shifts[0].ravel() - out[:3, :3] @ middle
-    return out
-
-
 def _supported(
-    lens_model: LensModel, sightings: Sequence[Sighting], fixed: frozenset[str]
+    lens_model: LensModel, sightings: Sequence[Sighting], fixed: frozenset[str], near: LensSettings | None
 ) -> tuple[tuple[str, ...], Array, Bundle, tuple[str, ...]]:
     """The fit with as many of the lens's terms as give one that can be meant all over the image: where no point lies,
     the highest ones bend it at will.  Names of the free parameters, what they change, the fit, and what was held.
@@ -264,7 +236,13 @@ def _supported(
     held: list[str] = []
     for name in (*reversed(parameter_names(lens_model.name)[5:]), ""):
         names, free = _free(lens_model.name, fixed | set(held))
-        bundle = _solve(BundleProblem(lens_model, sightings, free), lens_model, sightings)
+        problem = BundleProblem(lens_model, sightings, free)
+        if near is None:
+            bundle = _solve(problem, lens_model, sightings)
+        else:
+            start = lens_vector(near)
+            start[[name in held for name in parameter_names(lens_model.name)]] = 0.0
+            bundle = problem.solve(start, [plate_pose_start(lens_model, start, s) for s in sightings])
         check_fit(lens_model, bundle, free)
         try:
             make_camera(lens_model.settings(bundle.parameters))
@@ -305,18 +283,14 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
         except CalibrationError as error:
             failure = failure or error
             continue
-        if best is None or _merit(bundle) < _merit(best):
+        again = best is not None and np.allclose(bundle.parameters[:4], best.parameters[:4], rtol=1e-5)
+        if best is None or merit(bundle) < merit(best):
             best = bundle
-        if best.scale < 1.5:
+        if best.scale < 1.5 or again:
             break
     if best is None:
         raise failure or CalibrationError(DEGENERATE)
     return best
-
-
-def _merit(bundle: Bundle) -> tuple[float, float]:
-    used = np.concatenate(bundle.used)
-    return float(np.count_nonzero(~used)), bundle.rms_px
 
 
 def _free(model: ModelName, fixed: frozenset[str]) -> tuple[tuple[str, ...], Array]:
@@ -365,10 +339,3 @@ def _bayes(bundle: Bundle, free: int) -> float:
         count += 2 * len(used)
     parameters = free + 6 * len(bundle.used)
     return count * math.log(squares / count) + parameters * math.log(count)
-
-
-def lens_vector(camera: LensSettings) -> Array:
-    """A camera's parameters as :class:`LensModel` has them."""
-    pinhole = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
-    lens = getattr(camera, "coefficients", None)
-    return np.array([*pinhole, *(lens if lens is not None else (camera.kappa_per_px2,))])  # type: ignore[union-attr]

@@ -6,6 +6,7 @@ derivatives by their parameters.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -56,7 +57,7 @@ class LensModel:
         """The same, ready to project; unlike :func:`gripmon.camera.make_camera` it refuses nothing, as an estimate on
         its way may pass through absurd values.  Points outside the lens's domain project to NaN.
         """
-        return Camera(self.settings(parameters), self._map(parameters))
+        return _camera(self, tuple(parameters.tolist()))
 
     def without_distortion(self, focal_px: float) -> Array:
         """Parameters (k,) of a lens with this focal length, axis through the image's centre, nothing bent (the fisheye:
@@ -86,7 +87,8 @@ class LensModel:
             by_parameters[:, :, 0] += by_parameters[:, :, 4] * (2.0 * parameters[4] / fx)
         return uv_px, by_parameters, by_point
 
-    def _map(self, parameters: Array) -> LensMap:
+    def map_of(self, parameters: Array) -> LensMap:
+        """The lens alone."""
         lens = tuple(parameters[4:].tolist())
         if self.name == "paper":
             return PaperMap(lens[0] * float(parameters[0]) ** 2)
@@ -119,3 +121,10 @@ class LensModel:
             xy * (r2**3)[:, None],
         ]
         return np.stack(columns[: len(parameters) - 4], axis=2)
+
+
+@functools.lru_cache(maxsize=16)
+def _camera(model: LensModel, parameters: tuple[float, ...]) -> Camera:
+    """One for all views: a lens's tables take longer to make than to use."""
+    values = np.array(parameters)
+    return Camera(model.settings(values), model.map_of(values))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from gripmon.cli import calibrate_intrinsics, calibrate_plane
+from gripmon.cli import calibrate_intrinsics, calibrate_laser, calibrate_plane
 
-_METHODS = (calibrate_intrinsics, calibrate_plane)
+_METHODS = (calibrate_intrinsics, calibrate_plane, calibrate_laser)
 
 _DESCRIPTION = """\
 The off-line methods, from images alone.  Each writes a file with residuals, covariance and
@@ -18,6 +18,7 @@ examples:
   gripmon calibrate intrinsics plate/*.png --target chequerboard:9x6:0.025 --out camera.yaml
   gripmon calibrate plane on_plate.png --camera camera.yaml --target circles:8x8:0.008:0.004 \\
       --gripper gripper.yaml --corners rough.yaml --out hand_eye.yaml
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml
 
 exit codes: 0 written; 2 wrong usage or files; 3 the images can't be calibrated from, and why"""
 

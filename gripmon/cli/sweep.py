@@ -107,10 +107,10 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
     present, rig = Mount.of(config.cam_T_grip), rig_of(config)
     low, high, count = _DISTANCES
     default = f"{low * present.distance_m}:{high * present.distance_m}:{count}"
-    distances_m = _values("--distance", arguments.distance or default, _NEAREST_M, _FARTHEST_M, "m")
-    tilts = _values("--tilt", arguments.tilt or _TILTS_DEG, 0.0, 180.0, "degrees")
-    sides = _values("--side", arguments.side, -360.0, 360.0, "degrees") if arguments.side else None
-    rolls = _values("--roll", arguments.roll, -360.0, 360.0, "degrees") if arguments.roll else None
+    distances_m = _values("--distance", _or(arguments.distance, default), _NEAREST_M, _FARTHEST_M, "m")
+    tilts = _values("--tilt", _or(arguments.tilt, _TILTS_DEG), 0.0, 180.0, "degrees")
+    sides_rad = _turns("--side", arguments.side, present.side_rad)
+    rolls_rad = _turns("--roll", arguments.roll, present.roll_rad)
     cameras = _cameras(config.camera, arguments)
     at_px = _spot(config, arguments.at)
     try:
@@ -120,8 +120,8 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
     grid = Grid(
         distances_m,
         tuple(math.radians(v) for v in tilts),
-        (present.side_rad,) if sides is None else tuple(math.radians(v) for v in sides),
-        (present.roll_rad,) if rolls is None else tuple(math.radians(v) for v in rolls),
+        sides_rad,
+        rolls_rad,
         tuple(rig._replace(camera=camera) for camera in cameras),
         directions,
     )
@@ -132,10 +132,20 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
     return grid, at_px
 
 
+def _or(text: str | None, default: str) -> str:
+    return default if text is None else text
+
+
+def _turns(option: str, text: str | None, present_rad: float) -> tuple[float, ...]:
+    if text is None:
+        return (present_rad,)
+    return tuple(math.radians(v) for v in _values(option, text, -360.0, 360.0, "degrees"))
+
+
 def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
     from gripmon.outlook import with_focal
 
-    option, text = ("--fov", arguments.fov) if arguments.fov else ("--focal", arguments.focal)
+    option, text = ("--focal", arguments.focal) if arguments.fov is None else ("--fov", arguments.fov)
     if text is None:
         return [camera]
     if option == "--fov":

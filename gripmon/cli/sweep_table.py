@@ -99,7 +99,8 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
         "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
         "           worst opening; notices: the smallest step that is noticed along every axis; in: frames until",
         f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
-        "           until too little is in view.  Not known here: focus, light, what is in the camera's way.",
+        "           until too little is in view.  Not known here: focus, light, what is in the camera's way, and what",
+        "           hides the fingers without being in the gripper file.",
     ]
     if ranked[0].works:
         lines += _to_copy(ranked[0])
@@ -109,7 +110,7 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
 def _row(camera: Camera, trial: Trial) -> str:
     mount, covariance = trial.mount, trial.covariance
     angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
-    cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{v:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
+    cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
     cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
     if covariance is not None:
         cells += [f"{1e3 * math.sqrt(v):.3f}" for v in covariance.diagonal()[:3].tolist()]

@@ -25,8 +25,9 @@ _WIDTH, _EDGE, _GAP = 1500, 30, 36
 _INK, _FAINT, _PAPER, _MARK = (20, 20, 20), (95, 95, 95), (255, 255, 255), (226, 32, 38)
 _NOTHING = (206, 206, 206)
 _LEFT, _ROW, _BELOW = 50, 46, 46
+_CUT = 15
 _THUMB = 460
-_JPEG_QUALITY = 88
+_JPEG_QUALITY = 82
 _STILL = Background(kind="plain", motion="still", boxes=0, cables=0)
 _FINGERS = FingerLook(carriers=False)  # nothing but what the gripper file describes
 
@@ -64,7 +65,7 @@ def draw_sweep(
     maps_height = 34 + _ROW * len(shown.tilts_rad) + _BELOW
     thumbs = [
         (_name(best, "best" if best.works else "best, but it would not work"), best, grid.rigs[best.lens]),
-        (_name(present, "present"), present, rig),
+        (_name(present, "present") + _other_lens(rig, grid, best), present, rig),
         (_name(worst, "worst of the map"), worst, grid.rigs[worst.lens]),
     ]
     pictures = [_look(r, trial, jaw_opening_m) for _, trial, r in thumbs]
@@ -117,12 +118,12 @@ def _header(draw: ImageDraw.ImageDraw, rig: Rig, grid: Grid, best: Trial, trials
     camera, mount = grid.rigs[best.lens].camera, best.mount
     draw.text((_EDGE, 18), f"Camera mounts for {rig.gripper.name}", _INK, _font(28))
     view = f"{camera.width_px} x {camera.height_px} px, f = {camera.fx_px:.0f} px"
-    sides = f"side {math.degrees(mount.side_rad):.0f}°, roll {math.degrees(mount.roll_rad):.0f}°"
+    sides = f"side {_degrees(mount.side_rad)}, roll {_degrees(mount.roll_rad)}"
     count = f"{sum(t.works for t in trials)} of {len(trials)} mounts tried would work"
     others = len(grid.rigs) * len(grid.sides_rad) * len(grid.rolls_rad) > 1
     rest = "; maps: the best one's lens, side and roll" if others else ""
     draw.text((_EDGE, 58), f"{view}; {sides}; {count}{rest}.", _FAINT, _font(18))
-    key = "Struck through: would not work.  Star: the best.  Ring: the present mount.  Grey: nothing can be measured."
+    key = "Red corner: would not work.  Star: the best.  Ring: the present mount.  Grey: nothing can be measured."
     draw.text((_EDGE, 82), key, _FAINT, _font(16))
 
 
@@ -168,7 +169,7 @@ def _draw_cell(
     light = 0.299 * colour[0] + 0.587 * colour[1] + 0.114 * colour[2]
     ink = _INK if light > 130 else _PAPER
     if not trial.works:
-        draw.line((box[0] + 3, box[3] - 3, box[2] - 3, box[1] + 3), fill=ink, width=1)
+        draw.polygon([(box[2] - _CUT, box[1]), (box[2], box[1]), (box[2], box[1] + _CUT)], fill=_MARK, outline=_PAPER)
     if math.isfinite(value):
         text = f"{value:.{heat.digits}f}"
         draw.text(((box[0] + box[2]) / 2, box[1] + 0.72 * _ROW), text, ink, _font(14), anchor="mm")
@@ -212,7 +213,7 @@ def _index(ascending: Array, value: float) -> float | None:
 def _star(draw: ImageDraw.ImageDraw, at: tuple[float, float] | None) -> None:
     if at is None:
         return
-    x, y = at[0], at[1] - 9
+    x, y = at[0], at[1] - 8
     points = []
     for k in range(10):
         radius, angle = (10.0, 4.2)[k % 2], -0.5 * math.pi + k * math.pi / 5.0
@@ -252,7 +253,17 @@ def _look(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Pictures.Image
 
 def _name(trial: Trial, what: str) -> str:
     mount = trial.mount
-    return f"{what}: {1e3 * mount.distance_m:.0f} mm, tilt {math.degrees(mount.tilt_rad):.0f}°"
+    return f"{what}: {1e3 * mount.distance_m:.0f} mm, tilt {_degrees(mount.tilt_rad)}"
+
+
+def _other_lens(rig: Rig, grid: Grid, best: Trial) -> str:
+    """The focal length of the present lens, if it isn't that of the maps."""
+    return "" if grid.rigs[best.lens].camera is rig.camera else f", f = {rig.camera.fx_px:.0f} px"
+
+
+def _degrees(angle_rad: float) -> str:
+    """Without a minus before nought."""
+    return f"{round(math.degrees(angle_rad)) + 0}°"
 
 
 def _caption(draw: ImageDraw.ImageDraw, trial: Trial, at: tuple[int, int], width: int) -> None:

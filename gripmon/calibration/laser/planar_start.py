@@ -30,6 +30,8 @@ BELIEVED = 0.6
 """Part of an orientation's spots that are believed at first."""
 OUTLIER = 4.0
 """Residual, in robust standard deviations, beyond which a spot has no part in its orientation's fit."""
+SEED = 0
+"""Of the subsets that are drawn where there are too many."""
 _STEPS = 20
 
 
@@ -76,7 +78,7 @@ class _Group:
 
 
 def planar_start(
-    xy: Array, shifts_m: Sequence[Array], members: Sequence[NDArray[np.intp]], *, robust: bool = True, seed: int = 0
+    xy: Array, shifts_m: Sequence[Array], members: Sequence[NDArray[np.intp]], *, robust: bool = True, seed: int = SEED
 ) -> PlanarStart:
     """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3).  Without
     ``robust`` all spots are believed.

@@ -53,6 +53,12 @@ class Refined:
         """Root mean square of the used residuals, u and v each."""
         return float(np.sqrt(np.mean(np.square(self.residuals_px[self.used]))))
 
+    @property
+    def scale_px(self) -> float:
+        """The spots' noise, each axis, as the residuals show it."""
+        freedom = max(self.degrees_of_freedom, 1)
+        return self.rms_px * float(np.sqrt(2 * int(self.used.sum()) / freedom))
+
 
 @dataclass(frozen=True, slots=True)
 class _Loss:

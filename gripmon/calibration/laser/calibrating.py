@@ -1,0 +1,163 @@
+"""From spots and poses to a refined set-up: start, refinement, other candidates, and why it can't be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.calibration.laser import common_plane
+from gripmon.calibration.laser.closed_form import orientation_groups
+from gripmon.calibration.laser.refinement import Refined, refine
+from gripmon.calibration.laser.setup import LaserSetup
+from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import Camera
+from gripmon.records import Array
+
+FARTHEST_PLANE_M = 50.0
+LEAST_AGREEING = 0.5
+"""Part of the spots that has to agree: with fewer, another set-up might explain as many."""
+SUSPECT_PX = 3.0
+"""Noise of spots from which it is asked whether poses and images are out of step."""
+_OFFSETS = (1, -1, 2, -2)
+
+
+@dataclass(frozen=True, slots=True)
+class Spots:
+    """``uv_px`` (n, 2) and ``covariance_px`` (n, 2, 2) or None; ``others`` one (k, 2) a sample, further candidates."""
+
+    uv_px: Array
+    covariance_px: Array | None = None
+    others: tuple[Array, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LaserResult:
+    """The closed form's ``start``, what it was ``refined`` to, and which ``candidate`` was taken of each sample
+    (n,): 0 is the brightest.
+    """
+
+    start: LaserSetup
+    refined: Refined
+    uv_px: Array
+    candidate: NDArray[np.intp]
+
+
+def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
+    """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` where a label's samples are
+    turned against each other.
+    """
+    found = orientation_groups(base_T_ee)
+    if labels is None:
+        return found
+    own = np.empty(len(labels), dtype=np.intp)
+    for k, members in enumerate(found):
+        own[members] = k
+    out = []
+    for label in dict.fromkeys(labels):
+        members = np.flatnonzero(np.array([other == label for other in labels]))
+        if len(set(own[members].tolist())) > 1:
+            raise CalibrationError(
+                f"the end-effector turns within group {label}; groups of shifts without turning, or no groups: they "
+                "are found from the poses"
+            )
+        out.append(members)
+    return out
+
+
+def calibrate(
+    camera: Camera,
+    base_T_ee: Array,
+    spots: Spots,
+    labels: Sequence[str] | None = None,
+    *,
+    lens: LensPrior | None = None,
+    pose_noise: PoseNoise | None = None,
+) -> LaserResult:
+    """Everything at once.  Raises :class:`CalibrationError` with what is wrong with the data."""
+    xy = camera.undistort(spots.uv_px)
+    if not np.isfinite(xy).all():
+        index = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
+        u, v = spots.uv_px[index]
+        raise CalibrationError(f"spot {index + 1} at ({u:.1f}, {v:.1f}) px is outside of what the lens maps")
+    groups = groups_of(labels, base_T_ee)
+    fault: CalibrationError | None = None
+    try:
+        start = common_plane.solve(xy, base_T_ee, groups)
+        found = _refined(camera, base_T_ee, spots, start, lens, pose_noise)
+    except CalibrationError as error:
+        fault = error
+    if fault is None and found.refined.scale_px < SUSPECT_PX and found.refined.used.mean() >= LEAST_AGREEING:
+        _check_distance(found.refined.setup)
+        return found
+    _check_step(camera, base_T_ee, spots, xy, fault)
+    if fault is not None:
+        raise fault
+    _check_distance(found.refined.setup)
+    if found.refined.used.mean() < LEAST_AGREEING:
+        raise CalibrationError(
+            f"only {int(found.refined.used.sum())} of {len(xy)} spots agree with each other: wrong spots, poses of "
+            "other images, or a camera that is another one; each spot with the pose that it was seen at"
+        )
+    return found
+
+
+def _refined(
+    camera: Camera,
+    base_T_ee: Array,
+    spots: Spots,
+    start: LaserSetup,
+    lens: LensPrior | None,
+    pose_noise: PoseNoise | None,
+) -> LaserResult:
+    def solved(uv_px: Array, setup: LaserSetup) -> Refined:
+        return refine(
+            SpotProblem(camera, base_T_ee, uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise), setup
+        )
+
+    uv_px, choice = spots.uv_px, np.zeros(len(spots.uv_px), dtype=np.intp)
+    found = solved(uv_px, start)
+    for _ in range(3 if spots.others else 0):
+        # A reflection may be brighter than the spot: the candidate that the rest predicts takes its place.
+        predicted = uv_px - found.residuals_px
+        new, new_choice = spots.uv_px.copy(), np.zeros_like(choice)
+        for k in np.flatnonzero(~found.used):
+            candidates = np.concatenate([spots.uv_px[k][None], spots.others[k].reshape(-1, 2)])
+            nearest = int(np.linalg.norm(candidates - predicted[k], axis=1).argmin())
+            new[k], new_choice[k] = candidates[nearest], nearest
+        kept = found.used & (choice > 0)
+        new[kept], new_choice[kept] = uv_px[kept], choice[kept]
+        if (new_choice == choice).all():
+            break
+        uv_px, choice = new, new_choice
+        found = solved(uv_px, found.setup)
+    return LaserResult(start, found, uv_px, choice)
+
+
+def _check_distance(setup: LaserSetup) -> None:
+    if setup.distance_m > FARTHEST_PLANE_M:
+        raise CalibrationError(
+            f"the plane would be {setup.distance_m:.4g} m from the camera: are the poses in millimetres? metres"
+        )
+
+
+def _check_step(camera: Camera, base_T_ee: Array, spots: Spots, xy: Array, fault: CalibrationError | None) -> None:
+    """Raise if the spots fit the poses of their neighbours: the tables are out of step."""
+    for offset in _OFFSETS:
+        count = len(xy) - abs(offset)
+        own = slice(max(offset, 0), max(offset, 0) + count)
+        other = slice(max(-offset, 0), max(-offset, 0) + count)
+        try:
+            start = common_plane.solve(xy[other], base_T_ee[own])
+            found = refine(SpotProblem(camera, base_T_ee[own], spots.uv_px[other]), start)
+        except CalibrationError:
+            continue
+        if found.used.mean() > 0.7 and found.scale < SUSPECT_PX:
+            which = "later" if offset > 0 else "earlier"
+            raise CalibrationError(
+                f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which} "
+                f"({int(found.used.sum())} of {count} agree, {found.scale:.2g} px); each spot with its own pose"
+            ) from fault

@@ -1,0 +1,94 @@
+"""Where a plate is, seen by a calibrated camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from gripmon.calibration.bundle import Bundle, BundleProblem
+from gripmon.calibration.lens_models import LensModel, ModelName
+from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.camera import LensSettings
+from gripmon.records import Array
+
+
+def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
+    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes), the camera
+    being exact; and the fit that it comes from.  Raises :class:`CalibrationError`.
+    """
+    if len(sighting) < 4:
+        raise CalibrationError(f"{len(sighting)} points of the plate; at least 4")
+    lens_model, parameters = LensModel(model_of(camera), camera.width_px, camera.height_px), lens_vector(camera)
+    problem = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0)))
+    found: list[Bundle] = []
+    failure: CalibrationError | None = None
+    # Seen from afar a plane has two poses that look nearly the same; each is a minimum of its own.
+    for start in _plate_pose_starts(lens_model, parameters, sighting):
+        try:
+            found.append(problem.solve(parameters, [start]))
+        except CalibrationError as error:
+            failure = failure or error
+    if not found:
+        raise failure or CalibrationError("the plate's pose can't be found")
+    bundle = min(found, key=merit)
+    return bundle.cam_T_plate[0], bundle.covariance, bundle
+
+
+def model_of(camera: LensSettings) -> ModelName:
+    """The calibration's name of a camera's model.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+    tag = camera.__struct_config__.tag
+    if tag == "brown_conrady":
+        count = len(camera.coefficients)  # type: ignore[union-attr]
+        if count > 5:
+            raise CalibrationError(f"a lens with {count} coefficients; with 4 or 5")
+        return "brown_conrady" if count == 4 else "brown_conrady_5"
+    return "paper" if tag == "paper" else "fisheye"
+
+
+def plate_pose_start(lens_model: LensModel, parameters: Array, sighting: Sighting) -> Array:
+    """``cam_T_plate`` (4, 4) in closed form, from ideal coordinates (Collins and Bartoli, "Infinitesimal plane-based
+    pose estimation", 2014).  :class:`CalibrationError` where the lens doesn't map the points or they lie on a line.
+    """
+    return _plate_pose_starts(lens_model, parameters, sighting)[0]
+
+
+def _plate_pose_starts(lens_model: LensModel, parameters: Array, sighting: Sighting) -> list[Array]:
+    """Both poses (4, 4), the better one first."""
+    xy = lens_model.camera(parameters).undistort(sighting.uv_px)
+    good = np.isfinite(xy).all(axis=1)
+    if good.sum() < 4:
+        raise CalibrationError("the start is outside of what the lens model maps")
+    # Centred, as the solver wants it.
+    middle = sighting.plate_m[good].mean(axis=0)
+    points = sighting.plate_m[good] - middle
+    spread = np.linalg.svd(points[:, :2], compute_uv=False)
+    if spread[1] < 1e-3 * spread[0]:
+        raise CalibrationError("all points of the plate lie on a line; points that span an area")
+    found, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, np.ascontiguousarray(xy[good]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not found:
+        raise CalibrationError("the plate's pose can't be found")
+    out: list[Array] = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(turn)[0]
+        pose[:3, 3] = shift.ravel() - pose[:3, :3] @ middle
+        if np.isfinite(pose).all() and ((points @ pose[2, :3] + shift.ravel()[2]) > 0.0).all():
+            out.append(pose)
+    if not out:
+        raise CalibrationError("the plate's pose can't be found")
+    return out
+
+
+def merit(bundle: Bundle) -> tuple[float, float]:
+    """The smaller the better: points left out, then how well the rest fits."""
+    used = np.concatenate(bundle.used)
+    return float(np.count_nonzero(~used)), bundle.rms_px
+
+
+def lens_vector(camera: LensSettings) -> Array:
+    """A camera's parameters as :class:`LensModel` has them."""
+    pinhole = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
+    lens = getattr(camera, "coefficients", None)
+    return np.array([*pinhole, *(lens if lens is not None else (camera.kappa_per_px2,))])  # type: ignore[union-attr]

@@ -1,0 +1,237 @@
+"""``gripmon calibrate laser``: a fixed camera, its plane and a laser pointer on the arm, from spots and poses."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import calibration_files as files
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.calibration.documents import CameraCalibration
+    from gripmon.calibration.laser.calibrating import LaserResult, Spots
+    from gripmon.calibration.laser.document import LaserCalibration
+    from gripmon.calibration.laser.samples import Samples
+    from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise
+    from gripmon.records import Array
+
+_DESCRIPTION = """\
+Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
+plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
+row for each spot: u_px, v_px, or image (and laser_off, the same view without the laser), and the pose
+base_T_ee as tx_m, ty_m, tz_m with qx, qy, qz, qw or with rx_rad, ry_rad, rz_rad, or as m00 to m33; in
+YAML and JSON also base_T_ee: {translation_m, rotation_xyzw} or 4 x 4.  At each of three orientations
+or more, better nine, the end-effector is shifted along three directions without turning: ten spots."""
+
+_EXAMPLES = """\
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --picture laser.png
+  gripmon calibrate laser monday.csv tuesday.csv --camera camera.yaml --out laser.yaml --recording laser.rrd
+  gripmon calibrate laser spots.yaml --camera camera.yaml --refine-lens --arm-noise 0.0001:0.0002 --out laser.yaml
+
+exit codes: 0 written; 2 wrong usage or files; 3 the spots can't be calibrated from, and why:
+nothing is written then"""
+
+
+def add_parser(methods: Any) -> None:
+    """Add the method."""
+    parser = common.add_command(
+        methods, "laser", run, "a fixed camera, its plane and a laser pointer on the arm", _DESCRIPTION, _EXAMPLES
+    )
+    parser.add_argument("data", nargs="+", metavar="DATA", help="table of samples: .csv, .yaml or .json")
+    parser.add_argument(
+        "--camera", required=True, metavar="CAMERA.yaml", help="the camera: a file of gripmon calibrate intrinsics"
+    )
+    parser.add_argument("--out", required=True, metavar="FILE.yaml", help="file to write")
+    parser.add_argument("--picture", metavar="FILE.png", help="also a picture of residuals and scene")
+    parser.add_argument("--recording", metavar="FILE.rrd", help="also the scene as a rerun recording")
+    parser.add_argument(
+        "--refine-lens",
+        action="store_true",
+        help="estimate the lens, too, from what its calibration's covariance leaves",
+    )
+    parser.add_argument(
+        "--arm-noise",
+        type=_arm_noise,
+        metavar="M:RAD",
+        help="standard deviations of the arm's poses, position (m) and rotation (rad), each axis (default: none)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace files that are there")
+
+
+def _arm_noise(text: str) -> tuple[float, float]:
+    parts = text.split(":")
+    try:
+        position, rotation = (float(part) for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
+    if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
+        raise argparse.ArgumentTypeError(f"{text} is no arm's noise; metres and radians, e.g. 0.0001:0.0002")
+    return position, rotation
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon calibrate laser``."""
+    out = Path(arguments.out)
+    files.check_output(out, force=arguments.force)
+    if arguments.picture is not None:
+        files.check_picture(Path(arguments.picture), force=arguments.force)
+    if arguments.recording is not None:
+        files.check_output(Path(arguments.recording), force=arguments.force, option="--recording")
+    calibration = _camera(arguments.camera)
+    samples, spots, inputs, notes = _data(arguments, calibration)
+    result = _calibrated(calibration, samples, spots, arguments)
+    written = _document(result, samples, notes, inputs, arguments)
+    if arguments.picture is not None:
+        from gripmon.calibration.laser.picture import draw
+
+        files.write_picture(draw(result, samples.base_T_ee, written), Path(arguments.picture))
+    if arguments.recording is not None:
+        _record(result, samples.base_T_ee, Path(arguments.recording))
+    files.write_document(written, out)
+    _report(written)
+    print(f"written: {out}")
+    return common.EXIT_DONE
+
+
+def _camera(name: str) -> CameraCalibration:
+    from gripmon.config.calibrated import read_camera
+    from gripmon.config.errors import ConfigError
+
+    try:
+        return read_camera(Path(name))
+    except ConfigError as error:
+        raise common.CommandFailedError(f"--camera: {error}", common.EXIT_USAGE) from None
+
+
+def _data(
+    arguments: argparse.Namespace, calibration: CameraCalibration
+) -> tuple[Samples, Spots, list[Path], tuple[str, ...]]:
+    """Samples that have a spot, their spots, all input files, and what is to be noted."""
+    from gripmon.calibration.laser.samples import picked
+    from gripmon.cli import laser_tables
+
+    paths = [Path(name) for name in arguments.data]
+    samples, origins = laser_tables.read_tables(paths)
+    size_px = (calibration.camera.width_px, calibration.camera.height_px)
+    spots, kept, missing = laser_tables.find_spots(samples, origins, size_px)
+    for line in missing:
+        print(line, file=sys.stderr)
+    if not kept:
+        raise common.CommandFailedError(f"calibrate laser: none of {len(samples)} images shows a spot")
+    inputs = [*paths, Path(arguments.camera), *laser_tables.image_files(samples, origins)]
+    return picked(samples, kept), spots, inputs, tuple(missing)
+
+
+def _calibrated(
+    calibration: CameraCalibration, samples: Samples, spots: Spots, arguments: argparse.Namespace
+) -> LaserResult:
+    from gripmon.calibration.laser.calibrating import calibrate
+    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.camera import make_camera
+
+    try:
+        camera = make_camera(calibration.camera)
+    except ValueError as error:
+        raise common.CommandFailedError(f"--camera {arguments.camera}: {error}", common.EXIT_USAGE) from None
+    lens = _prior(calibration, arguments.camera) if arguments.refine_lens else None
+    try:
+        return calibrate(
+            camera, samples.base_T_ee, spots, samples.groups, lens=lens, pose_noise=_noise(arguments.arm_noise)
+        )
+    except CalibrationError as error:
+        raise common.CommandFailedError(f"calibrate laser: {error}") from None
+
+
+def _noise(given: tuple[float, float] | None) -> PoseNoise | None:
+    from gripmon.calibration.laser.spot_problem import PoseNoise
+
+    return None if given is None else PoseNoise(*given)
+
+
+def _prior(calibration: CameraCalibration, name: str) -> LensPrior:
+    import numpy as np
+
+    from gripmon.calibration.laser.spot_problem import LensPrior
+    from gripmon.calibration.lens_models import LensModel, parameter_names
+
+    camera = calibration.camera
+    count = len(calibration.parameters)
+    kind: Any = camera.__struct_config__.tag
+    coefficients = getattr(camera, "coefficients", ())
+    if kind == "brown_conrady" and len(coefficients) == 5:
+        kind = "brown_conrady_5"
+    names = parameter_names(kind)
+    values = [
+        camera.fx_px,
+        camera.fy_px,
+        camera.cx_px,
+        camera.cy_px,
+        *(coefficients or (getattr(camera, "kappa_per_px2", 0.0),)),
+    ]
+    unknown = [key for key in calibration.parameters if key not in names]
+    if count == 0 or unknown or len(values) != len(names):
+        raise common.CommandFailedError(
+            f"--refine-lens: {name} has no covariance of parameters that can be refined; a file of gripmon calibrate "
+            "intrinsics",
+            common.EXIT_USAGE,
+        )
+    free = tuple(names.index(key) for key in calibration.parameters)
+    model = LensModel(kind, camera.width_px, camera.height_px)
+    return LensPrior(model, np.array(values), free, np.array(calibration.covariance).reshape(count, count))
+
+
+def _document(
+    result: LaserResult, samples: Samples, notes: tuple[str, ...], inputs: list[Path], arguments: argparse.Namespace
+) -> LaserCalibration:
+    from gripmon.calibration.laser.calibrating import groups_of
+    from gripmon.calibration.laser.document import document
+    from gripmon.calibration.laser.planar_start import SEED
+    from gripmon.provenance import provenance_of
+
+    noise = None if arguments.arm_noise is None else ":".join(f"{value:g}" for value in arguments.arm_noise)
+    options = {
+        "--camera": arguments.camera, "--out": arguments.out, "--picture": arguments.picture,
+        "--recording": arguments.recording, "--refine-lens": arguments.refine_lens, "--arm-noise": noise,
+        "--force": arguments.force,
+    }  # fmt: skip
+    provenance = provenance_of(files.command_line("laser", arguments.data, options), inputs, SEED)
+    other = [name for name, k in zip(samples.names, result.candidate, strict=True) if k > 0]
+    if other:
+        notes = (*notes, f"not the brightest place but another one is the spot in: {', '.join(other)}")
+    orientations = len(groups_of(samples.groups, samples.base_T_ee))
+    return document(result.refined, samples.names, orientations, notes, provenance)
+
+
+def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
+    from gripmon.recording.laser_scene import write
+
+    try:
+        write(path, result.refined, base_T_ee, result.uv_px)
+    except OSError as error:
+        raise common.not_writable(path, error, "--recording") from None
+
+
+def _report(written: LaserCalibration) -> None:
+    residuals, sigmas = written.residuals, written.sigmas
+    print(
+        f"{residuals.used} of {residuals.spots} spots at {residuals.orientations} orientations, RMS "
+        f"{residuals.rms_px:.3f} px; seed {written.provenance.seed}"
+    )
+    for name in residuals.outliers:
+        print(f"  left out: {name}")
+    for line in written.warnings:
+        print(f"  {line}")
+
+    def shown(values: Any, keys: list[str], scale: float = 1.0) -> str:
+        return ", ".join(f"{scale * v:.2f} ± {scale * sigmas[k]:.2f}" for v, k in zip(values, keys, strict=True))
+
+    position = [f"base_T_cam.{axis}_m" for axis in "xyz"]
+    turns = [f"base_T_cam.r{axis}_rad" for axis in "xyz"]
+    print(f"camera in the base   {shown(written.base_T_cam.translation_m, position, 1e3)} mm")
+    print("camera's rotation    ± " + ", ± ".join(f"{57.29578 * sigmas[key]:.3f}" for key in turns) + " deg")
+    print(f"plane from camera    {shown([written.plane.distance_cam_m], ['plane.distance_m'], 1e3)} mm")
+    tilts = ("plane.tilt_a_rad", "plane.tilt_b_rad", "laser.turn_a_rad", "laser.turn_b_rad")
+    print("plane and beam tilt  ± " + ", ± ".join(f"{57.29578 * sigmas[key]:.3f}" for key in tilts) + " deg")

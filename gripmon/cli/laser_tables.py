@@ -1,0 +1,169 @@
+"""Tables of laser samples: CSV, YAML or JSON files, and the images that they name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.calibration.laser.calibrating import Spots
+    from gripmon.calibration.laser.samples import Samples
+
+_SUFFIXES = (".csv", ".yaml", ".yml", ".json")
+
+
+def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
+    """All samples, and the file that each comes from; what is wrong ends the command with exit code 2."""
+    from gripmon.calibration.laser.samples import from_rows, joined
+
+    parts, origins = [], []
+    for path in paths:
+        rows, places = _rows(path)
+        try:
+            parts.append(from_rows(rows, places))
+        except ValueError as error:
+            raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+        origins += [path] * len(rows)
+    try:
+        return joined(parts, [str(path) for path in paths]), origins
+    except ValueError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+
+
+def _rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    if path.suffix.lower() not in _SUFFIXES:
+        raise common.CommandFailedError(f"{path}: is no table; a .csv, .yaml or .json file", common.EXIT_USAGE)
+    if path.suffix.lower() == ".csv":
+        return _csv_rows(path)
+    values = _json(path) if path.suffix.lower() == ".json" else _yaml(path)
+    samples = values.get("samples") if isinstance(values, dict) else values
+    if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
+        raise common.CommandFailedError(
+            f"{path}: samples is no list of samples; samples: [{{u_px, v_px, base_T_ee}}, ...]", common.EXIT_USAGE
+        )
+    return samples, [f"sample {k + 1}" for k in range(len(samples))]
+
+
+def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    import csv
+
+    reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
+    rows: list[dict[str, Any]] = []
+    places = []
+    for row in reader:
+        if None in row or None in row.values():
+            count = len(reader.fieldnames or ())
+            raise common.CommandFailedError(
+                f"{path}: line {reader.line_num} has another number of fields than the header; {count}",
+                common.EXIT_USAGE,
+            )
+        rows.append({str(key).strip(): value.strip() for key, value in row.items()})
+        places.append(f"line {reader.line_num}")
+    if not rows:
+        raise common.CommandFailedError(
+            f"{path}: holds no sample; a header line, then a line for each spot", common.EXIT_USAGE
+        )
+    return rows, places
+
+
+def _json(path: Path) -> Any:
+    import json
+
+    try:
+        return json.loads(_text(path))
+    except ValueError as error:
+        raise common.CommandFailedError(f"{path}: not JSON: {error}; a JSON file", common.EXIT_USAGE) from None
+
+
+def _yaml(path: Path) -> Any:
+    from gripmon.config.errors import ConfigError
+    from gripmon.config.yaml_file import read_yaml
+
+    try:
+        return read_yaml(path)
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise common.CommandFailedError(
+            f"{path}: there is no such file; a table of samples", common.EXIT_USAGE
+        ) from None
+    except UnicodeDecodeError:
+        raise common.CommandFailedError(f"{path}: is not text; a table of samples", common.EXIT_USAGE) from None
+    except OSError as error:
+        raise common.CommandFailedError(
+            f"{path}: can't be read ({error.strerror}); a table of samples", common.EXIT_USAGE
+        ) from None
+
+
+def image_files(samples: Samples, origins: list[Path]) -> list[Path]:
+    """All image files that are looked at, relative to their tables."""
+    out = []
+    for k in _unseen(samples):
+        out += [origins[k].parent / name for name in (samples.images[k], samples.laser_off[k]) if name is not None]
+    return list(dict.fromkeys(out))
+
+
+def _unseen(samples: Samples) -> list[int]:
+    import numpy as np
+
+    return np.flatnonzero(np.isnan(samples.uv_px).any(axis=1)).tolist()
+
+
+def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) -> tuple[Spots, list[int], list[str]]:
+    """Spots in the images of those samples that don't have theirs; indices of samples with a spot, and why the others
+    have none.
+    """
+    import numpy as np
+
+    from gripmon.calibration.laser.calibrating import Spots
+    from gripmon.calibration.laser.spots import find_spots as in_image
+    from gripmon.calibration.sighting import NotFound
+
+    unseen = set(_unseen(samples))
+    uv_px, covariances, others = samples.uv_px.copy(), np.tile(np.eye(2), (len(samples), 1, 1)), []
+    kept, missing = [], []
+    with common.progress_bar(len(samples), "spot") as step:
+        for k, name in enumerate(samples.names):
+            step()
+            others.append(np.empty((0, 2)))
+            if k in unseen:
+                image = _image(origins[k].parent / str(samples.images[k]), size_px)
+                off = samples.laser_off[k]
+                found = in_image(image, None if off is None else _image(origins[k].parent / off, size_px))
+                if isinstance(found, NotFound):
+                    missing.append(f"{name}: {found.reason}")
+                    continue
+                uv_px[k], covariances[k] = found[0].uv_px, found[0].covariance_px
+                others[k] = np.array([spot.uv_px for spot in found[1:]]).reshape(-1, 2)
+            elif not (-0.5 <= uv_px[k, 0] <= size_px[0] - 0.5 and -0.5 <= uv_px[k, 1] <= size_px[1] - 0.5):
+                u, v = uv_px[k]
+                raise common.CommandFailedError(
+                    f"{origins[k]}: {name}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
+                    f"{size_px[0]} x {size_px[1]} px; spots of this camera",
+                    common.EXIT_USAGE,
+                )
+            kept.append(k)
+    covariance = covariances[kept] if unseen else None
+    return Spots(uv_px[kept], covariance, tuple(others[k] for k in kept) if unseen else ()), kept, missing
+
+
+def _image(path: Path, size_px: tuple[int, int]) -> Any:
+    from gripmon.sources.folder import read_image
+
+    image, fault = read_image(path)
+    if image is None:
+        raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+    if (image.shape[1], image.shape[0]) != size_px:
+        raise common.CommandFailedError(
+            f"{path}: is {image.shape[1]} x {image.shape[0]} px, the camera {size_px[0]} x {size_px[1]}; images of "
+            "this camera",
+            common.EXIT_USAGE,
+        )
+    return image

@@ -1,0 +1,323 @@
+"""``gripmon check --sweep``: mounts are what they are said to be, and what is predicted of them happens in images."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from meters import FISHEYE_LENS, box_gripper, difference
+from scipy.spatial.transform import Rotation
+from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+
+from gripmon.camera import make_camera
+from gripmon.cli import main
+from gripmon.config import builtin_config
+from gripmon.gripper import load_gripper
+from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.outlook import Mount, Rig, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
+from gripmon.simulator import Scenario, Simulator
+from gripmon.simulator.scenario import Background, FingerLook
+
+DEMO = builtin_config("demo.yaml")
+AT_PX = (386.0, 298.0)
+SEEN = Mount(0.115, math.radians(32.0), 0.0, 0.0)
+
+
+def pose(mount: Mount) -> np.ndarray:
+    return mount.cam_T_grip(towards(make_camera(PAPER_LENS), AT_PX))
+
+
+def rig() -> Rig:
+    return Rig(make_camera(PAPER_LENS), box_gripper(), MonitorSettings())
+
+
+def tried(mount: Mount) -> Any:
+    return try_mount(rig(), mount, 0, pose(mount), 0.034)
+
+
+# --- what the numbers of a mount mean ---
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_mount_says_what_a_pose_is(seed: int):
+    rng = np.random.default_rng(seed)
+    cam_T_grip = np.eye(4)
+    cam_T_grip[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    cam_T_grip[:3, 3] = rng.normal(size=3) * 0.02 + np.array([0.0, 0.0, 0.1])
+    mount = Mount.of(cam_T_grip)
+    np.testing.assert_allclose(mount.cam_T_grip(cam_T_grip[:3, 3]), cam_T_grip, atol=1e-12)
+    # By their definitions, with the camera's axis and centre in the gripper frame.
+    axis = cam_T_grip[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    assert math.cos(mount.tilt_rad) == pytest.approx(axis[2])
+    assert mount.distance_m == pytest.approx(np.linalg.norm(cam_T_grip[:3, 3]))
+    # It looks away from the side on which it sits.
+    sits = np.array([math.sin(mount.side_rad), -math.cos(mount.side_rad)])
+    assert -axis[:2] / np.linalg.norm(axis[:2]) == pytest.approx(sits)
+
+
+def test_without_tilt_the_side_is_nought_and_the_roll_is_all():
+    mount = Mount(0.1, 0.0, 0.0, 0.7)
+    again = Mount.of(pose(mount))
+    assert again == pytest.approx(mount, abs=1e-9)
+
+
+def test_a_roll_turns_the_picture_clockwise():
+    """About the principal point, where the axis is: y points down, so clockwise is from x to y."""
+    camera = make_camera(PAPER_LENS)
+    ahead = towards(camera, (camera.cx_px, camera.cy_px))
+    upright, rolled = (Mount(0.115, 0.5, 0.3, roll).cam_T_grip(ahead) for roll in (0.2, 0.2 + math.radians(25.0)))
+    points = np.array([[0.01, 0.005, 0.0], [-0.02, 0.01, -0.01]])
+    before, after = (
+        camera.project(points @ p[:3, :3].T + p[:3, 3]) - [camera.cx_px, camera.cy_px] for p in (upright, rolled)
+    )
+    c, s = math.cos(math.radians(25.0)), math.sin(math.radians(25.0))
+    np.testing.assert_allclose(after, before @ np.array([[c, s], [-s, c]]), atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
+def test_the_tcp_stays_where_it_is_with_every_lens(lens: Any):
+    camera = make_camera(lens)
+    for focal_px in (lens.fx_px, 600.0, 1500.0):
+        other = with_focal(camera, focal_px)
+        cam_T_grip = SEEN.cam_T_grip(towards(other, AT_PX))
+        np.testing.assert_allclose(other.project(cam_T_grip[None, :3, 3])[0], AT_PX, atol=1e-6)
+    assert with_focal(camera, lens.fx_px) is camera
+    wide = with_focal(camera, 600.0)
+    assert wide.fy_px / wide.fx_px == pytest.approx(lens.fy_px / lens.fx_px)
+    # Without distortion: OpenCV's own projection with none.
+    point = np.array([[0.03, -0.02, 0.1]])
+    matrix = np.array([[600.0, 0.0, wide.cx_px], [0.0, wide.fy_px, wide.cy_px], [0.0, 0.0, 1.0]])
+    model = cv2.fisheye.projectPoints if lens is FISHEYE_LENS else cv2.projectPoints
+    expected = model(point[None], np.zeros(3), np.zeros(3), matrix, np.zeros(4))[0].reshape(1, 2)
+    np.testing.assert_allclose(wide.project(point), expected, atol=1e-9)
+
+
+def test_the_field_of_view_is_the_angle_between_the_rays_at_the_images_ends():
+    ideal = with_focal(make_camera(PAPER_LENS), 500.0)
+    width = math.atan(ideal.cx_px / 500.0) + math.atan((767.0 - ideal.cx_px) / 500.0)
+    assert field_of_view_rad(ideal) == pytest.approx(width)
+    fisheye = with_focal(make_camera(FISHEYE_LENS), 500.0)
+    # Equidistant: the angle is the radius over the focal length, along a row through the centre.
+    assert field_of_view_rad(fisheye) == pytest.approx(767.0 / 500.0, rel=1e-3)
+
+
+# --- what is predicted, against simulated images ---
+
+MOUNTS = {
+    "near and flat": Mount(0.095, math.radians(55.0), 0.0, 0.0),
+    "far": Mount(0.150, math.radians(35.0), 0.0, 0.0),
+    "rolled": Mount(0.125, math.radians(30.0), 0.0, math.radians(90.0)),
+    "aside": Mount(0.125, math.radians(20.0), math.radians(60.0), 0.0),
+}
+FRAMES = 20
+TABLE = Background(boxes=0, cables=0)
+
+
+def scatter(mount: Mount) -> np.ndarray:
+    """(6,) spread of what the real tracker measures in simulated images while the robot moves over a printed table.
+
+    Nothing but the fingers hides anything: what a gripper file doesn't describe can't be predicted.
+    """
+    camera, gripper = make_camera(PAPER_LENS), load_gripper(DEMO.parent / "grippers" / "two_box_fingers.yaml")
+    cam_T_grip = pose(mount)
+    scenario = Scenario(duration_s=20.0, fps=4.0, background=TABLE, fingers=FingerLook(carriers=False))
+    simulator = Simulator(camera, gripper, cam_T_grip, scenario, 3)
+    tracker = Tracker(camera, gripper, MonitorSettings(jaw_sigma_m=0.0))
+    errors = []
+    for k in range(FRAMES):
+        measured = tracker.measure(simulator.frame(k), cam_T_grip)
+        assert measured.trusted
+        errors.append(difference(tracker.update(measured)[0], simulator.truth(k).cam_T_grip))
+    return np.std(errors, axis=0)
+
+
+@pytest.mark.parametrize("name", MOUNTS)
+def test_a_swept_mount_scatters_as_predicted(name: str):
+    """Another noise, and texture, than assumed: within a factor of three on every axis, the axes in their order."""
+    spread = scatter(MOUNTS[name])
+    gripper = load_gripper(DEMO.parent / "grippers" / "two_box_fingers.yaml")
+    known = Rig(make_camera(PAPER_LENS), gripper, MonitorSettings(jaw_sigma_m=0.0))
+    trial = try_mount(known, MOUNTS[name], 0, pose(MOUNTS[name]), 0.034)
+    expected = np.sqrt(trial.covariance.diagonal())
+    print(name, (spread / expected).round(2), (expected[:3] * 1e6).round(1))
+    assert (spread < 3.0 * expected).all()
+    assert (spread > 0.1 * expected).all()
+    assert spread[:3].argmax() == expected[:3].argmax()
+
+
+def test_farther_away_less_is_noticed():
+    near, far = tried(MOUNTS["near and flat"]), tried(MOUNTS["far"])
+    assert near.works and far.works
+    assert far.noticed_m > near.noticed_m and far.worst_sigma_m > near.worst_sigma_m
+    assert far.margin_px > near.margin_px
+
+
+# --- why a mount would not work ---
+
+
+def test_too_near_the_open_jaws_leave_the_image():
+    trial = tried(Mount(0.060, math.radians(32.0), 0.0, 0.0))
+    assert trial.kind == "too little in view in a part of the jaw's travel"
+    assert "outside of the image" in trial.reasons[0]
+    # Counted one by one.
+    enough = [see(rig(), trial.cam_T_grip, o).enough for o in np.linspace(0.0, 0.060, len(trial.openings_m))]
+    assert trial.share == np.mean(enough) < 1.0
+    assert trial.rank > tried(SEEN).rank
+
+
+def test_from_the_side_one_finger_hides_the_other():
+    trial = tried(Mount(0.115, math.radians(88.0), math.radians(90.0), 0.0))
+    assert trial.sight.behind.any()
+    names = [n for n, behind in zip(box_gripper().corner_ids, trial.sight.behind, strict=True) if behind]
+    assert all(name.startswith("L") for name in names), "the camera sits on the right finger's side"
+
+
+def test_a_camera_that_looks_at_the_back_of_everything_sees_nothing():
+    trial = tried(Mount(5.0, math.radians(32.0), 0.0, 0.0))
+    assert trial.kind == "nowhere enough in view" and trial.covariance is None
+    assert trial.noticed_m == math.inf
+    assert "0 edges long enough" in trial.reasons[0]
+
+
+def test_the_camera_may_shift_sideways_as_far_as_is_said():
+    trial = tried(SEEN)
+    ways = [sign * np.eye(6)[axis] for axis in range(2) for sign in (-1.0, 1.0)]
+    assert all(see(rig(), moved_camera(trial.cam_T_grip, 0.98 * trial.shift_m * way), 0.034).enough for way in ways)
+    assert not all(see(rig(), moved_camera(trial.cam_T_grip, trial.shift_m * way), 0.034).enough for way in ways)
+
+
+# --- the command ---
+
+
+def swept(capsys: pytest.CaptureFixture[str], *options: str) -> Any:
+    assert main(["check", str(DEMO), "--sweep", *options, "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_the_best_mount_can_be_put_into_the_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    values = swept(capsys, "--distance", "0.09:0.13:3", "--tilt", "20,50")
+    assert len(values["mounts"]) == 6
+    best, present = values["mounts"][0], values["present"]
+    assert best["works"] and max(best["smallest"]["tcp_m"]) < max(present["smallest"]["tcp_m"])
+    text = DEMO.read_text().replace("gripper: grippers", f"gripper: {DEMO.parent}/grippers")
+    text = text.replace("[0.0004, 0.0014, 0.1188]", str(best["cam_T_grip"]["translation_m"]))
+    text = text.replace("[0.267184, 0.003984, -0.001105, 0.963637]", str(best["cam_T_grip"]["rotation_xyzw"]))
+    (tmp_path / "best.yaml").write_text(text)
+    assert main(["check", str(tmp_path / "best.yaml"), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert checked["reference"]["distance_m"] == pytest.approx(best["distance_m"])
+    assert checked["accuracy"]["expected"]["tcp_m"] == pytest.approx(best["sigma"]["tcp_m"], rel=1e-6)
+    assert checked["accuracy"]["drift"]["smallest"]["tcp_m"] == pytest.approx(best["smallest"]["tcp_m"], rel=1e-6)
+    assert checked["in_view"]["border"]["smallest_px"] == pytest.approx(best["margin_px"], rel=1e-6)
+
+
+def test_the_present_mount_is_that_of_the_configuration(capsys: pytest.CaptureFixture[str]):
+    values = swept(capsys, "--distance", "0.1188", "--tilt", "31")
+    assert main(["check", str(DEMO), "--json"]) == 0
+    checked = json.loads(capsys.readouterr().out)
+    assert values["present"]["sigma"]["tcp_m"] == pytest.approx(checked["accuracy"]["expected"]["tcp_m"], rel=1e-9)
+    assert values["present"]["weakest"]["tcp_m"] == pytest.approx(checked["accuracy"]["weakest"]["tcp_m"], rel=1e-9)
+    assert math.degrees(values["present"]["tilt_rad"]) == pytest.approx(31.0, abs=0.01)
+    assert values["mounts"][0]["worst_sigma_m"] == pytest.approx(values["present"]["worst_sigma_m"], rel=0.01)
+
+
+def test_lenses_sides_and_rolls_are_axes_too(capsys: pytest.CaptureFixture[str]):
+    options = (
+        "--distance",
+        "0.12",
+        "--tilt",
+        "30",
+        "--side",
+        "0,90",
+        "--roll=-90:90:2",
+        "--fov",
+        "40,60",
+        "--at",
+        "384,288",
+    )
+    values = swept(capsys, *options)
+    assert len(values["mounts"]) == 8 and values["tcp_at_px"] == [384.0, 288.0]
+    assert {round(math.degrees(m["field_of_view_rad"])) for m in values["mounts"]} == {40, 60}
+    assert {round(math.degrees(m["side_rad"])) for m in values["mounts"]} == {0, 90}
+    assert {round(math.degrees(m["roll_rad"])) for m in values["mounts"]} == {-90, 90}
+    ranks = [(not m["works"], -m["jaw"]["share"] * (not m["works"])) for m in values["mounts"]]
+    assert ranks == sorted(ranks)
+
+
+def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "sweep.jpg"
+    options = ["--distance", "0.06:0.3:4", "--tilt", "10:60:3", "--picture", str(path)]
+    assert main(["check", str(DEMO), "--sweep", *options]) == 0
+    text = capsys.readouterr().out
+    assert "12 mounts tried" in text and "\nbest " in text and "\npresent " in text
+    assert "would not work: too little in view in a part of the jaw's travel" in text
+    assert "translation_m: [" in text
+    picture = cv2.imread(str(path))
+    assert picture.shape[1] == 1500 and 600 < picture.shape[0] < 1200
+    assert path.stat().st_size < 300_000
+    # Thumbnails and coloured cells are there: much of it is neither paper nor ink.
+    coloured = np.ptp(picture.astype(int), axis=2) > 60
+    assert coloured[110:300].mean() > 0.3
+    grey = (np.ptp(picture.astype(int), axis=2) < 12) & (picture.mean(axis=2) < 200) & (picture.mean(axis=2) > 20)
+    assert grey[-420:].mean() > 0.3
+
+
+def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "none.png"
+    assert main(["check", str(DEMO), "--sweep", "--distance", "4,5", "--tilt", "30", "--picture", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "2 mounts tried, 0 would work" in text and "2 would not work: nowhere enough in view" in text
+    assert "best as" not in text and cv2.imread(str(path)) is not None
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--distance", "0.1"], "--distance: only has a meaning for a sweep; add --sweep"),
+        (["--sweep", "--distance", "80:200:7"], "80 m is out of bounds; FIRST:LAST:COUNT or values with commas"),
+        (["--sweep", "--distance", "0.1:0.2"], "--distance 0.1:0.2: is no range"),
+        (["--sweep", "--distance", "nan"], "nan m is out of bounds"),
+        (["--sweep", "--distance", ""], "--distance : is no range"),
+        (["--sweep", "--tilt", "10:60:0"], "--tilt 10:60:0: is no range"),
+        (["--sweep", "--tilt", "ten"], "--tilt ten: is no range"),
+        (["--sweep", "--tilt=-10"], "-10 degrees is out of bounds"),
+        (["--sweep", "--fov", "200"], "200 degrees is out of bounds"),
+        (["--sweep", "--focal", "4"], "--focal 4: fx_px: 4 px is no focal length"),
+        (["--sweep", "--at", "384"], "--at 384: is no point of the image"),
+        (["--sweep", "--at", "384,700"], "--at: lies at (384.0, 700.0) px, outside of the image"),
+        (["--sweep", "--at", "nan,3"], "outside of the image"),
+        (["--sweep", "--tilt", "0:80:100", "--roll", "0:90:50"], "45000 mounts; at most 20000"),
+        (["--sweep", "--picture", "sweep.gif"], "--picture sweep.gif: is no kind of picture; .png or .jpg"),
+        (["--sweep", "--picture", "/nowhere/sweep.png"], "--picture /nowhere/sweep.png: can't be written"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_said_in_one_line(options: list[str], said: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["check", str(DEMO), *options]) == 2
+    captured = capsys.readouterr()
+    assert said in captured.err and captured.err.count("\n") == 1
+    assert captured.out == ""
+
+
+def test_a_focal_length_and_a_field_of_view_exclude_each_other(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(SystemExit) as ended:
+        main(["check", str(DEMO), "--sweep", "--focal", "900", "--fov", "60"])
+    assert ended.value.code == 2
+    assert "not allowed with argument" in capsys.readouterr().err
+
+
+def test_a_gripper_without_jaw_is_swept_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = builtin_config("visp_cube.yaml")
+    assert main(["check", str(path), "--sweep", "--distance", "0.4,0.6", "--tilt", "30", "--json"]) == 0
+    values = json.loads(capsys.readouterr().out)
+    assert all(len(m["jaw"]["opening_m"]) == 1 for m in values["mounts"]) and values["mounts"][0]["works"]
+
+
+def test_the_nominal_pose_of_the_tests_is_the_mount_it_looks_like():
+    mount = Mount.of(nominal_cam_T_grip())
+    assert math.degrees(mount.tilt_rad) == pytest.approx(32.0)
+    assert mount.side_rad == pytest.approx(0.0) and mount.roll_rad == pytest.approx(0.0)
