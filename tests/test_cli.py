@@ -305,6 +305,7 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
     assert {"creep", "bump", "occlusion"} <= {event["event"] for event in comparison["events"]}
     assert all((event["noticed_after_s"] is None) == event["harmless"] for event in comparison["events"])
     assert "after correction" in done.stdout and re.search(r"look at it \S*rerun \S*demo-0001.rrd", done.stdout)
+    assert re.search(r"report +gripmon report \S+/\*.rrd --out \S+/report.html", done.stdout)
 
 
 def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch):

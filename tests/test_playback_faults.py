@@ -284,7 +284,7 @@ def test_what_is_no_recording_of_ours(tmp_path: Path):
     assert refused(empty) == f"{empty}: is empty; not used"
     assert refused(picture) == f"{picture}: is no rerun recording, whatever its name says; not used"
     assert refused(lone).startswith(f"{lone}: holds no frame records")
-    assert "the application 'arm_viewer' that holds nothing of a monitor's; not used" in refused(foreign)
+    assert "the application 'arm_viewer' that holds no frames of a monitor's; not used" in refused(foreign)
     assert refused(nothing).startswith(f"{nothing}: holds no .rrd file")
     assert refused(tmp_path / "gone.rrd") == f"{tmp_path / 'gone.rrd'}: No such file or directory; not used"
     assert open_recordings([]) == Collection((), ())

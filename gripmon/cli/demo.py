@@ -239,6 +239,7 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
             *(f"look at it {_viewer()} {shlex.quote(recording)}" for recording in recordings),
+            f"report     gripmon report {shlex.quote(str(out))}/*.rrd --out {shlex.quote(str(out / 'report.html'))}",
             f"next       your own camera: cp -r {configs} mine; edit mine/live_camera.yaml;",
             "           gripmon check mine/live_camera.yaml; gripmon run mine/live_camera.yaml",
         ]

@@ -64,8 +64,8 @@ def add_parser(commands: Any) -> None:
         nargs="+",
         metavar="INPUT",
         help="a folder of images, taken in the order of their names, a video file, or a recording of ours: an .rrd "
-        "file, all files of one run, or a folder of them with all below; a timestamps.csv may lie beside images, with the columns "
-        "file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
+        "file, all files of one run, or a folder of them with all below; a timestamps.csv may lie beside images, with "
+        "the columns file,stamp_ns[,jaw_opening_m] (Unix ns, m)",
     )
     parser.add_argument(
         "--config",

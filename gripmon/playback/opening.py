@@ -123,7 +123,7 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
     ours = [contents for contents in found if contents.is_ours]
     if not ours:
         applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
-        what = f"is a recording of the application {applications} that holds nothing of a monitor's"
+        what = f"is a recording of the application {applications} that holds no frames of a monitor's"
         faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))
     return ours
 

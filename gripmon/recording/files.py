@@ -302,7 +302,7 @@ class FileSeries:
         self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 
     def _mend(self) -> None:
-        """Earlier files of this robot and camera, whose writer may have been killed; pins of recordings that are gone."""
+        """Earlier files of this robot and camera, whose writer may have been killed, and pins without a file."""
         with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
             for entry in self._budget.recordings():
                 repair(entry.path)
