@@ -34,14 +34,15 @@ class CameraCalibration(
     """A calibrated camera.
 
     ``covariance`` (n·n, row by row) is that of the n ``parameters``, which are keys of ``camera``
-    (``coefficients.0`` is the first one); what isn't among them was held fixed.
+    (``coefficients.0`` is the first one); what isn't among them was held fixed.  A camera that was imported from
+    another program's file has neither: how certain it is isn't known.
     """
 
     camera: LensSettings
     parameters: tuple[str, ...]
     covariance: tuple[float, ...]
-    residuals: CameraResiduals
-    target: str
+    residuals: CameraResiduals | None = None
+    target: str | None = None
     warnings: tuple[str, ...] = ()
     provenance: Provenance
 

@@ -5,9 +5,23 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from gripmon.cli import calibrate_intrinsics, calibrate_laser, calibrate_plane
+from gripmon.cli import (
+    calibrate_export,
+    calibrate_import,
+    calibrate_intrinsics,
+    calibrate_laser,
+    calibrate_plane,
+    calibrate_verify,
+)
 
-_METHODS = (calibrate_intrinsics, calibrate_plane, calibrate_laser)
+_METHODS = (
+    calibrate_intrinsics,
+    calibrate_plane,
+    calibrate_laser,
+    calibrate_verify,
+    calibrate_import,
+    calibrate_export,
+)
 
 _DESCRIPTION = """\
 The off-line methods, from images alone.  Each writes a file with residuals, covariance and

@@ -116,6 +116,11 @@ def write_picture(picture: Image, path: Path, option: str = "--picture") -> None
     _write(path, data.tobytes(), option)
 
 
+def write_bytes(data: bytes, path: Path, option: str = "--out") -> None:
+    """Write them, whole or not at all."""
+    _write(path, data, option)
+
+
 def command_line(method: str, positional: Sequence[str], options: dict[str, Any]) -> str:
     """What a file's provenance calls the command; options that are None or False were not given."""
     words = ["gripmon", "calibrate", method, *positional]

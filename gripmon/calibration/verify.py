@@ -1,0 +1,227 @@
+"""Are two calibrations the same?  Their difference with its uncertainty, and how probable it is by chance.
+
+Both are taken as independent.  What they share (a camera calibration, a plate) cancels in the difference but not in
+the sum of their covariances, so that differences then look less significant than they are: never the reverse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.stats import chi2
+
+from gripmon.calibration.intrinsics import lens_vector, model_of
+from gripmon.calibration.lens_models import LensModel, parameter_names
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import Camera, LensSettings, make_camera
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.records import Array
+
+NEGLIGIBLE_PX = 1e-3
+"""Two cameras that are as near as this don't differ, however certain they are."""
+_GRID = 25
+_DRAWS = 4000
+_SEED = 7
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeDifference:
+    """What two ``cam_T_grip`` differ by, second against first: the TCP's ``position_m`` (3,) and the ``rotation_rad``
+    (3,) vector along the camera's axes, with standard deviations.
+
+    ``chi2`` has six degrees of freedom; ``p_value`` is the probability of as large a one if both are the same,
+    ``position_p`` and ``rotation_p`` those of the parts alone.
+    """
+
+    position_m: Array
+    position_sigma_m: Array
+    rotation_rad: Array
+    rotation_sigma_rad: Array
+    chi2: float
+    p_value: float
+    position_p: float
+    rotation_p: float
+
+
+def compare_hand_eye(
+    a_cam_T_grip: Array, a_covariance: Array, b_cam_T_grip: Array, b_covariance: Array
+) -> HandEyeDifference:
+    """Transforms (4, 4) with the covariances (6, 6) of their errors (position, then rotation, camera axes; m, rad).
+
+    Under no difference ``xi = perturbation_between(a, b)`` has the covariance ``A + B`` to first order, and
+    ``xiᵀ (A + B)⁻¹ xi`` is chi-square with six degrees of freedom.  :class:`CalibrationError` for covariances that are
+    none, or together leave a direction exactly known.
+    """
+    for name, matrix in (("first", a_covariance), ("second", b_covariance)):
+        if not np.isfinite(matrix).all() or not np.allclose(matrix, matrix.T, rtol=1e-6, atol=0.0):
+            raise CalibrationError(f"the {name} covariance isn't symmetric; one of errors")
+    xi = perturbation_between(a_cam_T_grip, b_cam_T_grip)
+    covariance = a_covariance + b_covariance
+    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    return HandEyeDifference(
+        position_m=xi[:3],
+        position_sigma_m=sigma[:3],
+        rotation_rad=xi[3:],
+        rotation_sigma_rad=sigma[3:],
+        chi2=_chi2(xi, covariance),
+        p_value=float(chi2.sf(_chi2(xi, covariance), 6)),
+        position_p=float(chi2.sf(_chi2(xi[:3], covariance[:3, :3]), 3)),
+        rotation_p=float(chi2.sf(_chi2(xi[3:], covariance[3:, 3:]), 3)),
+    )
+
+
+def _chi2(difference: Array, covariance: Array) -> float:
+    sigma = np.sqrt(np.maximum(covariance.diagonal(), 0.0))
+    if not (sigma > 0.0).all():
+        raise CalibrationError("the uncertainties are zero; covariances that say what isn't known")
+    # In units of the deviations: metres and radians would make any matrix look singular.
+    correlation = covariance / np.outer(sigma, sigma)
+    try:
+        root = np.linalg.cholesky(correlation)
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the uncertainties leave a direction exactly known; full covariances") from None
+    return float(np.sum(np.square(np.linalg.solve(root, difference / sigma))))
+
+
+def mean_of_one_scene(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> tuple[Array, Array]:
+    """Mean (4, 4) of measurements of one pose, and their mean covariance (6, 6): what makes single images wrong, such
+    as the background, light and the lens, is the same in all of them, so that the number of images earns nothing.
+    """
+    mean = cam_T_grip[0]
+    for _ in range(3):
+        mean = perturb(mean, np.mean([perturbation_between(mean, T) for T in cam_T_grip], axis=0))
+    return mean, np.mean(covariances, axis=0)
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedCamera:
+    """A camera with the ``covariance`` (p, p) of those of its ``parameters`` that were estimated; p = 0: not known."""
+
+    camera: LensSettings
+    parameters: tuple[str, ...] = ()
+    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+
+
+@dataclass(frozen=True, slots=True)
+class CameraDifference:
+    """What two cameras differ by in what they do: where the second one shows what the first one shows at a pixel.
+
+    ``largest_px`` with its standard deviation along the difference, at ``at_px`` (2,) of the first image; ``rms_px``
+    over the image.  ``turn_rad`` (3,): the turn of the camera about its axes that explains most of it, and
+    ``largest_turned_px`` what is then left: a hand/eye calibration made with each would absorb that turn.  ``p_value``:
+    probability that the place which differs most, measured by its uncertainty, differs as much by chance; None if
+    neither camera's uncertainty is known.  ``compared``: share of the image that both show.
+    """
+
+    largest_px: float
+    largest_sigma_px: float
+    at_px: Array
+    rms_px: float
+    turn_rad: Array
+    largest_turned_px: float
+    p_value: float | None
+    compared: float
+
+
+def compare_cameras(a: CalibratedCamera, b: CalibratedCamera) -> CameraDifference:
+    """Models may be different ones; image sizes must not (:class:`CalibrationError`).
+
+    At pixel u of a grid the difference is ``d = pi_b(pi_a⁻¹(u)) - u``, with covariance ``J_a A J_aᵀ + J_b B J_bᵀ`` to
+    first order (J: derivative of the pixel by the parameters).  The statistic is the largest ``dᵀ cov⁻¹ d`` of the
+    grid; its distribution under no difference comes from drawn parameter errors, always the same ones.
+    """
+    size = (a.camera.width_px, a.camera.height_px)
+    if size != (b.camera.width_px, b.camera.height_px):
+        raise CalibrationError(
+            f"images of {size[0]} x {size[1]} px and of {b.camera.width_px} x {b.camera.height_px} px; one camera in "
+            "one size"
+        )
+    camera_a, camera_b = make_camera(a.camera), make_camera(b.camera)
+    grid_px = _grid(size)
+    xy = camera_a.undistort(grid_px)
+    shown = np.isfinite(xy).all(axis=1)
+    apart_px = np.full_like(grid_px, np.nan)
+    apart_px[shown] = camera_b.distort(xy[shown]) - grid_px[shown]
+    both = np.isfinite(apart_px).all(axis=1)
+    if np.count_nonzero(both) < 0.5 * len(grid_px):
+        raise CalibrationError("less than half of the image is seen by both lens models; calibrations of one camera")
+    uv_px, xy, apart_px = grid_px[both], xy[both], apart_px[both]
+    roots = np.concatenate([_root(a, xy), -_root(b, xy)], axis=2)
+    covariance = roots @ roots.transpose(0, 2, 1)
+    length = np.linalg.norm(apart_px, axis=1)
+    worst = int(np.argmax(length))
+    along = apart_px[worst] / max(length[worst], 1e-300)
+    turn_rad, left_px = _turned(camera_b, xy, apart_px)
+    return CameraDifference(
+        largest_px=float(length[worst]),
+        largest_sigma_px=float(np.sqrt(along @ covariance[worst] @ along)),
+        at_px=uv_px[worst],
+        rms_px=float(np.sqrt(np.mean(np.square(length)))),
+        turn_rad=turn_rad,
+        largest_turned_px=float(np.linalg.norm(left_px, axis=1).max()),
+        p_value=_chance(apart_px, covariance, roots) if roots.shape[2] else None,
+        compared=len(uv_px) / len(grid_px),
+    )
+
+
+def _grid(size: tuple[int, int]) -> Array:
+    """Pixels (n, 2) over the whole image."""
+    columns, rows = (np.linspace(0.0, n - 1.0, _GRID) for n in size)
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+
+
+def _root(calibrated: CalibratedCamera, xy: Array) -> Array:
+    """(n, 2, p): what independent errors of unit size in the parameters do to each pixel."""
+    if not calibrated.parameters:
+        return np.zeros((len(xy), 2, 0))
+    camera = calibrated.camera
+    model = LensModel(model_of(camera), camera.width_px, camera.height_px)
+    names = parameter_names(model.name)
+    unknown = [name for name in calibrated.parameters if name not in names]
+    if unknown:
+        raise CalibrationError(f"{unknown[0]} is no parameter of this camera; one of {', '.join(names)}")
+    points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    _, by_parameters, _ = model.project(lens_vector(camera), points)
+    chosen = np.zeros((len(names), len(calibrated.parameters)))
+    for column, name in enumerate(calibrated.parameters):
+        chosen[names.index(name), column] = 1.0
+    # With the aspect held one focal length stands for both.
+    if "fx_px" in calibrated.parameters and "fy_px" not in calibrated.parameters:
+        chosen[1, calibrated.parameters.index("fx_px")] = camera.fy_px / camera.fx_px
+    sigma = np.sqrt(np.maximum(calibrated.covariance.diagonal(), 0.0))
+    scale = np.where(sigma > 0.0, sigma, 1.0)
+    # Scaled: pixels beside kappa's 1/px² would lose the latter to rounding.
+    values, vectors = np.linalg.eigh(calibrated.covariance / np.outer(scale, scale))
+    if not np.isfinite(values).all() or values.min() < -1e-6:
+        raise CalibrationError("a camera's covariance has negative variances; one of errors")
+    out: Array = by_parameters @ chosen @ (scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    return out
+
+
+def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
+    """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), from drawn errors."""
+    # What neither camera left free has no variance; there a thousandth of a pixel counts.
+    inverse_root = np.linalg.inv(np.linalg.cholesky(covariance + NEGLIGIBLE_PX**2 * np.eye(2)))
+    observed = np.square(inverse_root @ apart_px[:, :, None]).sum(axis=(1, 2)).max()
+    whitened = inverse_root @ roots
+    draws = np.random.default_rng(_SEED).standard_normal((whitened.shape[2], _DRAWS))
+    largest = np.zeros(_DRAWS)
+    for place in whitened:
+        np.maximum(largest, np.square(place @ draws).sum(axis=0), out=largest)
+    return float((1 + np.count_nonzero(largest >= observed)) / (1 + _DRAWS))
+
+
+def _turned(camera: Camera, xy: Array, apart_px: Array) -> tuple[Array, Array]:
+    """The turn of the camera (3,), rad, that explains most of the differences (n, 2), and what is left of them."""
+    points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    _, by_point = camera.project_with_jacobian(points)
+    # omega x p, column by column
+    zero, x, y, z = np.zeros(len(xy)), points[:, 0], points[:, 1], points[:, 2]
+    by_turn = np.stack(
+        [np.stack([zero, -z, y], axis=1), np.stack([z, zero, -x], axis=1), np.stack([-y, x, zero], axis=1)], axis=2
+    )
+    matrix = (by_point @ by_turn).reshape(-1, 3)
+    turn: Array = np.linalg.lstsq(matrix, apart_px.ravel(), rcond=None)[0]
+    return turn, apart_px - (matrix @ turn).reshape(-1, 2)

@@ -1,0 +1,157 @@
+"""A hand/eye calibration measured anew from images, for ``gripmon calibrate verify``."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import calibration_files as files
+from gripmon.cli import common
+from gripmon.cli.calibration_sources import Calibrated
+
+if TYPE_CHECKING:
+    from gripmon.config import Config
+    from gripmon.records import Array, Image
+
+
+def measured(first: Calibrated, arguments: argparse.Namespace, warnings: list[str]) -> Calibrated:
+    """What the images show, on the plate if there is a ``--target``; what can't be measured ends the command with
+    exit code 3.  What is doubtful about it is added to ``warnings``.
+    """
+    from gripmon.geometry import to_record
+
+    config = _config(first, arguments)
+    opening_m = _opening(first, config, arguments)
+    paths = files.image_paths(arguments.second)
+    images = list(files.images_of(paths))
+    for path, image in images:
+        size = (config.camera.width_px, config.camera.height_px)
+        if (image.shape[1], image.shape[0]) != size:
+            raise common.CommandFailedError(
+                f"{path}: has {image.shape[1]} x {image.shape[0]} px; the camera's {size[0]} x {size[1]} px",
+                common.EXIT_USAGE,
+            )
+    if arguments.target is not None:
+        cam_T_grip, covariance = _on_plate(first, config, opening_m, images, arguments.target, warnings)
+    else:
+        cam_T_grip, covariance = _tracked(first, config, opening_m, images, warnings)
+    return Calibrated(
+        paths[0],
+        "images",
+        config.settings.camera,
+        cam_T_grip=to_record(cam_T_grip),
+        covariance=tuple(covariance.ravel().tolist()),
+    )
+
+
+def _config(first: Calibrated, arguments: argparse.Namespace) -> Config:
+    """The configuration, which has to be of the same camera and gripper."""
+    from gripmon.corners.taught import gripper_digest
+
+    if arguments.config is None:
+        raise common.CommandFailedError(
+            "--config: is missing; with images, the configuration with gripper and monitor", common.EXIT_USAGE
+        )
+    if first.cam_T_grip is None:
+        raise common.CommandFailedError(
+            f"{first.path}: is {first.kind}; with images, a hand/eye calibration", common.EXIT_USAGE
+        )
+    config = common.load(arguments.config, check_source=False)
+    if first.lens is not None and first.lens != config.settings.camera:
+        raise common.CommandFailedError(
+            f"{first.path}: camera: isn't the one of {arguments.config}; the same camera calibration in both",
+            common.EXIT_USAGE,
+        )
+    if first.gripper is not None and first.gripper.sha256 != gripper_digest(config.gripper):
+        raise common.CommandFailedError(
+            f"{first.path}: gripper: {first.gripper.name} isn't the one of {arguments.config}; the same file in both",
+            common.EXIT_USAGE,
+        )
+    return config
+
+
+def _opening(first: Calibrated, config: Config, arguments: argparse.Namespace) -> float | None:
+    gripper = config.gripper
+    if not gripper.has_jaw:
+        if arguments.jaw_opening is not None:
+            raise common.CommandFailedError("--jaw-opening: the gripper has no jaw; leave it out", common.EXIT_USAGE)
+        return None
+    given = (arguments.jaw_opening, first.jaw_opening_m, config.jaw_opening_m)
+    opening_m = next(m for m in given if m is not None)
+    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise common.CommandFailedError(
+            f"--jaw-opening: {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m",
+            common.EXIT_USAGE,
+        )
+    return opening_m
+
+
+def _on_plate(
+    first: Calibrated,
+    config: Config,
+    opening_m: float | None,
+    images: list[tuple[Path, Image]],
+    target_text: str,
+    warnings: list[str],
+) -> tuple[Array, Array]:
+    """By the plane coincidence, as ``gripmon calibrate plane`` does it, with the known gripper."""
+    from gripmon.calibration.detection import detect
+    from gripmon.calibration.plane import GivenCamera, KnownCorners, calibrate_plane
+    from gripmon.calibration.plane_average import average
+    from gripmon.calibration.sighting import CalibrationError, NotFound
+    from gripmon.geometry import from_record
+    from gripmon.onboarding.measuring import contact_height_m, measure_known
+
+    target = files.target_of(target_text)
+    assert first.cam_T_grip is not None
+    expected, gripper = from_record(first.cam_T_grip), config.gripper
+    points_m = gripper.points_grip_m(opening_m)
+    found = []
+    for path, image in images:
+        sighting = detect(image, target, str(path))
+        if isinstance(sighting, NotFound):
+            raise common.CommandFailedError(f"{path}: {sighting.reason}")
+        try:
+            corners, _ = measure_known(config.camera, gripper, image, expected, opening_m)
+            known_m = points_m[[gripper.point_ids.index(name) for name in corners.names]]
+            known = KnownCorners(known_m, contact_height_m(gripper, opening_m))
+            found.append(calibrate_plane(GivenCamera(config.settings.camera), sighting, corners, known))
+        except CalibrationError as error:
+            raise common.CommandFailedError(f"{path}: {error}") from None
+    together = average(found, inferred=False)
+    warnings += together.warnings
+    return together.cam_T_grip, together.covariance
+
+
+def _tracked(
+    first: Calibrated,
+    config: Config,
+    opening_m: float | None,
+    images: list[tuple[Path, Image]],
+    warnings: list[str],
+) -> tuple[Array, Array]:
+    """By the monitor's own measurement, beginning at the calibration; images that it can't measure are left out."""
+    import numpy as np
+
+    from gripmon.calibration.verify import mean_of_one_scene
+    from gripmon.geometry import from_record
+    from gripmon.monitor import Monitor
+    from gripmon.records import Frame, Origin, ReferenceRecord
+
+    assert first.cam_T_grip is not None
+    reference = ReferenceRecord("verify", 0, 0, "configuration", first.cam_T_grip, first.covariance)
+    transforms, covariances, reasons = [], [], []
+    for number, (path, image) in enumerate(images):
+        # Each image by itself: what a monitor learns from the last one is for a camera that stands still meanwhile.
+        monitor = Monitor(config.camera, config.gripper, config.settings.monitor, reference, config.taught_edges)
+        record = monitor.process(Frame(number, 1_000_000_000 * (number + 1), image, opening_m, str(path)))
+        if record.cam_T_grip is None or record.covariance is None or record.source is Origin.HELD:
+            reasons.append(f"{path}: {record.reason or 'the gripper is not seen'}")
+            continue
+        transforms.append(from_record(record.cam_T_grip))
+        covariances.append(np.reshape(record.covariance, (6, 6)))
+    if not transforms:
+        raise common.CommandFailedError(f"no image can be measured; {reasons[0]}")
+    warnings += [f"left out: {reason}" for reason in reasons]
+    return mean_of_one_scene(transforms, covariances)
