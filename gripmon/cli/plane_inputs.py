@@ -37,7 +37,7 @@ class Inputs:
     images: list[Image]
     rough: list[Rough | None]
     files: list[Path]
-    jaw_note: str | None
+    notes: tuple[str, ...]
 
     @property
     def inferred(self) -> bool:
@@ -88,7 +88,10 @@ def read(arguments: argparse.Namespace) -> Inputs:
     inputs = [*paths, *(Path(name) for name in named if name is not None)]
     if config is not None:
         inputs += [config.gripper_path, *config.calibrated.paths.values()]
-    return Inputs(camera, target, method, paths, images, rough, list(dict.fromkeys(inputs)), note)
+    notes = () if note is None else (note,)
+    if not camera.parameters:
+        notes = (*notes, "how certain the camera is isn't known: its errors are not in the covariance")
+    return Inputs(camera, target, method, paths, images, rough, list(dict.fromkeys(inputs)), notes)
 
 
 def _camera(arguments: argparse.Namespace, config: Config | None) -> GivenCamera:

@@ -78,8 +78,8 @@ def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, argu
     print(f"{'image':<{width}}  plate points     rms  corners  residual  tilt about x, y          gap")
     for look in looks:
         print(_image_line(look.coincidence, width))
-    if inputs.jaw_note is not None:
-        print(f"note: {inputs.jaw_note}")
+    for note in inputs.notes:
+        print(f"note: {note}")
     for look in looks:
         for name, reason in look.missing.items():
             print(f"note: {look.coincidence.sighting.name}: {name} not measured: {reason}")
@@ -108,6 +108,7 @@ def _values(
         "rms_px": result.rms_px,
         "consistency_p": result.consistency_p,
         "warnings": result.warnings,
+        "notes": inputs.notes,
         "images": [_image_values(look) for look in looks],
         "written": [arguments.gripper_out, arguments.out] if inputs.inferred else [arguments.out],
     }
