@@ -123,7 +123,7 @@ def test_the_command_writes_both_transforms(tmp_path, capsys):
     for name, truth in (("cam_T_base", cam_T_base), ("ee_T_target", ee_T_target), ("base_T_cam", invert(cam_T_base))):
         assert np.abs(np.array(written["transforms"][name]["translation_m"]) - truth[:3, 3]).max() < 2e-3
     assert written["residuals"]["poses"] == 12 and len(written["covariance"]) == 144
-    assert "12 of 12 poses" in capsys.readouterr().out
+    assert " of 12 poses, RMS 0." in capsys.readouterr().out
     assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 2
 
 

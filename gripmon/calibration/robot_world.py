@@ -23,7 +23,7 @@ FEWEST_POSES = 3
 LEAST_TURN_RAD = 5e-3
 BIWEIGHT = 4.685
 """Tukey's constant: 95 % efficiency for normal errors."""
-FALSE_OUTLIERS = 0.1
+FALSE_OUTLIERS = 0.05
 """How many good poses of a whole data set may be left out, on average."""
 _ITERATIONS = 60
 _ROUNDS = 20
