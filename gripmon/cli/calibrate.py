@@ -11,6 +11,7 @@ from gripmon.cli import (
     calibrate_intrinsics,
     calibrate_laser,
     calibrate_plane,
+    calibrate_robot_world,
     calibrate_verify,
 )
 
@@ -18,6 +19,7 @@ _METHODS = (
     calibrate_intrinsics,
     calibrate_plane,
     calibrate_laser,
+    calibrate_robot_world,
     calibrate_verify,
     calibrate_import,
     calibrate_export,

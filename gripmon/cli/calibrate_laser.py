@@ -136,8 +136,8 @@ def _calibrated(
         camera = make_camera(calibration.camera)
     except ValueError as error:
         raise common.CommandFailedError(f"--camera {arguments.camera}: {error}", common.EXIT_USAGE) from None
-    lens = _prior(calibration, arguments.camera) if arguments.refine_lens else None
     try:
+        lens = _prior(calibration, arguments.camera) if arguments.refine_lens else None
         return calibrate(
             camera, samples.base_T_ee, spots, samples.groups, lens=lens, pose_noise=_noise(arguments.arm_noise)
         )
@@ -154,23 +154,14 @@ def _noise(given: tuple[float, float] | None) -> PoseNoise | None:
 def _prior(calibration: CameraCalibration, name: str) -> LensPrior:
     import numpy as np
 
+    from gripmon.calibration.intrinsics import lens_vector, model_of
     from gripmon.calibration.laser.spot_problem import LensPrior
     from gripmon.calibration.lens_models import LensModel, parameter_names
 
     camera = calibration.camera
     count = len(calibration.parameters)
-    kind: Any = camera.__struct_config__.tag
-    coefficients = getattr(camera, "coefficients", ())
-    if kind == "brown_conrady" and len(coefficients) == 5:
-        kind = "brown_conrady_5"
-    names = parameter_names(kind)
-    values = [
-        camera.fx_px,
-        camera.fy_px,
-        camera.cx_px,
-        camera.cy_px,
-        *(coefficients or (getattr(camera, "kappa_per_px2", 0.0),)),
-    ]
+    kind = model_of(camera)
+    names, values = parameter_names(kind), lens_vector(camera)
     unknown = [key for key in calibration.parameters if key not in names]
     if count == 0 or unknown or len(values) != len(names):
         raise common.CommandFailedError(
@@ -180,7 +171,7 @@ def _prior(calibration: CameraCalibration, name: str) -> LensPrior:
         )
     free = tuple(names.index(key) for key in calibration.parameters)
     model = LensModel(kind, camera.width_px, camera.height_px)
-    return LensPrior(model, np.array(values), free, np.array(calibration.covariance).reshape(count, count))
+    return LensPrior(model, values, free, np.array(calibration.covariance).reshape(count, count))
 
 
 def _document(

@@ -20,7 +20,7 @@ def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
 
     parts, origins = [], []
     for path in paths:
-        rows, places = _rows(path)
+        rows, places = rows_of(path)
         try:
             parts.append(from_rows(rows, places))
         except ValueError as error:
@@ -32,7 +32,8 @@ def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
         raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
 
 
-def _rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+def rows_of(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """A table's rows, and where each stands; what is wrong ends the command with exit code 2."""
     if path.suffix.lower() not in _SUFFIXES:
         raise common.CommandFailedError(f"{path}: is no table; a .csv, .yaml or .json file", common.EXIT_USAGE)
     if path.suffix.lower() == ".csv":

@@ -50,8 +50,8 @@ def from_rows(rows: Sequence[Row], places: Sequence[str]) -> Samples:
     if not rows:
         raise ValueError("holds no sample; a row for each spot, better 50 of them")
     uv_px = np.array([_spot(row, place) for row, place in zip(rows, places, strict=True)])
-    base_T_ee = np.stack([_pose(row, place) for row, place in zip(rows, places, strict=True)])
-    _check_scale(base_T_ee)
+    base_T_ee = np.stack([pose_of(row, place) for row, place in zip(rows, places, strict=True)])
+    check_scale(base_T_ee)
     named = [row.get("group") not in (None, "") for row in rows]
     if any(named) and not all(named):
         raise ValueError(f"{places[named.index(False)]}: has no group, others have; a group for every row, or for none")
@@ -125,8 +125,8 @@ def _numbers(row: Row, keys: Sequence[str], place: str) -> list[float]:
     return out
 
 
-def _pose(row: Row, place: str) -> Array:
-    """``base_T_ee`` (4, 4) of a row."""
+def pose_of(row: Row, place: str) -> Array:
+    """``base_T_ee`` (4, 4) of a row.  ValueError: what is wrong, and what would be right."""
     if row.get("base_T_ee") is not None:
         return _nested(row["base_T_ee"], place)
     if any(key in row for key in MATRIX):
@@ -206,7 +206,8 @@ def checked_transform(matrix: Array, place: str) -> Array:
     return make_transform(left @ right, matrix[:3, 3])
 
 
-def _check_scale(base_T_ee: Array) -> None:
+def check_scale(base_T_ee: Array) -> None:
+    """ValueError for poses (n, 4, 4) that no arm reaches."""
     far = float(np.median(np.linalg.norm(base_T_ee[:, :3, 3], axis=1)))
     if far > _FARTHEST_M:
         raise ValueError(

@@ -1,0 +1,235 @@
+"""Robot-world and hand-eye at once, from a target on the hand that a fixed camera sees (or the other way round).
+
+Dornaika and Horaud, "Simultaneous robot-world and hand-eye calibration" (IEEE Trans. Robotics and Automation, 1998):
+for every pose ``cam_T_target = cam_T_base base_T_ee ee_T_target``, the first and the last unknown.  Closed form by
+quaternions, then all at once.  A camera on the hand is the same with ``ee_T_base`` for ``base_T_ee``: what comes out is
+``cam_T_ee`` and ``base_T_target`` then.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.geometry import invert, make_transform, perturb, skew
+from gripmon.records import Array
+
+FEWEST_POSES = 3
+LEAST_TURN_RAD = 5e-3
+BIWEIGHT = 4.685
+"""Tukey's constant: 95 % efficiency for normal errors."""
+FALSE_OUTLIERS = 0.05
+"""How many good poses of a whole data set may be left out, on average."""
+_ITERATIONS = 60
+_ROUNDS = 20
+
+
+@dataclass(frozen=True, slots=True)
+class RobotWorld:
+    """``covariance`` (12, 12) of ``cam_T_base`` and ``ee_T_target``, position then rotation each (axes of cam, of ee);
+    ``residuals`` (n, 6), measured against predicted ``cam_T_target``, position (m) and rotation (rad), camera axes;
+    ``used`` (n,).
+    """
+
+    cam_T_base: Array
+    ee_T_target: Array
+    covariance: Array
+    residuals: Array
+    used: NDArray[np.bool_]
+    degrees_of_freedom: int
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the used positions' residuals, each axis."""
+        return float(np.sqrt(np.mean(np.square(self.residuals[self.used, :3]))))
+
+    @property
+    def rms_rad(self) -> float:
+        """Root mean square of the used rotations' residuals, each axis."""
+        return float(np.sqrt(np.mean(np.square(self.residuals[self.used, 3:]))))
+
+
+def solve(cam_T_target: Array, base_T_ee: Array) -> tuple[Array, Array]:
+    """Closed form from poses (n, 4, 4) each: ``cam_T_base`` and ``ee_T_target``.  Raises :class:`CalibrationError` for
+    too few poses, or ones turned about one axis only.
+    """
+    _check_turns(cam_T_target, base_T_ee)
+    cam_R_base, target_R_ee = rotations(cam_T_target[:, :3, :3], base_T_ee[:, :3, :3])
+    shift, back = translations(cam_T_target, base_T_ee, cam_R_base)
+    return make_transform(cam_R_base, shift), invert(make_transform(target_R_ee, back))
+
+
+def rotations(cam_R_target: Array, base_R_ee: Array) -> tuple[Array, Array]:
+    """``cam_R_base`` and ``target_R_ee`` with ``cam_R_target target_R_ee = cam_R_base base_R_ee`` for all of (n, 3, 3).
+
+    As quaternions ``Q(a) x = W(b) z``; the least sum of squared differences under unit lengths is at the singular
+    vectors of ``sum Q(a)ᵀ W(b)`` with the largest value.  A quaternion and its negative are the same rotation: signs
+    are chosen by motions against the first pose, which the two sides turn by the same angle.
+    """
+    a = Rotation.from_matrix(cam_R_target).as_quat()
+    b = Rotation.from_matrix(base_R_ee).as_quat()
+    # Scalar part of q q_first⁻¹: the quaternions' inner product.
+    b = b * np.where((a @ a[0]) * (b @ b[0]) < 0.0, -1.0, 1.0)[:, None]
+    total = np.einsum("nji,njk->ik", _left(a), _right(b))
+    left, _, right = np.linalg.svd(total)
+    x, z = left[:, 0], right[0]
+    return Rotation.from_quat(z).as_matrix(), Rotation.from_quat(x).as_matrix()
+
+
+def translations(cam_T_target: Array, base_T_ee: Array, cam_R_base: Array) -> tuple[Array, Array]:
+    """Positions (3,) of ``cam_T_base`` and ``target_T_ee``, linear least squares of
+    ``cam_R_target x + cam_t_target = cam_R_base base_t_ee + z``.
+    """
+    count = len(cam_T_target)
+    rows = np.concatenate([np.tile(np.eye(3), (count, 1, 1)), -cam_T_target[:, :3, :3]], axis=2).reshape(-1, 6)
+    sides = (cam_T_target[:, :3, 3] - base_T_ee[:, :3, 3] @ cam_R_base.T).ravel()
+    found = np.linalg.lstsq(rows, sides, rcond=None)[0]
+    return found[:3], found[3:]
+
+
+def refine(
+    cam_T_target: Array, base_T_ee: Array, start: tuple[Array, Array], covariance: Array | None = None
+) -> RobotWorld:
+    """All twelve unknowns at once, robustly.  ``covariance`` (n, 6, 6) of the measured ``cam_T_target`` (position then
+    rotation, camera axes), believed up to a common scale; without it positions and rotations are weighed by what their
+    residuals show.
+    """
+    cam_T_base, ee_T_target = start
+    count = len(cam_T_target)
+    if 6 * count <= 12:
+        raise CalibrationError(f"{count} pose(s); at least {FEWEST_POSES}, better ten")
+    whiten = None if covariance is None else np.linalg.inv(np.linalg.cholesky(covariance))
+    used = np.ones(count, dtype=bool)
+    for turn in range(_ROUNDS):
+        values = residuals(cam_T_target, base_T_ee, cam_T_base, ee_T_target)
+        root = whiten if whiten is not None else _weights_of(values[used])
+        weights = _biweight(_sizes(root, values), 6) if count > FEWEST_POSES else np.ones(count)
+        before = cam_T_base, ee_T_target
+        cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, before, root, weights)
+        if (
+            turn > 2
+            and np.allclose(before[0], cam_T_base, atol=1e-12)
+            and np.allclose(before[1], ee_T_target, atol=1e-12)
+        ):
+            break
+    sizes = _sizes(root, residuals(cam_T_target, base_T_ee, cam_T_base, ee_T_target))
+    if count > FEWEST_POSES:
+        # The unknowns take their share of the residuals away.
+        left = np.sqrt(1.0 - 2.0 / count)
+        used = sizes <= np.sqrt(chi2.isf(FALSE_OUTLIERS / count, 6)) * _scale(sizes, 6) / left
+    if used.sum() < FEWEST_POSES:
+        raise CalibrationError(f"{int(used.sum())} of {count} poses agree with each other; at least {FEWEST_POSES}")
+    cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used.astype(float))
+    return _conclude(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used)
+
+
+def residuals(cam_T_target: Array, base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
+    """(n, 6): measured against predicted ``cam_T_target``, position and rotation, camera axes."""
+    predicted = cam_T_base @ base_T_ee @ ee_T_target
+    out = np.empty((len(predicted), 6))
+    out[:, :3] = cam_T_target[:, :3, 3] - predicted[:, :3, 3]
+    out[:, 3:] = Rotation.from_matrix(cam_T_target[:, :3, :3] @ predicted[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
+    return out
+
+
+def slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
+    """Derivatives (n, 6, 12) of predicted ``cam_T_target`` by perturbations of ``cam_T_base`` and ``ee_T_target``."""
+    predicted = cam_T_base @ base_T_ee @ ee_T_target
+    cam_R_ee = cam_T_base[:3, :3] @ base_T_ee[:, :3, :3]
+    out = np.zeros((len(predicted), 6, 12))
+    out[:, :3, :3] = out[:, 3:, 3:6] = np.eye(3)
+    out[:, :3, 3:6] = -skew(predicted[:, :3, 3] - cam_T_base[:3, 3])
+    out[:, :3, 6:9] = out[:, 3:, 9:] = cam_R_ee
+    return out
+
+
+def _minimise(
+    cam_T_target: Array, base_T_ee: Array, start: tuple[Array, Array], whiten: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Gauss-Newton, halved where it overshoots."""
+
+    def cost(at: tuple[Array, Array]) -> float:
+        return float((weights * np.square(_sizes(whiten, residuals(cam_T_target, base_T_ee, *at)))).sum())
+
+    here, best = start, cost(start)
+    for _ in range(_ITERATIONS):
+        a = (whiten @ slopes(base_T_ee, *here)) * np.sqrt(weights)[:, None, None]
+        values = (whiten @ residuals(cam_T_target, base_T_ee, *here)[:, :, None])[:, :, 0]
+        b = values * np.sqrt(weights)[:, None]
+        step = np.linalg.lstsq(a.reshape(-1, 12), b.ravel(), rcond=None)[0]
+        for _ in range(15):
+            trial = perturb(here[0], step[:6]), perturb(here[1], step[6:])
+            new = cost(trial)
+            if new <= best:
+                break
+            step = 0.5 * step
+        else:
+            return here
+        gain, here, best = best - new, trial, new
+        if gain <= 1e-12 * best:
+            break
+    return here
+
+
+def _conclude(
+    cam_T_target: Array, base_T_ee: Array, at: tuple[Array, Array], whiten: Array, used: NDArray[np.bool_]
+) -> RobotWorld:
+    a = (whiten @ slopes(base_T_ee, *at))[used].reshape(-1, 12)
+    values = residuals(cam_T_target, base_T_ee, *at)
+    freedom = 6 * int(used.sum()) - 12
+    size = np.linalg.norm(a, axis=0)
+    variance = max(float(np.square(_sizes(whiten, values)[used]).sum()) / freedom, 1e-18)
+    covariance = variance * np.linalg.inv((a / size).T @ (a / size)) / np.outer(size, size)
+    return RobotWorld(at[0], at[1], covariance, values, used, freedom)
+
+
+def _check_turns(cam_T_target: Array, base_T_ee: Array) -> None:
+    if len(base_T_ee) < FEWEST_POSES:
+        raise CalibrationError(f"{len(base_T_ee)} pose(s); at least {FEWEST_POSES}, better ten")
+    for which, poses in (("arm's", base_T_ee), ("target's", cam_T_target)):
+        turns = (poses[:, :3, :3] - poses[:, :3, :3].mean(axis=0)).reshape(-1, 3)
+        moved = np.linalg.svd(turns, compute_uv=False) / np.sqrt(len(poses))
+        if moved[2] < LEAST_TURN_RAD:
+            raise CalibrationError(
+                f"the {which} poses are turned about one axis only, or not at all; poses turned about at least two axes"
+            )
+
+
+def _weights_of(values: Array) -> Array:
+    """(6, 6), makes residuals unit: positions and rotations by their own robust scale."""
+    sizes = [_scale(np.linalg.norm(part, axis=1), 3) for part in (values[:, :3], values[:, 3:])]
+    return np.diag(1.0 / np.repeat(sizes, 3))
+
+
+def _sizes(whiten: Array, values: Array) -> Array:
+    out: Array = np.linalg.norm((whiten @ values[:, :, None])[:, :, 0], axis=1)
+    return out
+
+
+def _biweight(sizes: Array, freedom: int) -> Array:
+    # Lengths of six coordinates: their usual one is what one coordinate's standard deviation is otherwise.
+    share = np.minimum(sizes / (BIWEIGHT * _scale(sizes, freedom) * np.sqrt(freedom / 2.0)), 1.0)
+    out: Array = np.square(1.0 - np.square(share))
+    return out
+
+
+def _scale(sizes: Array, freedom: int) -> float:
+    """Standard deviation of one coordinate from lengths of vectors of so many: their median against the chi one's."""
+    return max(float(np.median(sizes)) / float(np.sqrt(chi2.median(freedom))), 1e-12)
+
+
+def _left(q: Array) -> Array:
+    """(n, 4, 4): the matrices of multiplication by quaternions x y z w from the left."""
+    x, y, z, w = q.T
+    return np.stack([np.stack(row, -1) for row in ((w, -z, y, x), (z, w, -x, y), (-y, x, w, z), (-x, -y, -z, w))], 1)
+
+
+def _right(q: Array) -> Array:
+    """(n, 4, 4): the same from the right."""
+    x, y, z, w = q.T
+    return np.stack([np.stack(row, -1) for row in ((w, z, -y, x), (-z, w, x, y), (y, -x, w, z), (-x, -y, -z, w))], 1)

@@ -1,0 +1,158 @@
+"""Robot-world and hand-eye at once: exact without noise, honest with it, degenerate poses named, the command's file."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from gripmon.calibration import robot_world
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.cli import main
+from gripmon.geometry import invert, make_transform, perturb, perturbation_between
+
+
+def transform(rng, reach_m=0.5):
+    return make_transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-reach_m, reach_m, 3))
+
+
+def poses(seed, count=12, turn_rad=0.6):
+    """cam_T_base, ee_T_target, base_T_ee and what the camera sees."""
+    rng = np.random.default_rng(seed)
+    cam_T_base, ee_T_target, first = transform(rng), transform(rng, 0.1), transform(rng)
+    base_T_ee = np.stack(
+        [
+            make_transform(Rotation.from_rotvec(rng.normal(0.0, turn_rad, 3)).as_matrix() @ first[:3, :3],
+                           first[:3, 3] + rng.uniform(-0.3, 0.3, 3))
+            for _ in range(count)
+        ]
+    )  # fmt: skip
+    return cam_T_base, ee_T_target, base_T_ee, cam_T_base @ base_T_ee @ ee_T_target
+
+
+def noisy(cam_T_target, sigma, seed):
+    rng = np.random.default_rng(seed + 1000)
+    return np.stack([perturb(T, sigma * rng.normal(size=6)) for T in cam_T_target])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_the_closed_form_is_exact_without_noise_whatever_the_quaternions_signs(seed):
+    cam_T_base, ee_T_target, base_T_ee, cam_T_target = poses(seed, 3 + seed)
+    found = robot_world.solve(cam_T_target, base_T_ee)
+    assert np.abs(found[0] - cam_T_base).max() < 1e-9
+    assert np.abs(found[1] - ee_T_target).max() < 1e-9
+    assert np.abs(robot_world.residuals(cam_T_target, base_T_ee, *found)).max() < 1e-9
+
+
+def test_slopes_are_those_of_central_differences():
+    cam_T_base, ee_T_target, base_T_ee, cam_T_target = poses(3)
+    step = 1e-6
+
+    def at(change):
+        return robot_world.residuals(
+            cam_T_target, base_T_ee, perturb(cam_T_base, change[:6]), perturb(ee_T_target, change[6:])
+        )
+
+    numeric = np.stack([(at(step * e) - at(-step * e)) / (2.0 * step) for e in np.eye(12)], axis=2)
+    assert np.abs(robot_world.slopes(base_T_ee, cam_T_base, ee_T_target) + numeric).max() < 1e-7
+
+
+SIGMA = np.array([1e-3, 1e-3, 3e-3, 4e-3, 4e-3, 1e-3])
+
+
+def test_errors_are_what_the_covariance_says_and_smaller_than_the_closed_form_s():
+    sizes, closed, refined = [], [], []
+    covariance = np.tile(np.diag(np.square(SIGMA)), (12, 1, 1))
+    for seed in range(60):
+        cam_T_base, _, base_T_ee, exact = poses(seed)
+        seen = noisy(exact, SIGMA, seed)
+        start = robot_world.solve(seen, base_T_ee)
+        found = robot_world.refine(seen, base_T_ee, start, covariance)
+        error = perturbation_between(found.cam_T_base, cam_T_base)
+        sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
+        closed.append(perturbation_between(start[0], cam_T_base))
+        refined.append(error)
+    assert 0.75 < np.mean(sizes) < 1.4
+    assert np.sqrt(np.mean(np.square(refined))) < 0.8 * np.sqrt(np.mean(np.square(closed)))
+
+
+def test_wrong_poses_are_left_out():
+    cam_T_base, _, base_T_ee, exact = poses(5, 20)
+    seen = noisy(exact, 0.1 * SIGMA, 5)
+    for k in (3, 11):
+        seen[k] = perturb(seen[k], np.array([0.05, 0.0, 0.1, 0.0, 0.3, 0.0]))
+    found = robot_world.refine(seen, base_T_ee, robot_world.solve(seen, base_T_ee))
+    assert np.flatnonzero(~found.used).tolist() == [3, 11]
+    assert np.abs(perturbation_between(found.cam_T_base, cam_T_base)).max() < 2e-3
+
+
+def test_degenerate_poses_are_named():
+    cam_T_base, ee_T_target, base_T_ee, cam_T_target = poses(1)
+    with pytest.raises(CalibrationError, match=r"2 pose\(s\); at least 3"):
+        robot_world.solve(cam_T_target[:2], base_T_ee[:2])
+    one_axis = base_T_ee.copy()
+    for k in range(len(one_axis)):
+        one_axis[k, :3, :3] = Rotation.from_rotvec([0.0, 0.0, 0.1 * k]).as_matrix() @ base_T_ee[0, :3, :3]
+    with pytest.raises(CalibrationError, match="about one axis only"):
+        robot_world.solve(cam_T_base @ one_axis @ ee_T_target, one_axis)
+
+
+def columns(prefix, T):
+    names = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
+    values = [*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()]
+    return {prefix + name: float(value) for name, value in zip(names, values, strict=True)}
+
+
+def write(path, base_T_ee, cam_T_target):
+    rows = [{**columns("", T), **columns("cam_", C)} for T, C in zip(base_T_ee, cam_T_target, strict=True)]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return str(path)
+
+
+def test_the_command_writes_both_transforms(tmp_path, capsys):
+    cam_T_base, ee_T_target, base_T_ee, exact = poses(4)
+    table, out = write(tmp_path / "poses.csv", base_T_ee, noisy(exact, np.full(6, 2e-4), 4)), tmp_path / "rw.yaml"
+    assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 0
+    written = yaml.safe_load(out.read_text())
+    for name, truth in (("cam_T_base", cam_T_base), ("ee_T_target", ee_T_target), ("base_T_cam", invert(cam_T_base))):
+        assert np.abs(np.array(written["transforms"][name]["translation_m"]) - truth[:3, 3]).max() < 2e-3
+    assert written["residuals"]["poses"] == 12 and len(written["covariance"]) == 144
+    assert " of 12 poses, RMS 0." in capsys.readouterr().out
+    assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 2
+
+
+def test_a_camera_on_the_hand(tmp_path):
+    rng = np.random.default_rng(8)
+    ee_T_cam, base_T_target = transform(rng, 0.1), transform(rng)
+    _, _, base_T_ee, _ = poses(8)
+    cam_T_target = np.stack([invert(T @ ee_T_cam) @ base_T_target for T in base_T_ee])
+    table, out = write(tmp_path / "poses.csv", base_T_ee, cam_T_target), tmp_path / "rw.yaml"
+    assert main(["calibrate", "robot-world", table, "--eye-in-hand", "--out", str(out)]) == 0
+    written = yaml.safe_load(out.read_text())["transforms"]
+    assert np.abs(np.array(written["ee_T_cam"]["translation_m"]) - ee_T_cam[:3, 3]).max() < 1e-6
+    assert np.abs(np.array(written["base_T_target"]["translation_m"]) - base_T_target[:3, 3]).max() < 1e-6
+
+
+def test_bad_tables_end_with_one_line(tmp_path, capsys):
+    _, _, base_T_ee, cam_T_target = poses(4)
+    far = base_T_ee.copy()
+    far[:, :3, 3] *= 1000.0
+    out = tmp_path / "rw.yaml"
+    (tmp_path / "arm.csv").write_text("tx_m,ty_m,tz_m,qx,qy,qz,qw\n0,0,0,0,0,0,1\n")
+    (tmp_path / "image.csv").write_text("image,tx_m,ty_m,tz_m,qx,qy,qz,qw\na.png,0,0,0,0,0,0,1\n")
+    for table, code, text in (
+        (write(tmp_path / "mm.csv", far, cam_T_target), 2, "millimetres? metres"),
+        (str(tmp_path / "arm.csv"), 2, "has neither cam_tx_m"),
+        (str(tmp_path / "image.csv"), 2, "--camera and --target"),
+        (write(tmp_path / "two.csv", base_T_ee[:2], cam_T_target[:2]), 3, "2 pose(s); at least 3"),
+    ):
+        assert main(["calibrate", "robot-world", table, "--out", str(out)]) == code
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1 and text in said[0]
+        assert not out.exists()
