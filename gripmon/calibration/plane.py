@@ -25,6 +25,8 @@ from gripmon.records import Array
 
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
+LARGEST_RMS_SHARE = 0.005
+"""Root mean square residual of the plate's points over the image's width beyond which they aren't explained at all."""
 _STEP = 0.05
 """Central differences reach so many standard deviations."""
 
@@ -126,6 +128,11 @@ def calibrate_plane(
     """
     _check_count(corners, known)
     cam_T_plate, plate_covariance, bundle = plate_pose(camera.lens, sighting)
+    if bundle.rms_px > LARGEST_RMS_SHARE * camera.lens.width_px:
+        raise CalibrationError(
+            f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, and "
+            "the target as it is"
+        )
     made = make_camera(camera.lens)
     given = _Given(made, cam_T_plate, corners.uv_px)
     each_px2 = corners.each_px2

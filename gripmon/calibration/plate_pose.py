@@ -30,7 +30,7 @@ def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, 
             failure = failure or error
     if not found:
         raise failure or CalibrationError("the plate's pose can't be found")
-    bundle = min(found, key=merit)
+    bundle = min(found, key=_typical_px)
     return bundle.cam_T_plate[0], bundle.covariance, bundle
 
 
@@ -79,6 +79,12 @@ def _plate_pose_starts(lens_model: LensModel, parameters: Array, sighting: Sight
     if not out:
         raise CalibrationError("the plate's pose can't be found")
     return out
+
+
+def _typical_px(bundle: Bundle) -> float:
+    """Median residual of all points: a wrong pose leaves none out, as all of them are far off alike."""
+    sizes = np.linalg.norm(np.concatenate(bundle.residuals_px), axis=1)
+    return float(np.median(np.where(np.isfinite(sizes), sizes, np.inf)))
 
 
 def merit(bundle: Bundle) -> tuple[float, float]:

@@ -33,9 +33,9 @@ LARGEST_REACH_SHARE = 0.25
 """Of the edge's length: beyond that it is more likely another one."""
 FINAL_REACH_PX = 5.0
 END_MARGIN_PX = 4.0
-SEEN_SHARE = 0.5
+SEEN_SHARE = 0.4
 """Part of its profiles that must show an edge."""
-SMALLEST_ANGLE_RAD = 0.2
+SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
 _GRID_PX = 0.5
 _START_PX = 1.0
