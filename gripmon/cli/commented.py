@@ -7,21 +7,21 @@ from typing import Any
 
 import msgspec
 
-_WIDTH = 120
 
-
-def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False, only: frozenset[str] | None = None) -> str:
+def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
     """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
 
-    ``only``: the keys that are written.  Keys without value are left out.
+    Keys without value are left out.
     """
     lines = []
     tag = type(settings).__struct_config__
     if tag.tag_field is not None and not off:
         lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
-    for field in msgspec.inspect.type_info(type(settings)).fields:  # type: ignore[union-attr]
+    section = msgspec.inspect.type_info(type(settings))
+    assert isinstance(section, msgspec.inspect.StructType)
+    for field in section.fields:
         value = getattr(settings, field.name)
-        if value is None or (only is not None and field.encode_name not in only):
+        if value is None:
             continue
         if isinstance(value, msgspec.Struct):
             lines.append(_line(indent, field.encode_name, "", "", off))

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from gripmon.records import ReferenceRecord
     from gripmon.teaching.corner_pose import CornerPose
 
+_UNITS = """\
+# Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
+_JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or ros2_joint_state"
 _AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
 
 
@@ -38,8 +41,7 @@ def config_text(
     assert source is not None
     parts = [
         f"# Written by: {inputs.command} (gripmon {__version__})",
-        "# Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (centre of the top-left "
-        "pixel: 0, 0).",
+        _UNITS,
         f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
         f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
         "",
@@ -52,7 +54,10 @@ def config_text(
         parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
     parts += ["", _reference(reference, measured_here), "", "source:"]
     if isinstance(source, FolderSettings):
-        parts += ["  kind: folder  # images in a folder", f"  path: {yaml_value(folder(Path(source.path)))}  # relative"]
+        parts += [
+            "  kind: folder  # images in a folder",
+            f"  path: {yaml_value(folder(Path(source.path)))}  # relative",
+        ]
         parts[-1] += " to this file"
     else:
         parts.append(lines_of(source, 2))
@@ -65,7 +70,9 @@ def config_text(
 def with_taught(path: Path, taught: str) -> str:
     """A configuration's own text with a line more, which names the taught model."""
     text = path.read_text(encoding="utf-8-sig")
-    return f"{text.rstrip()}\n\ntaught: {yaml_value(taught)}  # what the edges really look like; relative to this file\n"
+    return (
+        f"{text.rstrip()}\n\ntaught: {yaml_value(taught)}  # what the edges really look like; relative to this file\n"
+    )
 
 
 def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
@@ -95,8 +102,7 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
         return "jaw:\n  source: frames  # the opening comes with each image (timestamps.csv)"
     lines = [
         "jaw:",
-        "  source: fixed  # the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or "
-        "ros2_joint_state",
+        f"  source: fixed  # {_JAW_SOURCES}",
     ]
     if opening_m is not None:
         how = "as given" if known else "as the image showed it; better what the robot says"

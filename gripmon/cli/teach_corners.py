@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
     from gripmon.teaching.bench import Found
 
+_LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
@@ -51,15 +52,15 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Serve until the person is done."""
+    from gripmon.cli.teach_inputs import live_settings
     from gripmon.cli.teach_saving import FileSaving
-    from gripmon.sources import LiveSettings, SourceError, open_source
+    from gripmon.sources import SourceError, open_source
     from gripmon.teachpage import Desk, PageServer
 
     live = None
     if arguments.live is not None:
-        assert isinstance(inputs.source, LiveSettings)
         try:
-            live = open_source(inputs.source)
+            live = open_source(live_settings(arguments.live, inputs.bench.camera))
         except SourceError as error:
             raise common.CommandFailedError(f"--live: {error}", common.EXIT_USAGE) from None
     saving = FileSaving(inputs)
@@ -76,7 +77,8 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
         print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
         if not arguments.no_browser and _has_display():
             webbrowser.open(server.url)
-        server.done.wait()
+        while not server.done.wait(_LOOK_S):
+            pass  # an interrupt that another thread has caught is heard of here
     finally:
         server.close()
         desk.close()
@@ -142,7 +144,9 @@ def _table(found: Found) -> list[str]:
             "with a plate (gripmon calibrate plane)"
         )
         if found.pose.rival:
-            lines.append("note: another pose explains these corners as well; a corner outside of their plane would tell")
+            lines.append(
+                "note: another pose explains these corners as well; a corner outside of their plane would tell"
+            )
     expected = found.prospects
     if expected is not None:
         lines.append(f"expected of a frame   {_axes(expected.sigma)}")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -75,16 +77,11 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
 
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file; a fault ends the command with exit code 2."""
-    from gripmon.config.typed import SettingsError, to_settings
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.config.typed import to_settings
     from gripmon.teaching.bench import RoughCorners, rough_fault
 
-    try:
-        rough = to_settings(read_yaml(path), RoughCorners)
-    except SettingsError as error:
-        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
-    except ValueError as error:  # of the file itself
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    with _faults_of(path):
+        rough = to_settings(_yaml(path), RoughCorners)
     fault = rough_fault(rough.corners, gripper)
     if fault is not None:
         raise common.CommandFailedError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}", common.EXIT_USAGE)
@@ -197,9 +194,7 @@ def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, na
 
     transform = reference.cam_T_grip
     settings = ReferenceSettings(
-        cam_T_grip=TransformSettings(
-            translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw
-        ),
+        cam_T_grip=TransformSettings(translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw),
         covariance=reference.covariance,
     )
     pose, covariance = reference_transform(settings), covariance_of(settings)
@@ -217,23 +212,18 @@ def _yaml(path: Path) -> dict[str, object]:
     return read_yaml(path)
 
 
-class _faults_of:  # noqa: N801  used like a function
+@contextlib.contextmanager
+def _faults_of(path: Path) -> Iterator[None]:
     """What is wrong with a file's contents ends the command with exit code 2."""
+    from gripmon.config import ConfigError
+    from gripmon.config.typed import SettingsError
 
-    def __init__(self, path: Path):
-        self._path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        from gripmon.config import ConfigError
-        from gripmon.config.typed import SettingsError
-
-        if isinstance(error, ConfigError):
-            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
-        if isinstance(error, SettingsError):
-            raise common.CommandFailedError(f"{self._path}: {error}", common.EXIT_USAGE) from None
+    try:
+        yield
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    except SettingsError as error:
+        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
 
 
 def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
@@ -282,14 +272,21 @@ def _opening(path: Path, gripper: Gripper, config: Config | None, given_m: float
     return opening_m
 
 
+def live_settings(device: str, camera: Camera) -> LiveSettings:
+    """A camera that is asked for images of the calibration's size."""
+    from gripmon.sources import LiveSettings
+
+    named = int(device) if device.isdecimal() else device
+    return LiveSettings(device=named, width_px=camera.width_px, height_px=camera.height_px)
+
+
 def _source(arguments: argparse.Namespace, camera: Camera) -> FolderSettings | LiveSettings:
     """Where the monitor will find its frames: the live camera, or the images' folder."""
-    from gripmon.sources import FolderSettings, LiveSettings
+    from gripmon.sources import FolderSettings
 
-    if arguments.live is None:
-        return FolderSettings(path=str(Path(arguments.images[0]).parent))
-    device = int(arguments.live) if arguments.live.isdecimal() else arguments.live
-    return LiveSettings(device=device, width_px=camera.width_px, height_px=camera.height_px)
+    if arguments.live is not None:
+        return live_settings(arguments.live, camera)
+    return FolderSettings(path=str(Path(arguments.images[0]).parent))
 
 
 def _command(arguments: argparse.Namespace) -> str:

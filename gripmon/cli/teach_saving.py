@@ -59,7 +59,8 @@ class FileSaving:
         """As :class:`gripmon.teachpage.Saving`."""
         from gripmon.teachpage import Saved, SavingRefused
 
-        paths, notes = self._paths, []
+        paths = self._paths
+        notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
         if not wanted:
             raise SavingRefused("nothing is to be saved; at least one of the files")
@@ -180,7 +181,7 @@ class FileSaving:
 
         lines = [
             f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
-            "# For gripmon calibrate plane --corners and gripmon teach --corners; name: [column, row] in the image (px)",
+            "# For gripmon calibrate plane --corners, gripmon teach --corners; name: [column, row] in the image (px)",
             "corners:",
         ]
         for corner in found.snapped.corners:

@@ -72,13 +72,14 @@ def pose_from_corners(
     every = [*measured, *hand]
     taken = np.isin(np.arange(len(snapped.corners)), measured)
     uv_px = np.array([snapped.corners[i].uv_px for i in measured] + [by_hand_px[snapped.corners[i].name] for i in hand])
-    joint, of_edges = found.corners.joint_covariance_xy(taken), np.zeros((6, 6))
+    joint: Array = found.corners.joint_covariance_xy(taken)
+    of_edges: Array = np.zeros((6, 6))
     by_edges = refusal(gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]) is not None
     if by_edges:
         # All corners where the edges' joint fit has them: its covariance is the measurement's.
         every = [i for i, c in enumerate(snapped.corners) if np.isfinite(c.model_px).all()]
         uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
-        joint, of_edges = np.zeros((2 * len(every), 2 * len(every))), found.covariance[:6, :6]
+        joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
     covariance_xy = _covariance(camera, uv_px, joint, found.cam_T_grip[2, 3])
     given = _Given(camera, snapped.jaw_opening_m)
 
@@ -88,12 +89,12 @@ def pose_from_corners(
         return pose.cam_T_grip, pose.covariance, pose.weighted_rms
 
     try:
-        cam_T_grip, covariance, weighted_rms = solve(given)
+        cam_T_grip, of_corners, weighted_rms = solve(given)
         slopes = [_slope(solve, way) for way in _ways(given, gripper, snapped.jaw_sigma_m, camera_error)]
     except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
         raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
     # What contradicts itself is at least as wrong as it looks.
-    covariance = covariance * max(weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
+    covariance = of_corners * max(weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
     points_m = gripper.points_grip_m(given.jaw_opening_m)[gripper.corner_points[every]]
     alike = rivals(solutions(points_m, camera.undistort(uv_px), covariance_xy), len(every))
     names = () if by_edges else tuple(snapped.corners[i].name for i in every)

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
@@ -81,9 +82,9 @@ def place(
     names = [name for name in gripper.corner_ids if name in put_px]
     uv_px = np.array([put_px[name] for name in names], dtype=float).reshape(-1, 2)
     xy = camera.undistort(uv_px) if len(uv_px) else uv_px
-    known = np.isfinite(xy).all(axis=1)
-    names, xy = [name for name, k in zip(names, known, strict=True) if k], xy[known]
-    points = gripper.corner_points[[gripper.corner_ids.index(name) for name in names]] if names else []
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(xy).all(axis=1))
+    names, xy = [name for name, inside in zip(names, known.tolist(), strict=True) if inside], xy[known]
+    points = gripper.corner_points[np.array([gripper.corner_ids.index(name) for name in names], dtype=np.intp)]
     points_m = gripper.points_grip_m(jaw_opening_m)[points].reshape(-1, 3)
     weight = (0.5 * (camera.fx_px + camera.fy_px) / rough_sigma_px(camera)) ** 2
     found: list[Placed] = []
@@ -114,9 +115,7 @@ def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator
     yield from (pose.cam_T_grip for pose in found)
 
 
-def _settle(
-    start: Array, points_m: Array, xy: Array, weight: float, prior: Prior
-) -> tuple[Array, Array, float] | None:
+def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
     """Levenberg-Marquardt on the weighted image error and the prior; None where it leads behind the camera."""
     information = np.linalg.inv(prior.covariance)
     pose, damping = start, 1e-3

@@ -116,7 +116,9 @@ class Snapper:
             return self._rough(placed[0], jaw_opening_m, why)
         return self._measured(found, jaw_opening_m)
 
-    def _found(self, image: Image, placed: Sequence[Placed], jaw_opening_m: float, reported: bool) -> Measurement | None:
+    def _found(
+        self, image: Image, placed: Sequence[Placed], jaw_opening_m: float, reported: bool
+    ) -> Measurement | None:
         """The best of what is measured from each of the poses."""
         best: Measurement | None = None
         for pose in placed[:2]:

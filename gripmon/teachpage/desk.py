@@ -86,7 +86,7 @@ class Desk:
         self._bench, self._labels, self._saving, self._live = bench, labels, saving, live
         self._pictures = list(pictures)
         self._newest: Picture | None = None
-        self._why_dark = "the camera has sent nothing yet"
+        self._why_dark: str | None = None
         self._lock = threading.Lock()  # one reckons at a time: OpenCV and NumPy would only hinder each other
         self._arrived = threading.Condition()
         self._ended = False
@@ -146,14 +146,17 @@ class Desk:
         return self._infos()
 
     def save(self, order: SaveOrder) -> Saved:
-        """Write what was taught.  Raises :class:`BadRequest` and :class:`SavingRefused`."""
+        """Write what was taught, or say why not.  Raises :class:`BadRequest`."""
         if not self._pictures:
             self.take()
         number = order.put.image if order.put.image is not None else len(self._pictures) - 1
         picture = self._picture(number)
         found = self._found(order.put, picture)
         with self._lock:
-            return self._saving.save(order, found, number, tuple(self._pictures))
+            try:
+                return self._saving.save(order, found, number, tuple(self._pictures))
+            except SavingRefused as refused:
+                return Saved(refused=str(refused))
 
     def still(self, number: int) -> bytes:
         """An image as PNG.  Raises :class:`BadRequest`."""
@@ -184,9 +187,9 @@ class Desk:
         if self._live is None:
             raise BadRequest("there is no live camera here; the number of an image")
         with self._arrived:
-            self._arrived.wait_for(lambda: self._newest is not None or self._ended, _LIVE_WAIT_S)
+            self._arrived.wait_for(lambda: self._newest or self._why_dark or self._ended, _LIVE_WAIT_S)
             if self._newest is None:
-                raise BadRequest(self._why_dark)
+                raise BadRequest(self._why_dark or "the camera has sent nothing yet")
             return self._newest
 
     def _infos(self) -> tuple[PictureInfo, ...]:
@@ -202,10 +205,12 @@ class Desk:
             if frame is None:
                 break
             with self._arrived:
+                # An old image would look like a camera that stands still.
+                self._newest = None
                 if isinstance(frame, Waiting):
                     self._why_dark = frame.reason
-                    continue
-                self._newest, self._why_dark = self._usable(frame), self._why_dark
+                else:
+                    self._newest = self._usable(frame)
                 self._arrived.notify_all()
 
     def _usable(self, frame: Frame) -> Picture | None:
@@ -214,6 +219,7 @@ class Desk:
             self._why_dark = f"{self._labels.live}: {fault[1]}"
             return None
         assert frame.image is not None
+        self._why_dark = None
         return Picture("live", frame.image, frame.jaw_opening_m, None)
 
 

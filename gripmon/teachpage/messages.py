@@ -124,10 +124,11 @@ class Reply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Saved(msgspec.Struct, frozen=True, kw_only=True):
-    """``exists``: files that are in the way, nothing was written then; else ``written`` (path: what was taught, in
-    words), ``notes`` and the command that comes ``next``.
+    """``refused``: why nothing was written; ``exists``: files in the way, nothing was written then either; else
+    ``written`` (path: what it is, in words), ``notes`` and the command that comes ``next``.
     """
 
+    refused: str | None = None
     exists: tuple[str, ...] = ()
     written: dict[str, str] = {}
     notes: tuple[str, ...] = ()

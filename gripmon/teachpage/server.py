@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from gripmon.teachpage.desk import BadRequest, Desk, SavingRefused
+from gripmon.teachpage.desk import BadRequest, Desk
 from gripmon.teachpage.messages import Failure, Nothing, Put, SaveOrder
 
 _log = logging.getLogger(__name__)
@@ -76,9 +76,7 @@ class _Shop:
     def __init__(self, desk: Desk, token: str, hosts: frozenset[str], done: threading.Event):
         self.desk, self.token, self.hosts, self.done = desk, token, hosts, done
         folder = importlib.resources.files("gripmon.teachpage") / "page"
-        self.files = {
-            name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()
-        }
+        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
         self.encoder = msgspec.json.Encoder()
 
 
@@ -110,6 +108,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_version, sys_version = "gripmon", ""
     timeout = _SILENT_S
     server: _Http
+    _last = False
 
     def do_GET(self) -> None:
         self._answer(self._get)
@@ -124,9 +123,8 @@ class _Handler(BaseHTTPRequestHandler):
             data, kind = act(self._checked_path())
         except _Refused as refused:
             status, data = refused.status, self._failure(str(refused))
-        except (BadRequest, SavingRefused) as refused:
-            status = HTTPStatus.CONFLICT if isinstance(refused, SavingRefused) else HTTPStatus.BAD_REQUEST
-            data = self._failure(str(refused))
+        except BadRequest as refused:
+            status, data = HTTPStatus.BAD_REQUEST, self._failure(str(refused))
         except (ConnectionError, TimeoutError):
             self.close_connection = True
             return
@@ -137,6 +135,8 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True  # what is left of its body is not read
         with contextlib.suppress(ConnectionError, TimeoutError):
             self._send(status, data, kind)
+        if self._last:
+            self.server.shop.done.set()
 
     def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
         self.send_response(status)
@@ -186,11 +186,15 @@ class _Handler(BaseHTTPRequestHandler):
             "look": lambda: desk.look(self._body(Put)),
             "take": lambda: self._body(Nothing) and desk.take(),
             "save": lambda: desk.save(self._body(SaveOrder)),
-            "done": lambda: self._body(Nothing) and shop.done.set(),
+            "done": lambda: self._end(self._body(Nothing)),
         }
         if path not in actions:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
         return shop.encoder.encode(actions[path]()), "application/json"
+
+    def _end(self, _order: Nothing) -> None:
+        """The process ends once this has been answered."""
+        self._last = self.close_connection = True
 
     def _body(self, kind: type[_T]) -> _T:
         if self.headers.get_content_type() != "application/json":
