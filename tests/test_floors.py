@@ -20,7 +20,7 @@ FLOORS = {
     "calibration": 1, "simulator": 1,
     "monitor": 2, "teaching": 2, "onboarding": 2, "outlook": 2,
     "wire": 3, "sources": 3, "publish": 3, "ros2": 3, "recording": 3, "playback": 3, "report": 3, "interchange": 3,
-    "client": 3, "statefile": 3, "metrics": 3, "export": 3,
+    "client": 3, "statefile": 3, "metrics": 3, "export": 3, "teachpage": 3,
     "daemon": 4, "config": 4,
     "cli": 5, "__main__": 6,
 }  # fmt: skip

@@ -8,18 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from meters import FISHEYE_LENS, box_gripper, difference
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from watched import reference_of
 
+from gripmon.calibration.documents import CameraCalibration, CameraResiduals
 from gripmon.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
+from gripmon.config.yaml_file import as_yaml
+from gripmon.corners.prediction import lay_out
 from gripmon.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
-from gripmon.outlook import Mount, Rig, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
+from gripmon.outlook import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
+from gripmon.provenance import provenance_of
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook
 
@@ -177,6 +183,17 @@ def test_from_the_side_one_finger_hides_the_other():
     assert all(name.startswith("L") for name in names), "the camera sits on the right finger's side"
 
 
+def test_edges_behind_another_finger_are_not_counted_on():
+    """The monitor lays its samples on them all the same; what they would add isn't promised."""
+    trial = tried(Mount(0.115, math.radians(70.0), math.radians(75.0), 0.0))
+    camera, gripper, settings, _ = rig()
+    layout = lay_out(camera, gripper, trial.cam_T_grip, 0.034, settings.corners.sampling)
+    assert trial.sight.edges < len(layout.edges)
+    told = expect(camera, gripper, settings, reference_of(trial.cam_T_grip), 0.034)
+    assert told.edges == trial.sight.edges
+    np.testing.assert_allclose(told.covariance, trial.covariance)
+
+
 def test_a_camera_that_looks_at_the_back_of_everything_sees_nothing():
     trial = tried(Mount(5.0, math.radians(32.0), 0.0, 0.0))
     assert trial.kind == "nowhere enough in view" and trial.covariance is None
@@ -247,6 +264,46 @@ def test_lenses_sides_and_rolls_are_axes_too(capsys: pytest.CaptureFixture[str])
     assert {round(math.degrees(m["roll_rad"])) for m in values["mounts"]} == {-90, 90}
     ranks = [(not m["works"], -m["jaw"]["share"] * (not m["works"])) for m in values["mounts"]]
     assert ranks == sorted(ranks)
+
+
+def camera_file(path: Path, lens: Any) -> Path:
+    """As gripmon calibrate intrinsics writes it."""
+    document = CameraCalibration(
+        camera=lens,
+        parameters=("fx_px",),
+        covariance=(0.01,),
+        residuals=CameraResiduals(rms_px=0.1, views=3, points=100, outliers=0),
+        target="chequerboard:9x6:0.025",
+        provenance=provenance_of("gripmon calibrate intrinsics", [], None),
+    )
+    path.write_text(as_yaml(msgspec.to_builtins(document)))
+    return path
+
+
+def test_calibrated_lenses_are_swept_with_their_distortion(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    half = msgspec.structs.replace(
+        STRONG_LENS, width_px=384, height_px=288, fx_px=380.0, fy_px=378.5, cx_px=189.85, cy_px=145.05
+    )
+    files = [str(camera_file(tmp_path / f"{k}.yaml", lens)) for k, lens in enumerate((STRONG_LENS, half))]
+    values = swept(capsys, "--distance", "0.11", "--tilt", "30", "--lens", files[0], "--lens", files[1])
+    whole, small = sorted(values["mounts"], key=lambda m: -m["image_px"][0])
+    for lens, mount, (u, v) in (
+        (STRONG_LENS, whole, values["tcp_at_px"]),
+        (half, small, np.array(values["tcp_at_px"]) / 2),
+    ):
+        at_px = make_camera(lens).project(np.array([mount["cam_T_grip"]["translation_m"]]))[0]
+        np.testing.assert_allclose(at_px, (u, v), atol=0.3)
+        assert mount["focal_px"] == lens.fx_px
+    assert small["sigma"]["tcp_m"][2] > whole["sigma"]["tcp_m"][2]
+
+
+def test_what_is_no_calibrated_lens_is_said_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    other = tmp_path / "other.yaml"
+    other.write_text("fx_px: 3")
+    for path in (other, tmp_path / "nothing.yaml"):
+        assert main(["check", str(DEMO), "--sweep", "--lens", str(path)]) == 2
+        said = capsys.readouterr().err
+        assert said.startswith(f"--lens {path}") and said.count("\n") == 1
 
 
 def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,8 @@ from gripmon.cli import common, sweep_table
 from gripmon.cli.margins import rig_of
 
 if TYPE_CHECKING:
+    from PIL.Image import Image
+
     from gripmon.camera import Camera
     from gripmon.config import Config
     from gripmon.outlook import Grid
@@ -50,11 +53,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--focal", metavar="RANGE", help="focal length, same sensor (px); any but the calibrated one without distortion"
     )
     lens.add_argument("--fov", metavar="RANGE", help="the same by the image's width (degrees)")
-    group.add_argument("--at", metavar="U,V", help="where in the image the TCP shows (px; default: where it shows now)")
+    lens.add_argument(
+        "--lens",
+        metavar="FILE",
+        action="append",
+        help="a calibrated one, by gripmon calibrate intrinsics; may be repeated",
+    )
+    group.add_argument(
+        "--at",
+        metavar="U,V",
+        help="where the TCP shows in the present camera's image (px; default: as now)",
+    )
     group.add_argument("--picture", metavar="FILE", help="draw the sweep (.png, .jpg)")
 
 
-_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "at", "picture")
+_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "picture")
 
 
 def refuse_without_sweep(arguments: argparse.Namespace) -> None:
@@ -72,6 +85,7 @@ def run(arguments: argparse.Namespace) -> int:
     if picture is not None:
         _check_picture(picture)
     from gripmon.outlook import Mount, tried, try_mount
+    from gripmon.outlook.picture import draw_sweep
 
     opening_m = config.jaw_opening_m
     present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m)
@@ -86,10 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print("\n".join(sweep_table.as_text(config, grid, at_px, present, ranked)))
     if picture is not None:
-        from gripmon.outlook.picture import draw_sweep
-
-        if not draw_sweep(picture, rig_of(config), grid, present, trials, opening_m):
-            raise common.not_writable(picture, OSError("the image library refused"), "--picture")
+        _write(picture, draw_sweep(rig_of(config), grid, present, trials, opening_m))
         if not arguments.json:
             print(f"picture    {picture}")
     return common.EXIT_DONE
@@ -98,7 +109,19 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_picture(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise common.CommandFailedError(f"--picture {path}: is no kind of picture; .png or .jpg", common.EXIT_USAGE)
-    common.check_file(path, "--picture")
+    if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
+        raise common.not_writable(path, OSError("is a folder" if path.is_dir() else "no such place"), "--picture")
+
+
+def _write(path: Path, picture: Image) -> None:
+    """Whole or not at all."""
+    from gripmon.atomic import write_atomically
+    from gripmon.outlook.picture import encoded
+
+    try:
+        write_atomically(path, encoded(picture, path.suffix))
+    except OSError as error:
+        raise common.not_writable(path, error, "--picture") from None
 
 
 def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
@@ -114,7 +137,7 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
     cameras = _cameras(config.camera, arguments)
     at_px = _spot(config, arguments.at)
     try:
-        directions = tuple(towards(camera, at_px) for camera in cameras)
+        directions = tuple(towards(camera, _same_place(at_px, config.camera, camera)) for camera in cameras)
     except ValueError as error:
         raise common.CommandFailedError(f"--at: {error}", common.EXIT_USAGE) from None
     grid = Grid(
@@ -145,6 +168,8 @@ def _turns(option: str, text: str | None, present_rad: float) -> tuple[float, ..
 def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
     from gripmon.outlook import with_focal
 
+    if arguments.lens is not None:
+        return [_calibrated(Path(name)) for name in arguments.lens]
     option, text = ("--focal", arguments.focal) if arguments.fov is None else ("--fov", arguments.fov)
     if text is None:
         return [camera]
@@ -157,6 +182,24 @@ def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
         return [with_focal(camera, focal_px) for focal_px in focals_px]
     except ValueError as error:
         raise common.CommandFailedError(f"{option} {text}: {error}", common.EXIT_USAGE) from None
+
+
+def _calibrated(path: Path) -> Camera:
+    """The camera in a file; a fault ends the command with exit code 2."""
+    from gripmon.camera import make_camera
+    from gripmon.config import ConfigError
+    from gripmon.config.calibrated import read_camera
+
+    try:
+        return make_camera(read_camera(path).camera)
+    except (ConfigError, ValueError) as error:
+        raise common.CommandFailedError(f"--lens {error}", common.EXIT_USAGE) from None
+
+
+def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tuple[float, float]:
+    """A point of one camera's image in that of another one, which may have more pixels, or fewer."""
+    (u, v), across, down = at_px, other.width_px / camera.width_px, other.height_px / camera.height_px
+    return (u + 0.5) * across - 0.5, (v + 0.5) * down - 0.5
 
 
 def _spot(config: Config, text: str | None) -> tuple[float, float]:

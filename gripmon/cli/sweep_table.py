@@ -41,6 +41,7 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
     angle = field_of_view_rad(camera)
     return {
         **trial.mount._asdict(),
+        "image_px": [camera.width_px, camera.height_px],
         "focal_px": camera.fx_px,
         "field_of_view_rad": None if math.isnan(angle) else angle,
         "cam_T_grip": {

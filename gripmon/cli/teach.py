@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
+import re
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,12 @@ and write it as a taught model.  Named in the configuration (`taught: taught.yam
 monitor compare like with like: what bevels, rounded edges, shading and blur shift the edges by
 cancels.  The reference is by definition the gripper's pose in these images.
 
+With --page a person drags rough corners onto the fingertips, on a web page that only this machine
+can open, sees the edges snap and what accuracy to expect, and saves the taught model together with
+a configuration for gripmon check and gripmon run; no configuration is needed for that, only the
+camera's calibration and the gripper file.  Without --reference the pose comes from the corners,
+less exactly than from a plate (gripmon calibrate plane).  --corners does the same without a page.
+
 Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
 in use, each before another background, some with the jaws opened otherwise."""
 
@@ -33,6 +40,11 @@ _EXAMPLES = """\
   gripmon teach first/*.png --config mine/arm1.yaml
   gripmon teach now.png --config mine/arm1.yaml --jaw-opening 0.034 --picture taught.png
   gripmon check mine/arm1.yaml
+
+a new robot, without any configuration: put corners on the fingertips, on a page in your browser
+  gripmon teach --page first/*.png --camera camera.yaml --gripper gripper.yaml --out mine
+  gripmon teach --page --live 0 --camera camera.yaml --gripper gripper.yaml --reference hand_eye.yaml
+  gripmon teach first.png --corners rough.yaml --camera camera.yaml --gripper gripper.yaml --out mine
 
 exit codes: 0 written; 2 wrong usage, configuration or image files; 3 these images can't be taught
 from, and why: nothing is written then"""
@@ -43,14 +55,13 @@ def add_parser(commands: Any) -> None:
     parser = common.add_command(
         commands, "teach", run, "learn how the gripper's edges look at the reference", _DESCRIPTION, _EXAMPLES
     )
-    parser.add_argument("images", nargs="+", metavar="IMAGE", help="image file at the reference calibration")
-    parser.add_argument(
-        "--config", required=True, metavar="CONFIG", help="configuration (YAML); its source section is not used"
-    )
+    parser.add_argument("images", nargs="*", metavar="IMAGE", help="image file at the reference calibration")
+    parser.add_argument("--config", metavar="CONFIG", help="configuration (YAML); its source section is not used")
     parser.add_argument(
         "--out",
         metavar="FILE",
-        help="file to write (default: what the configuration names under taught, else taught.yaml beside it)",
+        help="file to write (default: what the configuration names under taught, else taught.yaml beside it); with "
+        "--page or --corners the folder to write to (default: the configuration's, else this one)",
     )
     parser.add_argument(
         "--jaw-opening",
@@ -63,10 +74,44 @@ def add_parser(commands: Any) -> None:
         "--picture", metavar="FILE.png", help="also draw the first image with what was taught, offsets enlarged"
     )
     parser.add_argument("--force", action="store_true", help="replace the file if there is one")
+    _add_corner_options(parser)
+
+
+def _add_corner_options(parser: argparse.ArgumentParser) -> None:
+    """Those of teaching from corners that a person puts on the fingertips."""
+    page = parser.add_argument_group("corners by hand")
+    page.add_argument("--page", action="store_true", help="teach on a local web page")
+    page.add_argument("--corners", metavar="FILE", help="without a page: rough corners, `corners: {name: [u, v], …}`")
+    page.add_argument("--live", metavar="DEVICE", help="with --page: a camera instead of images, as in source.device")
+    page.add_argument("--camera", metavar="FILE", help="without --config: the camera's calibration")
+    page.add_argument("--gripper", metavar="FILE", help="without --config: the gripper file")
+    page.add_argument("--reference", metavar="FILE", help="without --config: calibration of hand and eye, if there is")
+    page.add_argument("--robot", type=_key, metavar="NAME", help="the robot's name in the configuration written")
+    page.add_argument("--camera-name", type=_key, metavar="NAME", help="the camera's name in it")
+    page.add_argument("--port", type=_port, default=0, metavar="N", help="port of the page (default: any free one)")
+    page.add_argument("--no-browser", action="store_true", help="print the page's address, but open no browser")
+
+
+def _key(text: str) -> str:
+    """A name that may stand in a key on the network."""
+    if not text or re.fullmatch(r"[^/*$#?@\s][^/*$#?\s]*", text) is None:
+        raise argparse.ArgumentTypeError(f"'{text}' is no name; no blank, none of / * $ # ?, no @ in front")
+    return text
+
+
+def _port(text: str) -> int:
+    if not (text.isdecimal() and int(text) <= 65535):
+        raise argparse.ArgumentTypeError(f"'{text}' is no port; a whole number, 0 (any free one) to 65535")
+    return int(text)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon teach``."""
+    if arguments.page or arguments.corners is not None or arguments.live is not None:
+        from gripmon.cli import teach_corners
+
+        return teach_corners.run(arguments)
+    _check_usage(arguments)
     import cv2
 
     from gripmon.teaching import TeachingImage, TeachingRefused, teach
@@ -93,6 +138,20 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture is not None:
         _draw(config, model, images[0], Path(arguments.picture))
     return common.EXIT_DONE
+
+
+def _check_usage(arguments: argparse.Namespace) -> None:
+    """Without corners by hand images and a configuration are needed; nothing else makes sense."""
+    if not arguments.images:
+        raise common.CommandFailedError("teach: no image; image files, or --page --live DEVICE", common.EXIT_USAGE)
+    if arguments.config is None:
+        raise common.CommandFailedError(
+            "teach: --config is missing; a configuration, or --page with --camera and --gripper", common.EXIT_USAGE
+        )
+    for option in ("camera", "gripper", "reference", "robot", "camera_name"):
+        if getattr(arguments, option) is not None:
+            name = option.replace("_", "-")
+            raise common.CommandFailedError(f"teach: --{name} goes with --page or --corners", common.EXIT_USAGE)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from pathlib import Path
+from io import BytesIO
 from typing import NamedTuple
 
 import cv2
@@ -53,12 +53,9 @@ class _Slice(NamedTuple):
 
 
 def draw_sweep(
-    path: Path, rig: Rig, grid: Grid, present: Trial, trials: list[Trial], jaw_opening_m: float | None
-) -> bool:
-    """Write the picture of a sweep; False if it can't be written.
-
-    The heat maps show the lens, side and roll of the best mount.
-    """
+    rig: Rig, grid: Grid, present: Trial, trials: list[Trial], jaw_opening_m: float | None
+) -> Pictures.Image:
+    """The picture of a sweep; its heat maps show the lens, side and roll of the best mount."""
     best = min(trials, key=lambda trial: trial.rank)
     shown = _slice_of(grid, trials, best)
     worst = max((trial for row in shown.trials for trial in row), key=lambda trial: trial.rank)
@@ -83,11 +80,14 @@ def draw_sweep(
         draw.text((left, below), name, _INK, _font(19))
         canvas.paste(picture, (left, below + 30))
         _caption(draw, trial, (left, below + 38 + picture.height), width)
-    try:
-        canvas.save(path, quality=_JPEG_QUALITY)
-    except OSError:
-        return False
-    return True
+    return canvas
+
+
+def encoded(picture: Pictures.Image, suffix: str) -> bytes:
+    """The picture in the format that a file's ending says, ``.png``, ``.jpg`` or ``.jpeg``."""
+    out = BytesIO()
+    picture.save(out, "PNG" if suffix.lower() == ".png" else "JPEG", quality=_JPEG_QUALITY)
+    return out.getvalue()
 
 
 def _slice_of(grid: Grid, trials: list[Trial], best: Trial) -> _Slice:

@@ -1,0 +1,142 @@
+"""The configuration that teaching writes: complete, with a comment at every key."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon import __version__
+from gripmon.cli.commented import lines_of, yaml_value
+
+if TYPE_CHECKING:
+    from gripmon.cli.teach_inputs import Inputs
+    from gripmon.records import ReferenceRecord
+    from gripmon.teaching.corner_pose import CornerPose
+
+_UNITS = """\
+# Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
+_JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or ros2_joint_state"
+_AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
+
+
+def config_text(
+    inputs: Inputs,
+    *,
+    robot: str,
+    camera_name: str,
+    reference: ReferenceRecord,
+    measured_here: CornerPose | None,
+    taught: str | None,
+    gripper: str,
+    jaw_opening_m: float | None,
+    jaw_known: bool,
+    folder: Callable[[Path], str],
+) -> str:
+    """A whole file; ``folder`` names a path as the file does."""
+    from gripmon.sources import FolderSettings
+
+    camera = inputs.bench.camera.settings
+    source = inputs.source
+    assert source is not None
+    parts = [
+        f"# Written by: {inputs.command} (gripmon {__version__})",
+        _UNITS,
+        f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
+        f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
+        "",
+        "camera:",
+        lines_of(camera, 2),
+        "",
+        f"gripper: {yaml_value(gripper)}  # path of the gripper file, relative to this file",
+    ]
+    if taught is not None:
+        parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
+    parts += ["", _reference(reference, measured_here), "", "source:"]
+    if isinstance(source, FolderSettings):
+        parts += [
+            "  kind: folder  # images in a folder",
+            f"  path: {yaml_value(folder(Path(source.path)))}  # relative",
+        ]
+        parts[-1] += " to this file"
+    else:
+        parts.append(lines_of(source, 2))
+    if inputs.bench.gripper.has_jaw:
+        parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
+    parts += ["", _defaults()]
+    return "\n".join(parts) + "\n"
+
+
+def with_taught(path: Path, taught: str) -> str:
+    """A configuration's own text with a line more, which names the taught model."""
+    text = path.read_text(encoding="utf-8-sig")
+    return (
+        f"{text.rstrip()}\n\ntaught: {yaml_value(taught)}  # what the edges really look like; relative to this file\n"
+    )
+
+
+def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
+    transform, covariance = reference.cam_T_grip, list(reference.covariance)
+    said = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
+    lines = ["reference:"]
+    if measured_here is not None:
+        seen = f"{len(measured_here.corners)} corners of" if measured_here.corners else "the edges in"
+        lines.append(f"  # measured from {seen} one image: a plate (gripmon calibrate plane) tells it more exactly")
+    lines += [
+        f"  id: {yaml_value(reference.reference_id)}  # name of this calibration in messages",
+        f"  cam_T_grip:{said}",
+        f"    translation_m: {yaml_value(list(transform.translation_m))}  # the TCP in the camera frame: x, y, z (m)",
+        f"    rotation_xyzw: {yaml_value(list(transform.rotation_xyzw))}  # unit quaternion x, y, z, w (no unit)",
+        "  covariance:  # of its error, 6x6 row by row: TCP's position (m²), then rotation (rad²), camera axes",
+        "    [",
+        *(f"      {', '.join(yaml_value(v) for v in covariance[6 * row : 6 * row + 6])}," for row in range(6)),
+        "    ]",
+    ]
+    return "\n".join(lines)
+
+
+def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
+    openings = [picture.jaw_opening_m for picture in inputs.pictures]
+    table = [(Path(p.path).parent / "timestamps.csv").exists() for p in inputs.pictures if p.path is not None]
+    if table and all(table) and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+        return "jaw:\n  source: frames  # the opening comes with each image (timestamps.csv)"
+    lines = [
+        "jaw:",
+        f"  source: fixed  # {_JAW_SOURCES}",
+    ]
+    if opening_m is not None:
+        how = "as given" if known else "as the image showed it; better what the robot says"
+        lines.append(f"  opening_m: {yaml_value(round(opening_m, 7))}  # jaw opening, {how} (m)")
+    return "\n".join(lines)
+
+
+def _in_table(inputs: Inputs) -> bool:
+    """Whether the images' own table has their openings: one given for all of them is fixed."""
+    from gripmon.sources import SourceError
+    from gripmon.sources.folder import read_table
+
+    try:
+        for picture in inputs.pictures:
+            assert picture.path is not None
+            path = Path(picture.path)
+            row = read_table(path.parent / "timestamps.csv").get(path.name)
+            if row is None or row.jaw_opening_m is None or row.jaw_opening_m != picture.jaw_opening_m:
+                return False
+    except SourceError:
+        return False
+    return True
+
+
+def _defaults() -> str:
+    """What holds anyway, behind # signs."""
+    import msgspec
+
+    from gripmon.config import Settings
+
+    lines = [
+        "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
+    ]
+    for field in msgspec.structs.fields(Settings):
+        if field.name in _AS_THEY_ARE:
+            lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
+    return "\n".join(lines)

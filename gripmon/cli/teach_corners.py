@@ -1,0 +1,162 @@
+"""``gripmon teach`` from corners that a person puts on the fingertips: on a page (``--page``), or in a file
+(``--corners``)."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import sys
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.cli.teach_inputs import Inputs
+    from gripmon.teaching.bench import Found
+
+_LOOK_S = 0.2
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``gripmon teach --page`` and ``--corners``."""
+    from gripmon.cli.teach_inputs import read_inputs
+
+    _check_options(arguments)
+    inputs = read_inputs(arguments)
+    return _page(arguments, inputs) if arguments.page else _without_page(arguments, inputs)
+
+
+def _check_options(arguments: argparse.Namespace) -> None:
+    """Options that contradict each other end the command with exit code 2."""
+
+    def refuse(text: str) -> None:
+        raise common.CommandFailedError(f"teach: {text}", common.EXIT_USAGE)
+
+    if arguments.page and arguments.corners is not None:
+        refuse("--page and --corners are two ways of the same; one of them")
+    if arguments.live is not None and (arguments.images or not arguments.page):
+        refuse("--live goes with --page, without images; image files otherwise")
+    if not arguments.images and arguments.live is None:
+        refuse("no image; image files, or --page --live DEVICE")
+    if arguments.corners is not None and len(arguments.images) > 1:
+        refuse(f"{len(arguments.images)} images; with --corners one, the image that they were put in")
+    if arguments.picture is not None:
+        refuse("--picture goes with --config alone; look at the page")
+    if arguments.config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
+        refuse("--config has camera, gripper and reference already; either that, or --camera and --gripper")
+
+
+def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
+    """Serve until the person is done."""
+    from gripmon.cli.teach_inputs import live_settings
+    from gripmon.cli.teach_saving import FileSaving
+    from gripmon.sources import SourceError, open_source
+    from gripmon.teachpage import Desk, PageServer
+
+    live = None
+    if arguments.live is not None:
+        try:
+            live = open_source(live_settings(arguments.live, inputs.bench.camera))
+        except SourceError as error:
+            raise common.CommandFailedError(f"--live: {error}", common.EXIT_USAGE) from None
+    saving = FileSaving(inputs)
+    desk = Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live)
+    try:
+        server = PageServer(desk, arguments.port)
+    except OSError as error:
+        desk.close()
+        raise common.CommandFailedError(
+            f"--port {arguments.port}: can't be listened on ({error.strerror}); another one, or none", common.EXIT_USAGE
+        ) from None
+    try:
+        print(f"teach on this page: {server.url}", flush=True)
+        print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
+        if not arguments.no_browser and _has_display():
+            webbrowser.open(server.url)
+        while not server.done.wait(_LOOK_S):
+            pass  # an interrupt that another thread has caught is heard of here
+    finally:
+        server.close()
+        desk.close()
+    return common.EXIT_DONE
+
+
+def _has_display() -> bool:
+    return sys.platform in ("darwin", "win32") or any(os.environ.get(name) for name in _DISPLAYS)
+
+
+def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
+    """Once, with the corners in a file."""
+    import numpy as np
+
+    from gripmon.cli.teach_inputs import read_rough
+    from gripmon.cli.teach_saving import FileSaving
+    from gripmon.teachpage import SavingRefused
+    from gripmon.teachpage.messages import Put, SaveOrder
+
+    rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
+    picture = inputs.pictures[0]
+    corners = {name: np.array(at) for name, at in rough.items()}
+    found = inputs.bench.look(picture.image, corners, (), picture.jaw_opening_m)
+    if found.snapped.refused is not None:
+        raise common.CommandFailedError(f"{picture.name}: {found.snapped.refused}")
+    print("\n".join(_table(found)))
+    put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
+    order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=arguments.force)
+    try:
+        saved = FileSaving(inputs).save(order, found, 0, inputs.pictures)
+    except SavingRefused as refused:
+        raise common.CommandFailedError(f"teach: {refused}") from None
+    if saved.exists:
+        raise common.CommandFailedError(
+            f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace", common.EXIT_USAGE
+        )
+    for note in saved.notes:
+        print(f"note: {note}")
+    for path, what in saved.written.items():
+        print(f"written: {path} ({what})")
+    if saved.next is not None:
+        print(f"next: {saved.next}")
+    return common.EXIT_DONE
+
+
+def _table(found: Found) -> list[str]:
+    """What was seen, for a person."""
+    snapped = found.snapped
+    width = max(len(corner.name) for corner in snapped.corners)
+    lines = [f"{'corner':<{width}}  measured at (px)      +- px  edges agree"]
+    for corner in snapped.corners:
+        agree = "" if corner.inliers is None else f"{100.0 * corner.inliers:4.0f} %"
+        if corner.uv_px is None or corner.sigma_px is None:
+            lines.append(f"{corner.name:<{width}}  not measured: {corner.reason}")
+            continue
+        u, v = corner.uv_px.tolist()
+        lines.append(f"{corner.name:<{width}}  ({u:7.2f}, {v:7.2f})  {corner.sigma_px:7.3f}  {agree}")
+    if found.reference is not None and found.pose is not None:
+        sigma_mm = [1e3 * found.reference.covariance[k] ** 0.5 for k in (0, 7, 14)]
+        told = f"{len(found.pose.corners)} corners" if found.pose.corners else "the edges"
+        lines.append(
+            f"reference by {told}, TCP to {sigma_mm[0]:.3f}, {sigma_mm[1]:.3f}, {sigma_mm[2]:.3f} mm: less exact than "
+            "with a plate (gripmon calibrate plane)"
+        )
+        if found.pose.rival:
+            lines.append(
+                "note: another pose explains these corners as well; a corner outside of their plane would tell"
+            )
+    expected = found.prospects
+    if expected is not None:
+        lines.append(f"expected of a frame   {_axes(expected.sigma)}")
+        lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
+    return lines
+
+
+def _axes(values: object) -> str:
+    import numpy as np
+
+    x, y, z, a, b, c = np.asarray(values, dtype=float).tolist()
+    turns = ", ".join(f"{math.degrees(v):.3f}" for v in (a, b, c))
+    return f"TCP x {1e3 * x:.3f}, y {1e3 * y:.3f}, z {1e3 * z:.3f} mm, turns {turns}°"

@@ -1,0 +1,297 @@
+"""What teaching from corners begins with: camera, gripper, reference and images, each checked."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.camera import Camera, LensSettings
+    from gripmon.config import Config
+    from gripmon.gripper import Gripper
+    from gripmon.records import ReferenceRecord
+    from gripmon.sources import FolderSettings, LiveSettings
+    from gripmon.teaching.bench import Bench
+    from gripmon.teaching.corner_pose import CameraError
+    from gripmon.teachpage import Picture
+
+ROBOT, CAMERA_NAME = "robot1", "wrist"
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Everything but the corners.  ``folder`` is where files go; ``config`` what was given, if it was."""
+
+    bench: Bench
+    pictures: tuple[Picture, ...]
+    gripper_path: Path
+    folder: Path
+    source: FolderSettings | LiveSettings | None
+    config: Config | None
+    robot: str
+    camera_name: str
+    command: str
+    live: str | None
+
+
+def read_inputs(arguments: argparse.Namespace) -> Inputs:
+    """What the command line names; a fault ends the command with exit code 2."""
+    import cv2
+
+    from gripmon.monitor import MonitorSettings
+    from gripmon.teaching.bench import Bench
+
+    cv2.setNumThreads(1)
+    config = None
+    if arguments.config is not None:
+        config = common.load(arguments.config, check_source=False, with_taught=False)
+        bench = Bench(config.camera, config.gripper, config.settings.monitor, config.reference)
+        gripper_path = config.gripper_path
+    else:
+        gripper, gripper_path = _gripper(arguments.gripper)
+        camera, error, reference = _calibrations(arguments, gripper)
+        bench = Bench(camera, gripper, MonitorSettings(), reference, error)
+    pictures = tuple(_picture(Path(name), bench, config, arguments.jaw_opening) for name in arguments.images)
+    folder = Path(arguments.out) if arguments.out else config.directory if config is not None else Path()
+    common.make_directory(folder)
+    return Inputs(
+        bench=bench,
+        pictures=pictures,
+        gripper_path=gripper_path,
+        folder=folder,
+        source=None if config is not None else _source(arguments, bench.camera),
+        config=config,
+        robot=config.settings.robot if config is not None else arguments.robot or ROBOT,
+        camera_name=config.settings.camera_name if config is not None else arguments.camera_name or CAMERA_NAME,
+        command=_command(arguments),
+        live=arguments.live,
+    )
+
+
+def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
+    """The corners in a file; a fault ends the command with exit code 2."""
+    from gripmon.config.typed import to_settings
+    from gripmon.teaching.bench import RoughCorners, rough_fault
+
+    with _faults_of(path):
+        rough = to_settings(_yaml(path), RoughCorners)
+    fault = rough_fault(rough.corners, gripper)
+    if fault is not None:
+        raise common.CommandFailedError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}", common.EXIT_USAGE)
+    return rough.corners
+
+
+def _gripper(name: str | None) -> tuple[Gripper, Path]:
+    from gripmon.gripper import GripperError, load_gripper
+
+    if name is None:
+        raise common.CommandFailedError(
+            "teach: no gripper; --gripper FILE, one of configs/grippers or your own, or --config", common.EXIT_USAGE
+        )
+    path = Path(name)
+    try:
+        return load_gripper(path), path
+    except OSError as error:
+        right = "a gripper file such as those in configs/grippers"
+        raise common.CommandFailedError(
+            f"--gripper {path}: can't be read ({error.strerror}); {right}", common.EXIT_USAGE
+        ) from None
+    except GripperError as error:
+        raise common.CommandFailedError(f"--gripper {path}: {error}", common.EXIT_USAGE) from None
+
+
+def _calibrations(
+    arguments: argparse.Namespace, gripper: Gripper
+) -> tuple[Camera, CameraError | None, ReferenceRecord | None]:
+    """Camera and reference from their files; a reference's file holds its camera, too."""
+    from gripmon.camera import make_camera
+
+    lens, error = (None, None) if arguments.camera is None else _lens(Path(arguments.camera))
+    reference = None
+    if arguments.reference is not None:
+        own, reference = _hand_eye(Path(arguments.reference), gripper)
+        if lens is not None and lens != own:
+            raise common.CommandFailedError(
+                f"--reference {arguments.reference}: was made with another camera than --camera {arguments.camera}; "
+                "calibrations that belong together",
+                common.EXIT_USAGE,
+            )
+        lens = own
+    if lens is None:
+        raise common.CommandFailedError(
+            "teach: no camera; --camera FILE (of gripmon calibrate intrinsics), or --config", common.EXIT_USAGE
+        )
+    try:
+        camera = make_camera(lens)
+    except ValueError as fault:
+        raise common.CommandFailedError(f"{arguments.camera or arguments.reference}: camera.{fault}", 2) from None
+    if reference is not None:
+        _check_view(camera, gripper, reference, arguments.reference)
+    return camera, error, reference
+
+
+def _lens(path: Path) -> tuple[LensSettings, CameraError | None]:
+    """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
+    import numpy as np
+
+    from gripmon.calibration.documents import CameraCalibration
+    from gripmon.camera import LensSettings
+    from gripmon.config.typed import to_settings
+    from gripmon.teaching.corner_pose import CameraError
+
+    with _faults_of(path):
+        values = _yaml(path)
+        if "schema" not in values:
+            lens: LensSettings = to_settings(values, LensSettings)  # type: ignore[arg-type]
+            return lens, None
+        made = to_settings(values, CameraCalibration)
+    count = len(made.parameters)
+    covariance = np.reshape(made.covariance, (-1, count)) if count else np.zeros((0, 0))
+    if covariance.shape != (count, count):
+        raise common.CommandFailedError(
+            f"{path}: covariance: has {len(made.covariance)} values; {count * count} for {count} parameters", 2
+        )
+    return made.camera, CameraError(made.parameters, covariance)
+
+
+def _hand_eye(path: Path, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
+    """A file of ``gripmon calibrate plane``."""
+    import hashlib
+
+    import msgspec
+
+    from gripmon.calibration.documents import HandEyeCalibration
+    from gripmon.config.typed import to_settings
+    from gripmon.corners.taught import gripper_digest
+    from gripmon.records import ReferenceRecord
+
+    with _faults_of(path):
+        made = to_settings(_yaml(path), HandEyeCalibration)
+    if made.gripper.sha256 != gripper_digest(gripper):
+        raise common.CommandFailedError(
+            f"--reference {path}: gripper: was made with {made.gripper.name} as it then was, --gripper is "
+            f"{gripper.name}; the gripper file that it was made with",
+            common.EXIT_USAGE,
+        )
+    digest = hashlib.sha256(msgspec.json.encode(made.cam_T_grip)).hexdigest()[:8]
+    return made.camera, ReferenceRecord(
+        f"plane-{digest}", 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance)
+    )
+
+
+def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:
+    """End the command if this reference doesn't see this gripper."""
+    from gripmon.config.checks import covariance_of, predict_view, reference_transform, view_fault
+    from gripmon.config.settings import ReferenceSettings, TransformSettings
+    from gripmon.config.typed import Fault
+
+    transform = reference.cam_T_grip
+    settings = ReferenceSettings(
+        cam_T_grip=TransformSettings(translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw),
+        covariance=reference.covariance,
+    )
+    pose, covariance = reference_transform(settings), covariance_of(settings)
+    fault = pose if isinstance(pose, Fault) else covariance if isinstance(covariance, Fault) else None
+    if fault is None and not isinstance(pose, Fault):
+        fault = view_fault(predict_view(camera, gripper, pose, None), gripper, camera)
+    if fault is not None:
+        key = fault.key.removeprefix("reference.")
+        raise common.CommandFailedError(f"--reference {name}: {key}: {fault.wrong}; {fault.right}", common.EXIT_USAGE)
+
+
+def _yaml(path: Path) -> dict[str, object]:
+    from gripmon.config.yaml_file import read_yaml
+
+    return read_yaml(path)
+
+
+@contextlib.contextmanager
+def _faults_of(path: Path) -> Iterator[None]:
+    """What is wrong with a file's contents ends the command with exit code 2."""
+    from gripmon.config import ConfigError
+    from gripmon.config.typed import SettingsError
+
+    try:
+        yield
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    except SettingsError as error:
+        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+
+
+def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
+    """An image that fits the camera; else the command ends with exit code 2."""
+    from gripmon.inspection import inspect
+    from gripmon.records import Frame
+    from gripmon.sources.folder import read_image
+    from gripmon.teachpage import Picture
+
+    if path.is_dir():
+        raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)
+    image, fault = read_image(path)
+    if image is None:
+        raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+    refused = inspect(Frame(0, 0, image, None, str(path)), bench.camera, bench.gripper)
+    if refused is not None:
+        raise common.CommandFailedError(f"{path}: {refused[0]}: {refused[1]}", common.EXIT_USAGE)
+    return Picture(path.name, image, _opening(path, bench.gripper, config, given_m), str(path))
+
+
+def _opening(path: Path, gripper: Gripper, config: Config | None, given_m: float | None) -> float | None:
+    """What is known of the jaw opening in an image: given, in its folder's table, or fixed in the configuration; None
+    if nothing is.
+    """
+    from gripmon.sources import SourceError
+    from gripmon.sources.folder import TIMESTAMPS_NAME, read_table
+
+    if not gripper.has_jaw:
+        if given_m is not None:
+            raise common.CommandFailedError("--jaw-opening: the gripper has no jaw; leave it out", common.EXIT_USAGE)
+        return None
+    opening_m, table = given_m, path.parent / TIMESTAMPS_NAME
+    if opening_m is None and config is not None and config.settings.jaw.source == "fixed":
+        opening_m = config.jaw_opening_m
+    if opening_m is None and table.exists():
+        try:
+            row = read_table(table).get(path.name)
+        except SourceError as error:
+            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+        opening_m = None if row is None else row.jaw_opening_m
+    if opening_m is not None and not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise common.CommandFailedError(
+            f"{path}: jaw opening {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m",
+            common.EXIT_USAGE,
+        )
+    return opening_m
+
+
+def live_settings(device: str, camera: Camera) -> LiveSettings:
+    """A camera that is asked for images of the calibration's size."""
+    from gripmon.sources import LiveSettings
+
+    named = int(device) if device.isdecimal() else device
+    return LiveSettings(device=named, width_px=camera.width_px, height_px=camera.height_px)
+
+
+def _source(arguments: argparse.Namespace, camera: Camera) -> FolderSettings | LiveSettings:
+    """Where the monitor will find its frames: the live camera, or the images' folder."""
+    from gripmon.sources import FolderSettings
+
+    if arguments.live is not None:
+        return live_settings(arguments.live, camera)
+    return FolderSettings(path=str(Path(arguments.images[0]).parent))
+
+
+def _command(arguments: argparse.Namespace) -> str:
+    words = ["gripmon", "teach", *(["--page"] if arguments.page else []), *arguments.images]
+    for name in ("live", "corners", "config", "camera", "gripper", "reference", "out", "jaw_opening"):
+        value = getattr(arguments, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)

@@ -1,0 +1,270 @@
+"""Files of teaching from corners: the taught model, a configuration, the corners; whole, or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon import __version__
+
+if TYPE_CHECKING:
+    from gripmon.cli.teach_inputs import Inputs
+    from gripmon.corners import TaughtModel
+    from gripmon.records import ReferenceRecord
+    from gripmon.teaching import Taught
+    from gripmon.teaching.bench import Found
+    from gripmon.teachpage import Picture, Saved, SaveOrder
+    from gripmon.teachpage.desk import Labels
+
+TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
+
+
+class FileSaving:
+    """Writes beside each other in one folder; what can't be used later is found before anything is written."""
+
+    def __init__(self, inputs: Inputs):
+        self._inputs = inputs
+
+    @property
+    def _paths(self) -> dict[str, Path]:
+        """Where each file goes."""
+        inputs, config = self._inputs, self._inputs.config
+        named = None if config is None else config.taught_path
+        return {
+            "taught": inputs.folder / TAUGHT if named is None else named,
+            "config": inputs.folder / CONFIG if config is None else config.path,
+            "corners": inputs.folder / CORNERS,
+        }
+
+    def labels(self) -> Labels:
+        """What the page shows."""
+        from gripmon.teachpage.desk import Labels
+
+        inputs, known = self._inputs, self._inputs.bench.reference
+        return Labels(
+            robot=inputs.robot,
+            camera_name=inputs.camera_name,
+            fixed_names=inputs.config is not None,
+            folder=str(inputs.folder.resolve()),
+            files={kind: str(path) for kind, path in self._paths.items()},
+            reference=None if known is None else known.reference_id,
+            live=inputs.live,
+        )
+
+    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+        """As :class:`gripmon.teachpage.Saving`."""
+        from gripmon.teachpage import Saved, SavingRefused
+
+        paths = self._paths
+        notes: list[str] = []
+        wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
+        if not wanted:
+            raise SavingRefused("nothing is to be saved; at least one of the files")
+        if "config" in wanted and self._names_it_already(order):
+            wanted.remove("config")
+        exists = tuple(str(paths[kind]) for kind in wanted if paths[kind].exists())
+        if exists and not order.replace:
+            return Saved(exists=exists)
+        texts: dict[str, str] = {}
+        if "corners" in wanted:
+            texts["corners"] = self._corners(order, found, pictures[number].name)
+        files = self._pictures(pictures)
+        reference = found.reference
+        if reference is None and {"taught", "config"} & set(wanted):
+            raise SavingRefused(f"{found.no_reference}; or save the corners only")
+        model = None
+        if order.taught and reference is not None:
+            model, notes = self._taught(order, found, reference, pictures, files)
+            from gripmon.teaching.document import to_yaml
+
+            texts["taught"] = to_yaml(model)
+        if "config" in wanted and reference is not None:
+            texts["config"] = self._config(order, found, reference, model is not None)
+        self._try_out(order, found, texts)
+        written = self._write(texts, files if order.taught else {})
+        config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
+        follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
+        return Saved(written=written, notes=tuple(notes), next=follows)
+
+    def _names_it_already(self, order: SaveOrder) -> bool:
+        """A configuration that was given is only changed to name the taught model, if it doesn't."""
+        config = self._inputs.config
+        return config is not None and (config.taught_path is not None or not order.taught)
+
+    def _pictures(self, pictures: Sequence[Picture]) -> dict[str, bytes]:
+        """Live images become files, so that their taught model can be made again."""
+        import cv2
+
+        out = {}
+        for picture in pictures:
+            if picture.path is None:
+                ending = ".tif" if picture.image.dtype.kind == "f" else ".png"
+                _, data = cv2.imencode(ending, picture.image)
+                path = self._inputs.folder / IMAGES / Path(picture.name).with_suffix(ending)
+                out[str(path)] = data.tobytes()
+        return out
+
+    def _taught(
+        self,
+        order: SaveOrder,
+        found: Found,
+        reference: ReferenceRecord,
+        pictures: Sequence[Picture],
+        files: Mapping[str, bytes],
+    ) -> tuple[TaughtModel, list[str]]:
+        from gripmon.teaching import TeachingImage, TeachingRefused
+        from gripmon.teachpage import SavingRefused
+
+        bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
+        openings = [
+            opening_m if order.put.jaw_opening_m is not None or p.jaw_opening_m is None else p.jaw_opening_m
+            for p in pictures
+        ]
+        nominal_m = bench.gripper.jaw_nominal_m
+        images = [
+            TeachingImage(p.image, nominal_m if m is None else m, p.name)
+            for p, m in zip(pictures, openings, strict=True)
+        ]
+        try:
+            taught, _ = bench.taught(reference, images)
+        except TeachingRefused as refused:
+            raise SavingRefused(f"no taught model: {refused}; or save without it") from None
+        left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
+        return self._model(taught, reference, pictures, openings, files), [*taught.notes, *left]
+
+    def _model(
+        self,
+        taught: Taught,
+        reference: ReferenceRecord,
+        pictures: Sequence[Picture],
+        openings: Sequence[float | None],
+        files: Mapping[str, bytes],
+    ) -> TaughtModel:
+        from datetime import UTC, datetime
+
+        from gripmon.corners import TaughtModel
+        from gripmon.corners.taught import Provenance, TaughtImage, identity
+        from gripmon.geometry import from_record
+
+        bench, names = self._inputs.bench, iter(files)
+        images = []
+        for picture, opening_m in zip(pictures, openings, strict=True):
+            path = next(names) if picture.path is None else picture.path
+            data = files[path] if picture.path is None else Path(path).read_bytes()
+            images.append(TaughtImage(file=path, sha256=hashlib.sha256(data).hexdigest(), jaw_opening_m=opening_m))
+        camera, gripper, stands = identity(
+            bench.camera, bench.gripper, reference.reference_id, from_record(reference.cam_T_grip)
+        )
+        return TaughtModel(
+            provenance=Provenance(
+                gripmon=__version__,
+                time=datetime.now(UTC).isoformat(timespec="seconds"),
+                command=self._inputs.command,
+                images=tuple(images),
+                closure_px=taught.closure_px,
+            ),
+            camera=camera,
+            gripper=gripper,
+            reference=stands,
+            edge_settings=bench.settings.corners.edges,
+            edges=taught.edges,
+            corners=taught.corners,
+        )
+
+    def _corners(self, order: SaveOrder, found: Found, image: str) -> str:
+        """Corners as ``--corners`` reads them."""
+        from gripmon.cli.commented import yaml_value
+
+        lines = [
+            f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
+            "# For gripmon calibrate plane --corners, gripmon teach --corners; name: [column, row] in the image (px)",
+            "corners:",
+        ]
+        for corner in found.snapped.corners:
+            by_hand = order.put.corners.get(corner.name)
+            if by_hand is not None and (corner.name in order.put.by_hand or corner.uv_px is None):
+                lines.append(f"  {corner.name}: {yaml_value([round(v, 4) for v in by_hand])}  # by hand")
+            elif corner.uv_px is not None:
+                at = [round(v, 4) for v in corner.uv_px.tolist()]
+                lines.append(f"  {corner.name}: {yaml_value(at)}  # measured, +- {corner.sigma_px:.3f} px")
+        if len(lines) == 3:
+            lines[-1] = "corners: {}"
+        return "\n".join(lines) + "\n"
+
+    def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
+        from gripmon.cli.teach_config import config_text, with_taught
+
+        given = self._inputs.config
+        if given is not None:
+            return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
+        return config_text(
+            self._inputs,
+            robot=order.robot,
+            camera_name=order.camera_name,
+            reference=reference,
+            measured_here=found.pose,
+            taught=TAUGHT if taught else None,
+            gripper=self._relative(self._inputs.gripper_path),
+            jaw_opening_m=found.snapped.jaw_opening_m,
+            jaw_known=order.put.jaw_opening_m is not None,
+            folder=self._relative,
+        )
+
+    def _relative(self, path: Path, to: Path | None = None) -> str:
+        """As a configuration in ``to``, or the folder written to, names it."""
+        return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
+
+    def _try_out(self, order: SaveOrder, found: Found, texts: Mapping[str, str]) -> None:
+        """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
+        if "config" not in texts:
+            return
+        import shutil
+
+        import yaml
+
+        from gripmon.config import ConfigError, load_config
+        from gripmon.config.yaml_file import as_yaml, read_yaml
+        from gripmon.teachpage import SavingRefused
+
+        base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
+        with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
+            trial = Path(name) / CONFIG
+            trial.write_text(texts["config"], encoding="utf-8")
+            try:
+                values = read_yaml(trial)
+                values["gripper"] = str((base / values["gripper"]).resolve())
+                if "taught" in texts:
+                    (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
+                    values["taught"] = TAUGHT
+                for key in ("camera", "reference"):
+                    if isinstance(values.get(key), str):
+                        shutil.copy(base / values[key], Path(name) / f"{key}.yaml")
+                        values[key] = f"{key}.yaml"
+                trial.write_text(as_yaml(values), encoding="utf-8")
+                load_config(trial, check_source=False, with_taught="taught" in texts)
+            except (ConfigError, yaml.YAMLError, OSError) as error:
+                told = str(error).replace(f"{name}{os.sep}", "")
+                raise SavingRefused(f"the configuration would not be sound: {told}") from None
+
+    def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
+        """Each whole or not at all; the configuration last, since it names the others."""
+        from gripmon.atomic import write_atomically
+        from gripmon.teachpage import SavingRefused
+
+        words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}
+        written: dict[str, str] = {}
+        todo = [(Path(path), data, "an image") for path, data in files.items()]
+        todo += [(self._paths[k], texts[k].encode(), words[k]) for k in ("corners", "taught", "config") if k in texts]
+        for path, data, what in todo:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(path, data)
+            except OSError as error:
+                done = f"; written before: {', '.join(written)}" if written else ""
+                raise SavingRefused(f"{path}: can't be written ({error.strerror or error}){done}") from None
+            written[str(path)] = what
+        return written

@@ -1,0 +1,287 @@
+"""From corners put by hand to edges, a pose and files: the reckoning, and ``gripmon teach --corners``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
+from taught_by_hand import Rig, make_rig
+
+from gripmon.calibration.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
+from gripmon.camera import make_camera
+from gripmon.cli import main
+from gripmon.config import Settings, load_config
+from gripmon.config.typed import to_settings
+from gripmon.config.yaml_file import as_yaml, read_yaml
+from gripmon.corners.taught import gripper_digest
+from gripmon.geometry import from_record, perturb, perturbation_between, to_record
+from gripmon.monitor import MonitorSettings
+from gripmon.outlook import expect
+from gripmon.provenance import Provenance
+from gripmon.simulator import Simulator
+from gripmon.simulator.scenario import JawScript, Sensor
+from gripmon.teaching.bench import Bench
+from gripmon.teaching.corner_pose import CameraError, pose_from_corners
+from gripmon.teaching.placing import place, usual_view
+
+INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
+OPENING_M = 0.034
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    return make_rig(tmp_path_factory.mktemp("corners"))
+
+
+@pytest.fixture(scope="module")
+def bench(rig: Rig) -> Bench:
+    return Bench(rig.camera, rig.gripper, MonitorSettings(), None)
+
+
+def put(values: dict[str, list[float]]) -> dict[str, np.ndarray]:
+    return {name: np.array(at) for name, at in values.items()}
+
+
+def test_a_few_corners_place_the_gripper_about_right():
+    """Turned in any way about the optical axis, from corners that are exact."""
+    camera, gripper = make_camera(PAPER_LENS), sharp_gripper()
+    rng = np.random.default_rng(4)
+    for turn in np.linspace(-3.0, 3.0, 7):
+        pose = perturb(nominal_cam_T_grip(), np.array([0.0, 0.0, 0.0, *rng.normal(0.0, 0.05, 2), turn]))
+        points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points]
+        uv_px = camera.project(points_m @ pose[:3, :3].T + pose[:3, 3])
+        shown = dict(zip(gripper.corner_ids, uv_px, strict=True))
+        found = place(camera, gripper, OPENING_M, {n: shown[n] for n in INNER}, usual_view(camera, gripper, OPENING_M))
+        xi = perturbation_between(found[0].cam_T_grip, pose)
+        assert np.linalg.norm(xi[3:]) < 0.15 and np.linalg.norm(xi[:3]) < 0.005
+        # What it thinks of its own error is of that size.
+        assert xi @ np.linalg.solve(found[0].covariance, xi) < 22.5
+    # One corner only: the whole gripper follows it.
+    at = np.array([100.0, 500.0])
+    one = place(camera, gripper, OPENING_M, {"L_in_near": at}, usual_view(camera, gripper, OPENING_M))[0]
+    assert one.left_px["L_in_near"] < 5.0
+
+
+@pytest.mark.parametrize("opening_m", [OPENING_M, None])
+def test_rough_corners_snap_to_the_true_ones(rig: Rig, bench: Bench, opening_m: float | None):
+    for seed in range(4):
+        found = bench.look(rig.image, put(rig.rough(*INNER, off_px=5.0, seed=seed)), (), opening_m)
+        assert found.snapped.refused is None
+        measured = [corner for corner in found.snapped.corners if corner.uv_px is not None]
+        assert len(measured) == 6
+        for corner in measured:
+            off = corner.uv_px - rig.corners_px[corner.name]  # type: ignore[operator]
+            assert np.linalg.norm(off) < 0.2
+            assert off @ np.linalg.solve(corner.covariance_px, off) < 25.0
+            assert corner.sigma_px == pytest.approx(np.sqrt(np.linalg.eigvalsh(corner.covariance_px)[-1]), rel=1e-6)
+        assert found.snapped.jaw_opening_m == pytest.approx(OPENING_M, abs=5.0 * (found.snapped.jaw_sigma_m or 0.0))
+
+
+def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
+    good = rig.rough(*INNER)
+    few = bench.look(rig.image, put({"L_in_near": good["L_in_near"]}), (), OPENING_M)
+    assert few.snapped.refused == "put 3 more corners on the fingertips" and few.reference is None
+    swapped = {**good, "L_in_near": good["R_in_near"], "R_in_near": good["L_in_near"]}
+    assert "where the others put it" in str(bench.look(rig.image, put(swapped), (), OPENING_M).snapped.refused)
+    empty = np.full_like(rig.image, 120)
+    assert "no fingers are seen" in str(bench.look(empty, put(good), (), OPENING_M).snapped.refused)
+    away = {name: [u, v - 150.0] for name, (u, v) in good.items()}
+    assert bench.look(rig.image, put(away), (), OPENING_M).snapped.refused is not None
+
+
+def test_what_is_expected_is_what_check_says(rig: Rig, bench: Bench):
+    found = bench.look(rig.image, put(rig.rough(*INNER)), (), OPENING_M)
+    assert found.reference is not None and found.prospects is not None
+    outlook = expect(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M)
+    np.testing.assert_allclose(found.prospects.sigma, outlook.sigma)
+    assert (found.prospects.smallest > 0.0).all() and found.prospects.edges == outlook.edges
+
+
+def test_the_pose_is_as_good_as_its_covariance_says():
+    """Over poses, openings that are reported wrongly, and cameras that are calibrated wrongly, by what is stated."""
+    gripper, rng = sharp_gripper(), np.random.default_rng(8)
+    sigma_m, sigma_px = 1e-4, 4.0
+    error = CameraError(("fx_px", "cx_px", "cy_px"), np.diag([sigma_px**2] * 3))
+    squares = []
+    for trial in range(24):
+        off = rng.normal(0.0, sigma_px, 3)
+        lens = msgspec.structs.replace(
+            PAPER_LENS, fx_px=962.0 + off[0], fy_px=962.0 + off[0], cx_px=383.5 + off[1], cy_px=287.5 + off[2]
+        )
+        pose = perturb(nominal_cam_T_grip(), np.concatenate([rng.normal(0.0, 0.003, 3), rng.normal(0.0, 0.06, 3)]))
+        sensor = msgspec.structs.replace(IDEAL_SENSOR, read_noise_dn=1.5)
+        assert isinstance(sensor, Sensor)
+        scene = plain_scenario(jaw=JawScript(knots=((0.0, OPENING_M),)), sensor=sensor)
+        simulator = Simulator(make_camera(lens), gripper, pose, scene, trial)
+        bench = Bench(make_camera(PAPER_LENS), gripper, MonitorSettings(jaw_sigma_m=sigma_m), None, error)
+        points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points]
+        uv_px = make_camera(lens).project(points_m @ pose[:3, :3].T + pose[:3, 3])
+        shown = dict(zip(gripper.corner_ids, uv_px + rng.normal(0.0, 3.0, uv_px.shape), strict=True))
+        reported_m = OPENING_M + rng.normal(0.0, sigma_m)
+        found = bench.look(simulator.render(0), {name: shown[name] for name in INNER}, (), reported_m)
+        assert found.reference is not None, found.no_reference
+        xi = perturbation_between(from_record(found.reference.cam_T_grip), pose)
+        squares.append(xi @ np.linalg.solve(np.reshape(found.reference.covariance, (6, 6)), xi))
+    # Six degrees of freedom each; that grippers are not made exactly is allowed for, and not simulated.
+    assert 0.5 < np.mean(squares) < 7.5
+    assert max(squares) < 28.0
+
+
+def test_corners_by_hand_count_little_against_measured_ones(rig: Rig, bench: Bench):
+    rough = put(rig.rough(*INNER))
+    found = bench.look(rig.image, rough, (), OPENING_M)
+    held = {"R_in_near": rig.corners_px["R_in_near"] + 0.5}
+    by_hand = pose_from_corners(rig.camera, rig.gripper, found.snapped, held)
+    assert found.pose is not None and set(by_hand.corners) == set(found.pose.corners)
+    assert by_hand.covariance[0, 0] > 1.2 * found.pose.covariance[0, 0]
+    moved = perturbation_between(found.pose.cam_T_grip, by_hand.cam_T_grip)
+    assert moved @ np.linalg.solve(by_hand.covariance, moved) < 4.0
+
+
+def run(arguments: list[object], capsys: pytest.CaptureFixture[str]) -> tuple[int, str, str]:
+    capsys.readouterr()
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    text = capsys.readouterr()
+    return code, text.out, text.err
+
+
+def rough_file(rig: Rig, path: Path, **more: object) -> Path:
+    path.write_text(yaml.safe_dump({"corners": {**rig.rough(*INNER), **more}}))
+    return path
+
+
+def test_without_a_page_a_file_of_corners_does_the_same(rig: Rig, tmp_path: Path, capsys):
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    command: list[object] = ["teach", rig.image_path, "--corners", rough, *rig.options, "--out", tmp_path / "mine"]
+    code, out, err = run(command, capsys)
+    assert (code, err) == (0, "")
+    assert "L_out_far   not measured: hidden by its own finger" in out and "smallest drift seen" in out
+    assert "less exact than with a plate" in out
+    config = load_config(tmp_path / "mine" / "config.yaml")
+    assert config.taught is not None and config.settings.jaw.source == "frames"
+    # What is not said holds as everywhere.
+    defaults = {field.name: field.default for field in msgspec.structs.fields(Settings)}
+    for name in ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state"):
+        assert getattr(config.settings, name) == defaults[name]
+    # Its own corners are a file of corners again.
+    again: list[object] = ["teach", rig.image_path, "--corners", tmp_path / "mine" / "corners.yaml", *rig.options]
+    assert run([*again, "--out", tmp_path / "again"], capsys)[0] == 0
+    # Nothing is replaced without a word.
+    before = {path.name: path.read_bytes() for path in (tmp_path / "mine").iterdir()}
+    code, _, err = run(command, capsys)
+    assert code == 2 and "there already" in err and len(err.splitlines()) == 1
+    assert {path.name: path.read_bytes() for path in (tmp_path / "mine").iterdir()} == before
+    assert run([*command, "--force"], capsys)[0] == 0
+
+
+def test_what_is_commented_out_is_what_holds(rig: Rig, tmp_path: Path, capsys):
+    """Every # taken away, the file means the same."""
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    assert run(["teach", rig.image_path, "--corners", rough, *rig.options, "--out", tmp_path], capsys)[0] == 0
+    text = (tmp_path / "config.yaml").read_text()
+    head, mark, rest = text.partition("# Everything below")
+    first, _, defaults = rest.partition("\n")
+    (tmp_path / "whole.yaml").write_text(head + mark + first + "\n" + defaults.replace("\n# ", "\n").removeprefix("# "))
+    assert len((tmp_path / "whole.yaml").read_text().splitlines()) == len(text.splitlines())
+    assert load_config(tmp_path / "whole.yaml").settings == load_config(tmp_path / "config.yaml").settings
+    assert all("  # " in line for line in defaults.splitlines() if ": " in line)
+
+
+def test_a_calibration_with_a_plate_becomes_the_reference(rig: Rig, tmp_path: Path, capsys):
+    made = HandEyeCalibration(
+        camera=rig.camera.settings,
+        gripper=CalibratedGripper(name=rig.gripper.name, sha256=gripper_digest(rig.gripper)),
+        jaw_opening_m=OPENING_M,
+        cam_T_grip=to_record(nominal_cam_T_grip()),
+        covariance=tuple(np.diag([1e-9] * 3 + [1e-7] * 3).ravel().tolist()),
+        residuals=HandEyeResiduals(rms_m=1e-5, rms_px=0.1, corners=4, images=1),
+        provenance=Provenance(gripmon="0", time="2026-01-01T00:00:00+00:00", command="test"),
+    )
+    (tmp_path / "hand_eye.yaml").write_text(as_yaml(msgspec.to_builtins(made)))
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    gripper = ["--gripper", rig.folder / "gripper.yaml", "--reference", tmp_path / "hand_eye.yaml"]
+    command: list[object] = ["teach", rig.image_path, "--corners", rough, *gripper, "--out", tmp_path / "mine"]
+    code, out, err = run(command, capsys)
+    assert (code, err) == (0, "") and "with a plate" not in out
+    config = load_config(tmp_path / "mine" / "config.yaml")
+    np.testing.assert_allclose(config.cam_T_grip, nominal_cam_T_grip(), atol=1e-12)
+    assert config.reference.covariance == made.covariance
+    # Another gripper's calibration is none.
+    other = msgspec.structs.replace(made, gripper=CalibratedGripper(name="other", sha256="0" * 64))
+    (tmp_path / "hand_eye.yaml").write_text(as_yaml(msgspec.to_builtins(other)))
+    code, out, err = run([*command, "--force"], capsys)
+    assert (code, out) == (2, "") and "gripper: was made with other" in err and len(err.splitlines()) == 1
+
+
+def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
+    image, camera, gripper = rig.image_path, rig.folder / "camera.yaml", rig.folder / "gripper.yaml"
+    (tmp_path / "broken.png").write_bytes(image.read_bytes()[:2000])
+    cv2.imwrite(str(tmp_path / "small.png"), cv2.resize(rig.image, (320, 240)))
+    (tmp_path / "no.yaml").write_text("camera: [")
+    (tmp_path / "half.yaml").write_text("model: paper\nwidth_px: 768\n")
+    bad = rough_file(rig, tmp_path / "nose.yaml", nose=[1.0, 2.0])
+    (tmp_path / "flat.yaml").write_text("corners: {L_in_near: [1.0]}\n")
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    given: list[object] = ["--camera", camera, "--gripper", gripper, "--out", tmp_path / "out"]
+    page: list[object] = ["--page", *given]
+    for arguments, said in (
+        ([tmp_path / "broken.png", *page], "truncated, damaged or not an image"),
+        ([tmp_path / "none.png", *page], "the file is missing"),
+        ([tmp_path, *page], "is a folder"),
+        ([tmp_path / "small.png", *page], "320x240 pixels; 768x576"),
+        ([image, "--page", "--camera", camera], "no gripper; --gripper FILE"),
+        ([image, "--page", "--gripper", gripper], "no camera; --camera FILE"),
+        ([image, "--page", "--camera", camera, "--gripper", tmp_path / "none.yaml"], "can't be read"),
+        ([image, "--page", "--camera", tmp_path / "none.yaml", "--gripper", gripper], "there is no such file"),
+        ([image, "--page", "--camera", tmp_path / "no.yaml", "--gripper", gripper], "not YAML"),
+        ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "height_px"),
+        ([*page], "no image; image files, or --page --live DEVICE"),
+        ([image, *page, "--live", "0"], "--live goes with --page, without images"),
+        ([image, *page, "--corners", rough], "--page and --corners"),
+        ([image, *page, "--config", camera], "--config has camera, gripper and reference already"),
+        ([image, *page, "--jaw-opening", "0.2"], "jaw opening 0.2 m; the gripper's 0 to 0.06 m"),
+        ([image, *page, "--picture", "a.png"], "--picture goes with --config"),
+        ([image, *given, "--corners", bad], "corners.nose: the gripper has no such corner; one of L_in_near"),
+        ([image, *given, "--corners", tmp_path / "flat.yaml"], "corners.L_in_near: has 1 values"),
+        ([image, *given, "--corners", tmp_path / "none.yaml"], "there is no such file"),
+        ([image, "--gripper", gripper], "teach: --config is missing"),
+        ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera goes with --page"),
+        ([], "no image"),
+    ):
+        code, out, err = run(["teach", *arguments], capsys)
+        assert (code, out) == (2, ""), (arguments, err)
+        assert said in err and len(err.splitlines()) == 1, err
+    code, out, err = run(["teach", image, "--page", "--port", "70000"], capsys)
+    assert code == 2 and "no port" in err
+    assert run(["teach", image, "--page", "--robot", "a/b"], capsys)[0] == 2
+
+
+def test_corners_without_fingers_fail_and_write_nothing(rig: Rig, tmp_path: Path, capsys):
+    cv2.imwrite(str(tmp_path / "empty.png"), cv2.add(np.full_like(rig.image, 120), rig.image // 40))
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    blank = np.full(rig.image.shape[:2], 120, np.uint8)
+    blank[::7, ::5] = 160
+    cv2.imwrite(str(tmp_path / "empty.png"), blank)
+    options = ["--jaw-opening", OPENING_M, "--out", tmp_path / "out"]
+    code, out, err = run(["teach", tmp_path / "empty.png", "--corners", rough, *rig.options, *options], capsys)
+    assert (code, out) == (3, "") and "no fingers are seen" in err
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
+def test_the_file_of_corners_is_as_the_contract_says(rig: Rig, tmp_path: Path, capsys):
+    """A mapping of names to columns and rows, and nothing else."""
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    assert run(["teach", rig.image_path, "--corners", rough, *rig.options, "--out", tmp_path], capsys)[0] == 0
+    values = read_yaml(tmp_path / "corners.yaml")
+    assert list(values) == ["corners"]
+    read = to_settings(values["corners"], dict[str, tuple[float, float]])
+    assert set(INNER) <= set(read) and json.dumps(read)

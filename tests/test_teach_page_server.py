@@ -1,0 +1,304 @@
+"""The page's web server as those meet it who have no business there, and what it answers to nonsense."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import socket
+import threading
+import time
+import urllib.parse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from taught_by_hand import Rig, make_rig
+
+from gripmon.monitor import MonitorSettings
+from gripmon.records import Frame
+from gripmon.sources import Waiting
+from gripmon.teaching.bench import Bench, Found
+from gripmon.teachpage import Desk, PageServer, Picture, Saved, SaveOrder, SavingRefused
+from gripmon.teachpage.desk import BadRequest, Labels
+
+LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
+DEADLINE_S = 30.0
+
+
+class Told:
+    """Saves nothing, and keeps what it was told to."""
+
+    def __init__(self) -> None:
+        self.orders: list[SaveOrder] = []
+        self.refuse = ""
+
+    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+        if self.refuse:
+            raise SavingRefused(self.refuse)
+        self.orders.append(order)
+        return Saved(written={"c": f"image {number} of {len(pictures)}"})
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    return make_rig(tmp_path_factory.mktemp("served"))
+
+
+@pytest.fixture(scope="module")
+def saving() -> Told:
+    return Told()
+
+
+@pytest.fixture(scope="module")
+def served(rig: Rig, saving: Told) -> Iterator[PageServer]:
+    picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
+    server = PageServer(Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving))
+    yield server
+    server.close()
+
+
+def ask(
+    server: PageServer,
+    path: str | None = None,
+    method: str = "GET",
+    body: bytes | None = None,
+    headers: dict[str, str] | None = None,
+) -> tuple[int, dict[str, str], bytes]:
+    """One request; ``path`` below the token, or from the root if it begins with a slash."""
+    parts = urllib.parse.urlsplit(server.url)
+    whole = parts.path + (path or "") if path is None or not path.startswith("/") else path
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=DEADLINE_S)
+    try:
+        connection.putrequest(method, whole, skip_host=True)
+        given = {"Host": f"127.0.0.1:{server.port}"} | (headers or {})
+        if body is not None:
+            given = {"Content-Type": "application/json", "Content-Length": str(len(body))} | given
+        for name, value in given.items():
+            if value:
+                connection.putheader(name, value)
+        connection.endheaders(body)
+        answer = connection.getresponse()
+        return answer.status, dict(answer.headers), answer.read()
+    finally:
+        connection.close()
+
+
+def look(server: PageServer, value: object) -> tuple[int, dict[str, object]]:
+    status, _, data = ask(server, "look", "POST", json.dumps(value).encode())
+    return status, json.loads(data)
+
+
+def test_every_file_of_the_page_is_served_and_allows_nobody_else(served: PageServer):
+    status, headers, page = ask(served)
+    assert status == 200 and headers["Content-Type"].startswith("text/html")
+    for name in ("style.css", "main.js", "stage.js", "panel.js", "history.js", "server.js", "icon.svg", "state"):
+        status, headers, data = ask(served, name)
+        assert status == 200 and data, name
+        assert "script-src 'self'" in headers["Content-Security-Policy"]
+        assert "unsafe" not in headers["Content-Security-Policy"]
+        assert headers["X-Content-Type-Options"] == "nosniff" and headers["Referrer-Policy"] == "no-referrer"
+        assert not [header for header in headers if header.lower().startswith("access-control")]
+        assert b"http://" not in data.replace(b"http://www.w3.org/", b"") and b"https://" not in data
+    assert b"<script" in page and b"style=" not in page and b"onclick" not in page
+    status, headers, data = ask(served, "image/0.png")
+    assert status == 200 and data.startswith(b"\x89PNG")
+
+
+def test_without_the_token_or_under_another_name_nothing_is_told(served: PageServer):
+    token = urllib.parse.urlsplit(served.url).path
+    for path in (
+        "/",
+        "/state",
+        "/look",
+        token[:-2] + "/state",
+        token.replace("/", "/x", 1),
+        "/../" + token,
+        token[:-1],
+    ):
+        status, _, data = ask(served, path)
+        assert status == 403 and len(data) < 200, path
+    for host in ("evil.example", f"evil.example:{served.port}", "127.0.0.1", f"127.0.0.1:{served.port + 1}", ""):
+        for method, body in (("GET", None), ("POST", b"{}")):
+            status, _, data = ask(served, "state" if body is None else "done", method, body, {"Host": host})
+            assert status == 403 and b"corners" not in data, host
+    status, _, _ = ask(served, "done", "POST", b"{}", {"Origin": "http://evil.example"})
+    assert status == 403
+    assert not served.done.is_set()
+    assert ask(served, "state", headers={"Host": f"localhost:{served.port}"})[0] == 200
+    assert len(urllib.parse.urlsplit(served.url).path.strip("/")) >= 32
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../server.py", "..%2fserver.py", "%2e%2e/server.py", "....//server.py", "page/index.html", "index.html",
+        "image/../state", "image/1.png", "image/-1.png", "image/0.png/..", "image/٣.png", "style.css%00", "main.js/",
+        "image/99999999999999999999.png",
+    ],
+)  # fmt: skip
+def test_no_path_leads_anywhere_else(served: PageServer, path: str):
+    status, _, data = ask(served, urllib.parse.quote(path, safe="/%"))
+    assert status in (400, 404) and b"import" not in data and b"Traceback" not in data
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (b"", "not understood"),
+        (b"{", "not understood"),
+        (b"\xff\xfe", "not understood"),
+        (b"[" * 200_000, "not understood"),
+        (b'{"corners": {"L_in_near": [1]}}', "corners"),
+        (b'{"corners": {"L_in_near": ["a", 2]}}', "corners"),
+        (b'{"corners": {"L_in_near": [NaN, 2]}}', "not understood"),
+        (b'{"corners": {"L_in_near": [1e300, 2]}}', "corners"),
+        (b'{"corners": {"nose": [1, 2]}, "image": 0}', "no such corner; one of L_in_near"),
+        (b'{"corners": {}, "image": 7}', "there is no image 7"),
+        (b'{"corners": {}}', "no live camera"),
+        (b'{"corners": {}, "image": 0, "jaw_opening_m": 0.4}', "jaw opening 400 mm; the gripper's 0 to 60 mm"),
+        (b'{"corners": {}, "image": 0, "more": 1}', "more"),
+    ],
+)
+def test_a_corrupted_request_is_told_what_is_wrong(served: PageServer, body: bytes, said: str):
+    status, _, data = ask(served, "look", "POST", body)
+    assert status == 400 and said in json.loads(data)["error"]
+    assert b"Traceback" not in data and b"\n" not in data
+
+
+def test_a_request_must_be_json_and_short(served: PageServer):
+    plain = {"Content-Type": "text/plain"}
+    assert ask(served, "look", "POST", b"{}", plain)[0] == 415
+    assert ask(served, "look", "POST", b"{}", {"Content-Length": "1000001"})[0] == 413
+    assert ask(served, "look", "POST", b"{}", {"Content-Length": "-1"})[0] == 411
+    assert ask(served, "nowhere", "POST", b"{}")[0] == 404
+    assert ask(served, "look", "DELETE")[0] == 501
+    with socket.create_connection(("127.0.0.1", served.port), timeout=DEADLINE_S) as raw:
+        raw.sendall(b"\x16\x03\x01 nonsense\r\n\r\n")
+        assert b"400" in raw.recv(4096)
+    assert ask(served, "state")[0] == 200
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    corners=st.dictionaries(
+        st.sampled_from(["L_in_near", "L_in_far", "L_out_near", "R_in_near", "R_in_far", "R_out_far"]),
+        st.tuples(st.floats(-2000.0, 2000.0), st.floats(-2000.0, 2000.0)),
+        max_size=6,
+    ),
+    by_hand=st.booleans(),
+)
+def test_wherever_corners_are_put_there_is_an_answer(
+    served: PageServer, corners: dict[str, tuple[float, float]], by_hand: bool
+):
+    status, reply = look(served, {"corners": corners, "by_hand": list(corners) if by_hand else [], "image": 0})
+    assert status == 200, reply
+    assert reply["refused"] or reply["share"] > 0.3
+    assert len(reply["corners"]) == 8
+    if reply["refused"]:
+        assert not reply["expected"] and all(corner["uv_px"] is None for corner in reply["corners"])
+
+
+def test_pages_don_t_disturb_each_other(served: PageServer, rig: Rig):
+    """Each answer is of its own corners, whoever else asks at the same time."""
+    good = rig.rough("L_in_near", "L_in_far", "R_in_near", "R_in_far")
+    few = {"L_in_near": good["L_in_near"]}
+    answers: dict[int, tuple[int, dict[str, object]]] = {}
+
+    def visit(number: int) -> None:
+        corners = few if number % 2 else good
+        answers[number] = look(served, {"corners": corners, "image": 0, "jaw_opening_m": 0.034})
+
+    visitors = [threading.Thread(target=visit, args=(number,)) for number in range(6)]
+    for visitor in visitors:
+        visitor.start()
+    for visitor in visitors:
+        visitor.join()
+    assert sorted(answers) == list(range(6))
+    for number, (status, reply) in answers.items():
+        assert status == 200
+        assert (reply["refused"] is not None) == bool(number % 2)
+        if not number % 2:
+            found = {corner["name"]: corner["uv_px"] for corner in reply["corners"]}  # type: ignore[attr-defined]
+            assert np.linalg.norm(np.array(found["L_in_near"]) - rig.corners_px["L_in_near"]) < 0.2
+
+
+def test_saving_is_told_as_it_went(served: PageServer, saving: Told, rig: Rig):
+    put = {"corners": rig.rough("L_in_near", "L_in_far", "R_in_near", "R_in_far"), "image": 0}
+    order = {"put": put, "robot": "arm", "camera_name": "wrist", "taught": False}
+    status, _, data = ask(served, "save", "POST", json.dumps(order).encode())
+    assert status == 200 and json.loads(data)["written"] == {"c": "image 0 of 1"}
+    assert saving.orders[-1].config and not saving.orders[-1].taught and not saving.orders[-1].replace
+    saving.refuse = "the disk is full"
+    status, _, data = ask(served, "save", "POST", json.dumps(order).encode())
+    saving.refuse = ""
+    assert status == 200 and json.loads(data)["refused"] == "the disk is full"
+    for robot in ("a/b", "", "@arm", "a b"):
+        assert ask(served, "save", "POST", json.dumps(order | {"robot": robot}).encode())[0] == 400
+
+
+def test_done_is_answered_before_it_is_done(rig: Rig, saving: Told):
+    picture = Picture("000000.png", rig.image, 0.034, str(rig.image_path))
+    server = PageServer(Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving))
+    try:
+        assert ask(server, "done", "POST", b"{}")[0] == 200
+        assert server.done.wait(DEADLINE_S)
+    finally:
+        server.close()
+
+
+class Camera:
+    """Gives what it is told to, for ever."""
+
+    live, connected, dropped = True, True, 0
+
+    def __init__(self, answer: Frame | Waiting):
+        self.answer, self.closed = answer, False
+
+    def read(self) -> Frame | Waiting | None:
+        time.sleep(0.01)
+        return None if self.closed else self.answer
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def shown(desk: Desk) -> bytes:
+    """The live image; empty while there is none."""
+    try:
+        return desk.live()
+    except BadRequest:
+        return b""
+
+
+def test_a_camera_of_another_size_or_none_is_said(rig: Rig, saving: Told):
+    labels = Labels("arm", "wrist", False, "/there", {}, None, "cam0")
+    camera = Camera(Frame(0, 0, np.full((48, 64), 100, np.uint8), None, "live"))
+    desk = Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [], labels, saving, camera)
+    try:
+        with pytest.raises(BadRequest, match="64x48 pixels; 768x576"):
+            desk.live()
+        camera.answer = Frame(1, 1, rig.image, 0.034, "live")
+        deadline = time.monotonic() + DEADLINE_S
+        while not (data := shown(desk)):
+            assert time.monotonic() < deadline
+        assert data.startswith(b"\xff\xd8")
+        assert [one.name for one in desk.take()] == ["live-000.png"]
+        assert desk.still(0).startswith(b"\x89PNG")
+    finally:
+        desk.close()
+    assert camera.closed
+
+
+def test_images_of_more_bits_are_shown_as_pictures(rig: Rig, saving: Told):
+    import cv2
+
+    deep = (rig.image.astype(np.uint16) * 16 + 200).astype(np.uint16)
+    picture = Picture("deep.png", deep, None, str(Path("deep.png")))
+    desk = Desk(Bench(rig.camera, rig.gripper, MonitorSettings(), None), [picture], LABELS, saving)
+    shown = cv2.imdecode(np.frombuffer(desk.still(0), np.uint8), cv2.IMREAD_UNCHANGED)
+    assert shown.dtype == np.uint8 and shown.shape[:2] == rig.image.shape[:2]
+    assert int(shown.max()) - int(shown.min()) > 200
+    desk.close()
