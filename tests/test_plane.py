@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.stats import binom, chi2
 
 from gripmon.calibration.plane import FingerCorners, GivenCamera, corners_of, lengths_of
 from gripmon.calibration.plane_equations import back_project, coincide_linear, infer_rectangle
+from gripmon.calibration.plate_pose import plate_pose
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import perturbation_between
 
@@ -174,6 +176,20 @@ def test_wrong_points_of_the_plate_are_left_out():
     assert error @ np.linalg.solve(found.covariance, error) < chi2.ppf(0.9999, 6)
     assert np.abs(error[:3]).max() < 1e-4
     assert len(clean.sighting) == len(spoilt.sighting)
+
+
+def test_no_wrong_pose_of_the_plate_wins_by_leaving_no_point_out():
+    """A plane has two poses that look alike; at the wrong one all points are off, and none is an outlier."""
+    for seed in range(60):
+        made = trial(seeded(seed), noise_px=0.02, outliers=3)
+        assert plate_pose(LENS, made.sighting)[2].rms_px < 0.05, seed
+
+
+def test_a_plate_that_doesnt_fit_the_camera_is_refused():
+    made = trial(seeded(12))
+    squeezed = replace(made.sighting, plate_m=made.sighting.plate_m * [1.0, 0.6, 1.0])
+    with pytest.raises(CalibrationError, match="the plate doesn't fit the camera: residuals of"):
+        solved(replace(made, sighting=squeezed))
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -1,0 +1,117 @@
+"""A configuration that names files of the off-line methods, and every way in which they don't belong to it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+
+from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.config import ConfigError, load_config
+from gripmon.config.yaml_file import as_yaml, read_yaml
+from gripmon.corners.taught import gripper_digest
+from gripmon.geometry import to_record
+from gripmon.gripper import load_gripper
+from gripmon.provenance import provenance_of
+from gripmon.statefile import calibration_of
+
+ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"
+COVARIANCE = tuple(np.diag([1e-10] * 3 + [1e-8] * 3).ravel().tolist())
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    gripper = load_gripper(BOX_FINGERS)
+    camera = CameraCalibration(
+        camera=PAPER_LENS, parameters=("fx_px",), covariance=(0.01,), provenance=provenance_of("a")
+    )
+    hand_eye = HandEyeCalibration(
+        camera=PAPER_LENS,
+        gripper=CalibratedGripper(name=gripper.name, sha256=gripper_digest(gripper)),
+        cam_T_grip=to_record(nominal_cam_T_grip()),
+        covariance=COVARIANCE,
+        residuals=HandEyeResiduals(rms_m=1e-5, rms_px=0.1, corners=4, images=1),
+        provenance=provenance_of("b"),
+    )
+    for name, document in (("camera.yaml", camera), ("hand_eye.yaml", hand_eye)):
+        (tmp_path / name).write_text(as_yaml(json.loads(msgspec.json.encode(document))))
+    (tmp_path / "gripper.yaml").write_text(BOX_FINGERS.read_text())
+    settings = {
+        "robot": "arm",
+        "camera_name": "wrist",
+        "camera": "camera.yaml",
+        "gripper": "gripper.yaml",
+        "reference": "hand_eye.yaml",
+        "source": {"kind": "folder", "path": "."},
+    }
+    (tmp_path / "arm.yaml").write_text(as_yaml(settings))
+    return tmp_path
+
+
+def change(path: Path, edit: Callable[[dict[str, Any]], object]) -> None:
+    values = read_yaml(path)
+    edit(values)
+    path.write_text(as_yaml(values))
+
+
+def sections() -> dict[str, Any]:
+    transform = to_record(nominal_cam_T_grip())
+    reference = {"cam_T_grip": json.loads(msgspec.json.encode(transform)), "covariance": list(COVARIANCE)}
+    return {"camera": json.loads(msgspec.json.encode(PAPER_LENS)), "reference": reference}
+
+
+def test_files_and_sections_say_the_same(folder: Path):
+    by_files = load_config(folder / "arm.yaml")
+    change(folder / "arm.yaml", lambda v: v.update(sections()))
+    by_sections = load_config(folder / "arm.yaml")
+    assert by_files.settings == by_sections.settings and by_files.reference == by_sections.reference
+    assert by_files.calibrated.paths == {"camera": folder / "camera.yaml", "reference": folder / "hand_eye.yaml"}
+    assert by_sections.calibrated.paths == {}
+    assert by_files.reference.covariance == COVARIANCE
+
+
+@pytest.mark.parametrize(
+    ("file", "edit", "line"),
+    [
+        (ARM, lambda v: v.update(camera="none.yaml"), "arm.yaml: camera: there is no file"),
+        (ARM, lambda v: v.update(reference="none.yaml"), "a file of gripmon calibrate plane, its path"),
+        (ARM, lambda v: v.update(camera="hand_eye.yaml"), "hand_eye.yaml: schema: is 'gripmon.hand_eye"),
+        (ARM, lambda v: v.update(reference="gripper.yaml"), "gripper.yaml: schema: is None; gripmon.hand_eye"),
+        (CAM, lambda v: v.update(covariance=[1.0, 2.0]), "camera.yaml: covariance: has 2 values for 1 parameters"),
+        (CAM, lambda v: v["camera"].update(fx_px=-1.0), "camera.yaml: camera.fx_px: "),
+        (CAM, lambda v: v["camera"].update(focal=9.0), "camera.yaml: camera.focal: unknown key"),
+        (CAM, lambda v: v["camera"].update(fx_px=970.0), "hand_eye.yaml: camera: isn't the configuration's"),
+        ("gripper.yaml", lambda v: v["points"]["L_in_far"].update(xyz_m=[-0.0171, 0.008, 0.0]),
+         "hand_eye.yaml: gripper: is two_box_fingers with other contents"),
+        (HE, lambda v: v["gripper"].update(name="other", sha256="0" * 64), "gripper: is other, the"),
+        (HE, lambda v: v["cam_T_grip"].update(translation_m=[0.0, 0.0, -0.1]),
+         "hand_eye.yaml: cam_T_grip.translation_m: puts the TCP behind the camera"),
+        (HE, lambda v: v.update(covariance=[0.0] * 36), "hand_eye.yaml: covariance: has a variance of zero"),
+        (HE, lambda v: v.update(covariance=[0.0] * 35), "hand_eye.yaml: covariance: has 35 values"),
+        (HE, lambda v: v.pop("provenance"), "hand_eye.yaml: provenance: is missing"),
+    ],
+)  # fmt: skip
+def test_what_doesnt_belong_together_is_one_clear_line(
+    folder: Path, file: str, edit: Callable[[dict[str, Any]], object], line: str
+):
+    change(folder / file, edit)
+    with pytest.raises(ConfigError) as caught:
+        load_config(folder / "arm.yaml")
+    assert line in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_where_a_gripper_file_comes_from_changes_no_digest(folder: Path):
+    before = load_config(folder / "arm.yaml")
+    values = json.loads(msgspec.json.encode(provenance_of("elsewhere")))
+    change(folder / "gripper.yaml", lambda v: v.update(provenance=values))
+    after = load_config(folder / "arm.yaml")
+    assert after.gripper.model.provenance is not None and before.gripper.model.provenance is None
+    assert gripper_digest(after.gripper) == gripper_digest(before.gripper)
+    lens, reference = before.camera.settings, before.reference
+    assert calibration_of(lens, after.gripper.model, reference) == calibration_of(lens, before.gripper.model, reference)
