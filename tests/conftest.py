@@ -7,6 +7,7 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import zenoh
 from commanded import Loop, reply_to
@@ -14,6 +15,10 @@ from loopback import free_endpoint, plain_session
 from published import Published
 
 from gripmon.wire import PublishSettings
+
+# No test fails because a machine is slow.
+hypothesis.settings.register_profile("unhurried", deadline=None)
+hypothesis.settings.load_profile("unhurried")
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -269,4 +269,4 @@ class LifeOfAlerts(RuleBasedStateMachine):
 
 
 TestLifeOfAlerts = LifeOfAlerts.TestCase
-TestLifeOfAlerts.settings = settings(max_examples=60, stateful_step_count=60, deadline=None)
+TestLifeOfAlerts.settings = settings(max_examples=60, stateful_step_count=60)

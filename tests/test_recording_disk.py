@@ -185,6 +185,23 @@ def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: P
     assert (writer.frames_written, writer.dropped) == (20, 0)
 
 
+def test_what_a_paused_recording_loses_is_no_thinning() -> None:
+    """The reason that it gave itself stands, and none of its losses count when it has gone on."""
+    health = Health(0.0)
+
+    def look(at_s: float, frames: int, explained: bool) -> str | None:
+        health.look(at_s, at_s, True, os.getpid(), frames, 0, explained)
+        return health.fault
+
+    assert [look(1.1 * i, 10 * i, explained=True) for i in range(1, 9)] == [None] * 8
+    assert [look(1.1 * i, 80, explained=False) for i in range(9, 15)] == [None] * 6
+    assert [look(1.1 * i, 80 + 10 * (i - 14), explained=False) is None for i in range(15, 18)] == [True, True, False]
+    assert health.fault is not None and "it can't keep up, frames are dropped" in health.fault
+    assert look(20.0, 200, explained=True) is None
+    health.look(20.0 + 2.0 * SILENT_AFTER_S, 20.0, True, os.getpid(), 200, 0, True)
+    assert health.fault is not None and health.fault.startswith("recording pauses: its process"), "silence counts"
+
+
 def test_losses_that_go_on_are_said_and_a_burst_is_not() -> None:
     health = Health(0.0)
 

@@ -198,7 +198,7 @@ def test_a_draft_that_is_no_pose_never_comes_in_force():
 STEPS = st.lists(st.sampled_from(["a", "p", "y", "n", "u", "r", "u0", "u1", "u2", "u5"]), max_size=40)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(STEPS)
 def test_whatever_is_asked_the_chain_holds_together_and_can_be_kept(steps: list[str]):
     book, names = ReferenceBook(configured(3)), {}

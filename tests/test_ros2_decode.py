@@ -178,7 +178,7 @@ def test_opening_from_joints():
         both.opening_m({"left": 0.01, "right": math.nan})
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(data=st.data())
 def test_whatever_comes_is_decoded_or_refused_in_words(data: st.DataObject):
     decode, good = data.draw(

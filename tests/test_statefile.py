@@ -88,7 +88,7 @@ def test_every_cut_and_every_flipped_bit_is_found():
     assert survivors < 5
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_whatever_happens_to_the_bytes_all_or_nothing_is_used(data: st.DataObject):
     start = data.draw(st.integers(0, len(DATA) - 1))

@@ -333,7 +333,7 @@ NAMES = st.text(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(edges=st.dictionaries(NAMES | st.sampled_from(["no", "1e5", "~", "0x1", "a: b", " x", "-"]), EDGES, min_size=1))
 def test_reading_gives_back_what_was_written(tmp_path_factory: pytest.TempPathFactory, edges: dict[str, object]):
     """Any names and numbers, to the last bit, through the file and the reader of configurations."""

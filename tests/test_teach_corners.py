@@ -13,7 +13,7 @@ import yaml
 from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
 from taught_by_hand import Rig, make_rig
 
-from gripmon.calibration.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import Settings, load_config
@@ -212,6 +212,7 @@ def test_a_calibration_with_a_plate_becomes_the_reference(rig: Rig, tmp_path: Pa
     command: list[object] = ["teach", rig.image_path, "--corners", rough, *gripper, "--out", tmp_path / "mine"]
     code, out, err = run(command, capsys)
     assert (code, err) == (0, "") and "with a plate" not in out
+    assert yaml.safe_load((tmp_path / "mine" / "config.yaml").read_text())["reference"] == "../hand_eye.yaml"
     config = load_config(tmp_path / "mine" / "config.yaml")
     np.testing.assert_allclose(config.cam_T_grip, nominal_cam_T_grip(), atol=1e-12)
     assert config.reference.covariance == made.covariance
@@ -219,7 +220,27 @@ def test_a_calibration_with_a_plate_becomes_the_reference(rig: Rig, tmp_path: Pa
     other = msgspec.structs.replace(made, gripper=CalibratedGripper(name="other", sha256="0" * 64))
     (tmp_path / "hand_eye.yaml").write_text(as_yaml(msgspec.to_builtins(other)))
     code, out, err = run([*command, "--force"], capsys)
-    assert (code, out) == (2, "") and "gripper: was made with other" in err and len(err.splitlines()) == 1
+    assert (code, out) == (2, "") and "gripper: is other, --gripper is" in err and len(err.splitlines()) == 1
+
+
+def test_a_calibrated_camera_is_named_and_its_doubt_counts(rig: Rig, tmp_path: Path, capsys):
+    made = CameraCalibration(
+        camera=rig.camera.settings,
+        parameters=("fx_px", "cx_px", "cy_px"),
+        covariance=tuple(np.diag([25.0] * 3).ravel().tolist()),
+        provenance=Provenance(gripmon="0", time="2026-01-01T00:00:00+00:00", command="test"),
+    )
+    (tmp_path / "camera.yaml").write_text(as_yaml(msgspec.to_builtins(made)))
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    given: list[object] = ["teach", rig.image_path, "--corners", rough, "--gripper", rig.folder / "gripper.yaml"]
+    assert run([*given, "--camera", tmp_path / "camera.yaml", "--out", tmp_path / "mine"], capsys)[0] == 0
+    assert run([*given, "--camera", rig.folder / "camera.yaml", "--out", tmp_path / "sure"], capsys)[0] == 0
+    assert yaml.safe_load((tmp_path / "mine" / "config.yaml").read_text())["camera"] == "../camera.yaml"
+    doubted, sure = (load_config(tmp_path / name / "config.yaml") for name in ("mine", "sure"))
+    assert doubted.camera.settings == sure.camera.settings
+    # 5 px of the principal point, at 115 mm and 962 px: 0.6 mm.
+    assert np.sqrt(doubted.reference.covariance[0]) == pytest.approx(0.115 * 5.0 / 962.0, rel=0.3)
+    assert np.sqrt(sure.reference.covariance[0]) < 1e-4
 
 
 def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
@@ -240,7 +261,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([tmp_path / "small.png", *page], "320x240 pixels; 768x576"),
         ([image, "--page", "--camera", camera], "no gripper; --gripper FILE"),
         ([image, "--page", "--gripper", gripper], "no camera; --camera FILE"),
-        ([image, "--page", "--camera", camera, "--gripper", tmp_path / "none.yaml"], "can't be read"),
+        ([image, "--page", "--camera", camera, "--gripper", tmp_path / "none.yaml"], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "none.yaml", "--gripper", gripper], "there is no such file"),
         ([image, "--page", "--camera", tmp_path / "no.yaml", "--gripper", gripper], "not YAML"),
         ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "height_px"),

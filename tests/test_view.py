@@ -27,6 +27,7 @@ from loopback import WAIT_S, free_endpoint, wait_until
 from network_daemon import ENVIRONMENT
 from rerun.chunk import RrdReader
 
+from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.recording import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
 
@@ -184,15 +185,22 @@ def refused(*arguments: str) -> str:
     return line
 
 
-def test_what_cannot_be_shown_is_said_in_one_line(tmp_path: Path):
+def test_what_cannot_be_shown_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
     (tmp_path / "empty").mkdir()
     (tmp_path / "text.rrd").write_text("no recording")
     (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
-    assert refused("view", str(tmp_path / "none.rrd")).endswith("none.rrd: there is no recording; an .rrd file")
-    assert refused("view", str(tmp_path / "empty")).endswith("empty: there is no recording; an .rrd file")
-    assert refused("view", str(tmp_path / "text.rrd")).endswith("text.rrd: is no recording; an .rrd file of gripmon's")
-    native = refused("view", str(tmp_path / "right.rrd"), "--native")
-    assert native == "view: there is no display for a window; the web viewer needs none"
+    for arguments, code, said in (
+        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no recording; an .rrd file"),
+        (("empty",), 2, f"{tmp_path}/empty: there is no recording; an .rrd file"),
+        (("text.rrd",), 2, f"{tmp_path}/text.rrd: is no recording; an .rrd file of gripmon's"),
+        (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
+    ):
+        assert main(["view", str(tmp_path / arguments[0]), *arguments[1:]]) == code
+        assert capsys.readouterr().err.splitlines() == [said]
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()

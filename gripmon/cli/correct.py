@@ -99,6 +99,11 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.playback import open_recordings
 
     found = open_recordings(paths)
+    if not found.recordings:
+        files = any(path.suffix.lower() in (".rrd", ".jsonl") for path in paths)
+        raise common.CommandFailedError(
+            f"correct: {'; '.join(found.faults)}", common.EXIT_FAILED if files else common.EXIT_USAGE
+        )
     for fault in found.faults:
         print(f"correct: {fault}", file=sys.stderr)
     _check_targets(out, _targets(out, len(found.recordings)))

@@ -239,11 +239,18 @@ def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
             "",
             f"results    {out / 'estimates.jsonl'}, {out / 'summary.json'}",
             *(f"look at it {_viewer()} {shlex.quote(recording)}" for recording in recordings),
-            f"report     gripmon report {shlex.quote(str(out))}/*.rrd --out {shlex.quote(str(out / 'report.html'))}",
+            _report_line(recordings, out),
             f"next       your own camera: cp -r {configs} mine; edit mine/live_camera.yaml;",
             "           gripmon check mine/live_camera.yaml; gripmon run mine/live_camera.yaml",
         ]
     )
+
+
+def _report_line(recordings: list[str], out: Path) -> str:
+    """How to ask what happened."""
+    if not recordings:
+        return "recording  none was written; the alerts above say why"
+    return f"report     gripmon report {shlex.join(recordings)} --out {shlex.quote(str(out / 'report.html'))}"
 
 
 def _viewer() -> str:

@@ -31,6 +31,7 @@ exit codes: 0 done, also where a part of a recording could not be used (one line
 2 wrong usage; 3 nothing in it could be used, or the folder could not be written"""
 
 _MEGABYTE = 1_000_000
+_FAULTS_SAID = 5  # in one line
 
 
 def add_parser(commands: Any) -> None:
@@ -55,10 +56,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     exporter = Exporter(out)
     faults = _export(exporter, files)
-    for fault in faults:
-        print(fault, file=sys.stderr)
     if not exporter.parts:
-        raise common.CommandFailedError(f"nothing could be exported from {_count(len(files), 'file')}")
+        more = f"; and {len(faults) - _FAULTS_SAID} more" if len(faults) > _FAULTS_SAID else ""
+        raise common.CommandFailedError(f"export: {'; '.join(faults[:_FAULTS_SAID]) or 'nothing was recorded'}{more}")
+    for fault in faults:
+        print(f"export: {fault}", file=sys.stderr)
     rows = ", ".join(f"{table} {exporter.rows[table]}" for table in SCHEMAS if exporter.rows[table])
     print(f"{out}: {rows or 'no rows yet'}, from {_count(exporter.parts, 'file')}")
     return common.EXIT_DONE

@@ -121,9 +121,10 @@ def _camera_lines(values: dict[str, Any]) -> list[str]:
 
 
 def _span(amounts: list[float | None], factor: float, sought: float) -> str:
-    low, high = (f"{factor * (sought if a is None else a):.1f}" for a in amounts)
-    # Beyond what was sought it may go on.
-    return f"-{low}{'…' * (amounts[0] is None)} to +{high}{'…' * (amounts[1] is None)}"
+    """None: it wasn't found as far as was sought."""
+    low, high = (f"{'' if a is not None else 'beyond '}{sign}" for a, sign in zip(amounts, "-+", strict=True))
+    low_amount, high_amount = (f"{factor * (sought if a is None else a):.1f}" for a in amounts)
+    return f"{low}{low_amount} to {high}{high_amount}"
 
 
 def _jaw_lines(jaw: dict[str, Any] | None) -> list[str]:

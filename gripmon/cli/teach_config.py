@@ -36,7 +36,6 @@ def config_text(
     """A whole file; ``folder`` names a path as the file does."""
     from gripmon.sources import FolderSettings
 
-    camera = inputs.bench.camera.settings
     source = inputs.source
     assert source is not None
     parts = [
@@ -45,14 +44,18 @@ def config_text(
         f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
         f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
         "",
-        "camera:",
-        lines_of(camera, 2),
+        *_camera(inputs, folder),
         "",
         f"gripper: {yaml_value(gripper)}  # path of the gripper file, relative to this file",
     ]
     if taught is not None:
         parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
-    parts += ["", _reference(reference, measured_here), "", "source:"]
+    if "reference" in inputs.calibrations:
+        there = yaml_value(folder(inputs.calibrations["reference"]))
+        parts += ["", f"reference: {there}  # file of gripmon calibrate plane, relative to this file; or a section"]
+    else:
+        parts += ["", _reference(reference, measured_here)]
+    parts += ["", "source:"]
     if isinstance(source, FolderSettings):
         parts += [
             "  kind: folder  # images in a folder",
@@ -65,6 +68,13 @@ def config_text(
         parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
     parts += ["", _defaults()]
     return "\n".join(parts) + "\n"
+
+
+def _camera(inputs: Inputs, folder: Callable[[Path], str]) -> list[str]:
+    if "camera" in inputs.calibrations:
+        there = yaml_value(folder(inputs.calibrations["camera"]))
+        return [f"camera: {there}  # file of gripmon calibrate intrinsics, relative to this file; or a section"]
+    return ["camera:", lines_of(inputs.bench.camera.settings, 2)]
 
 
 def with_taught(path: Path, taught: str) -> str:

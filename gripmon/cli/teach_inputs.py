@@ -39,6 +39,7 @@ class Inputs:
     camera_name: str
     command: str
     live: str | None
+    calibrations: dict[str, Path]
 
 
 def read_inputs(arguments: argparse.Namespace) -> Inputs:
@@ -72,13 +73,15 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
         camera_name=config.settings.camera_name if config is not None else arguments.camera_name or CAMERA_NAME,
         command=_command(arguments),
         live=arguments.live,
+        calibrations=_named(arguments),
     )
 
 
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file; a fault ends the command with exit code 2."""
     from gripmon.config.typed import to_settings
-    from gripmon.teaching.bench import RoughCorners, rough_fault
+    from gripmon.onboarding.rough import RoughCorners
+    from gripmon.teaching.bench import rough_fault
 
     with _faults_of(path):
         rough = to_settings(_yaml(path), RoughCorners)
@@ -89,22 +92,20 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
 
 def _gripper(name: str | None) -> tuple[Gripper, Path]:
-    from gripmon.gripper import GripperError, load_gripper
+    from gripmon.config import read_gripper
 
     if name is None:
         raise common.CommandFailedError(
             "teach: no gripper; --gripper FILE, one of configs/grippers or your own, or --config", common.EXIT_USAGE
         )
     path = Path(name)
-    try:
-        return load_gripper(path), path
-    except OSError as error:
-        right = "a gripper file such as those in configs/grippers"
+    if not path.is_file():
         raise common.CommandFailedError(
-            f"--gripper {path}: can't be read ({error.strerror}); {right}", common.EXIT_USAGE
-        ) from None
-    except GripperError as error:
-        raise common.CommandFailedError(f"--gripper {path}: {error}", common.EXIT_USAGE) from None
+            f"--gripper {path}: there is no such file; a gripper file such as those in configs/grippers",
+            common.EXIT_USAGE,
+        )
+    with _faults_of(path):
+        return read_gripper(path), path
 
 
 def _calibrations(
@@ -116,14 +117,7 @@ def _calibrations(
     lens, error = (None, None) if arguments.camera is None else _lens(Path(arguments.camera))
     reference = None
     if arguments.reference is not None:
-        own, reference = _hand_eye(Path(arguments.reference), gripper)
-        if lens is not None and lens != own:
-            raise common.CommandFailedError(
-                f"--reference {arguments.reference}: was made with another camera than --camera {arguments.camera}; "
-                "calibrations that belong together",
-                common.EXIT_USAGE,
-            )
-        lens = own
+        lens, reference = _hand_eye(Path(arguments.reference), lens, gripper)
     if lens is None:
         raise common.CommandFailedError(
             "teach: no camera; --camera FILE (of gripmon calibrate intrinsics), or --config", common.EXIT_USAGE
@@ -131,18 +125,27 @@ def _calibrations(
     try:
         camera = make_camera(lens)
     except ValueError as fault:
-        raise common.CommandFailedError(f"{arguments.camera or arguments.reference}: camera.{fault}", 2) from None
+        raise common.CommandFailedError(
+            f"{arguments.camera or arguments.reference}: camera.{fault}", common.EXIT_USAGE
+        ) from None
     if reference is not None:
         _check_view(camera, gripper, reference, arguments.reference)
     return camera, error, reference
+
+
+def _named(arguments: argparse.Namespace) -> dict[str, Path]:
+    """Files of ``gripmon calibrate``, which a configuration names in place of sections, by key."""
+    given = {"camera": arguments.camera, "reference": arguments.reference}
+    paths = {key: Path(name) for key, name in given.items() if name is not None}
+    return {key: path for key, path in paths.items() if "schema" in _yaml(path)}
 
 
 def _lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
     import numpy as np
 
-    from gripmon.calibration.documents import CameraCalibration
     from gripmon.camera import LensSettings
+    from gripmon.config.calibrated import read_camera
     from gripmon.config.typed import to_settings
     from gripmon.teaching.corner_pose import CameraError
 
@@ -151,39 +154,30 @@ def _lens(path: Path) -> tuple[LensSettings, CameraError | None]:
         if "schema" not in values:
             lens: LensSettings = to_settings(values, LensSettings)  # type: ignore[arg-type]
             return lens, None
-        made = to_settings(values, CameraCalibration)
+        made = read_camera(path)
+    if not made.parameters:
+        return made.camera, None
     count = len(made.parameters)
-    covariance = np.reshape(made.covariance, (-1, count)) if count else np.zeros((0, 0))
-    if covariance.shape != (count, count):
-        raise common.CommandFailedError(
-            f"{path}: covariance: has {len(made.covariance)} values; {count * count} for {count} parameters", 2
-        )
-    return made.camera, CameraError(made.parameters, covariance)
+    return made.camera, CameraError(made.parameters, np.reshape(made.covariance, (count, count)))
 
 
-def _hand_eye(path: Path, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
-    """A file of ``gripmon calibrate plane``."""
+def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
+    """A file of ``gripmon calibrate plane``, made with this camera, if one was given, and this gripper."""
     import hashlib
 
-    import msgspec
-
-    from gripmon.calibration.documents import HandEyeCalibration
-    from gripmon.config.typed import to_settings
-    from gripmon.corners.taught import gripper_digest
-    from gripmon.records import ReferenceRecord
+    from gripmon.config.calibrated import mismatch, read_hand_eye
+    from gripmon.records import ReferenceRecord, to_json
 
     with _faults_of(path):
-        made = to_settings(_yaml(path), HandEyeCalibration)
-    if made.gripper.sha256 != gripper_digest(gripper):
-        raise common.CommandFailedError(
-            f"--reference {path}: gripper: was made with {made.gripper.name} as it then was, --gripper is "
-            f"{gripper.name}; the gripper file that it was made with",
-            common.EXIT_USAGE,
-        )
-    digest = hashlib.sha256(msgspec.json.encode(made.cam_T_grip)).hexdigest()[:8]
-    return made.camera, ReferenceRecord(
-        f"plane-{digest}", 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance)
-    )
+        made = read_hand_eye(path)
+    fault = mismatch(made, lens or made.camera, gripper)
+    if fault is not None:
+        wrong = fault.wrong.replace("the configuration's camera", "--camera")
+        wrong = wrong.replace("the configuration has", "--gripper is")
+        raise common.CommandFailedError(f"--reference {path}: {fault.key}: {wrong}; {fault.right}", common.EXIT_USAGE)
+    digest = hashlib.sha256(to_json(made.cam_T_grip)).hexdigest()[:8]
+    name = f"config-{digest}"  # as the configuration that names the file will call it
+    return made.camera, ReferenceRecord(name, 0, 0, "configuration", made.cam_T_grip, tuple(made.covariance))
 
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:

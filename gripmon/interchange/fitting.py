@@ -13,6 +13,8 @@ from gripmon.records import Array
 
 GOOD_ENOUGH_PX = 0.001
 """A fit with fewer coefficients does if it is as near as this."""
+_STEPS = 20
+"""Of a refinement that begins near its end."""
 _FITTED, _CHECKED = 41, 101
 """Points along the image's longer and shorter side: where the lens is fitted, and where it is compared."""
 
@@ -59,7 +61,7 @@ def _fit(original: Camera, count: int) -> FittedLens:
             found = BrownMap(_ordered(values)).distort(np.ascontiguousarray(xy.T)).T
             return np.asarray(np.where(np.isfinite(found), found - q, 1.0)).ravel() * settings.fx_px
 
-        coefficients = least_squares(errors, start, x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+        coefficients = least_squares(errors, start, x_scale="jac", max_nfev=_STEPS).x
     lens = BrownConradyLens(
         **{key: getattr(settings, key) for key in ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px")},
         coefficients=_ordered(coefficients),

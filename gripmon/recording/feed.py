@@ -287,7 +287,9 @@ class ProcessRecorder:
     def _look(self, worker: WorkerProcess) -> None:
         if not worker.gone:
             images = self.images_dropped
-            self._health.look(time.monotonic(), worker.heard_s, worker.heard, worker.pid, self.dropped, images)
+            explained = worker.status.failure is not None
+            now_s = time.monotonic()
+            self._health.look(now_s, worker.heard_s, worker.heard, worker.pid, self.dropped, images, explained)
 
     def _running_worker(self) -> WorkerProcess | None:
         if self._worker is None and time.monotonic() >= self._restart_at:

@@ -22,15 +22,22 @@ class Health:
         self._looks_without = 0
         self._thins: str | None = None
 
-    def look(self, now_s: float, heard_s: float, heard: bool, pid: int, frames: int, images: int) -> None:
-        """``heard_s``: when it last reported, or was started while never ``heard``; then what was dropped so far."""
+    def look(
+        self, now_s: float, heard_s: float, heard: bool, pid: int, frames: int, images: int, explained: bool = False
+    ) -> None:
+        """``heard_s``: when it last reported, or was started while never ``heard``; then what was dropped so far.
+
+        ``explained``: the process itself says why it writes nothing, and what is lost meanwhile is no thinning.
+        """
         if now_s - heard_s > (SILENT_AFTER_S if heard else _START_TAKES_S):
             self.fault = f"recording pauses: {_why_silent(pid)}"
             self._counts, self._looked_s = (frames, images), now_s
             return
         if now_s - self._looked_s >= _LOOK_EVERY_S:
             self._looked_s = now_s
-            self._count(heard, frames, images)
+            self._count(heard and not explained, frames, images)
+        if explained:
+            self._thins, self._looks_with_losses = None, 0
         self.fault = self._thins
 
     def _count(self, heard: bool, frames: int, images: int) -> None:

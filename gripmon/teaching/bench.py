@@ -27,12 +27,6 @@ LARGEST_OFF_PX = 100_000.0
 """Corners are put in the image, or beside it; nothing farther is meant."""
 
 
-class RoughCorners(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A file of corners put by hand."""
-
-    corners: dict[str, tuple[float, float]]
-
-
 class Found(NamedTuple):
     """Everything that follows from corners put by hand in one image: the reference that it gives (or is known), None
     with a reason in words.

@@ -29,7 +29,7 @@ export function begin(state) {
     code.textContent = basename(state.files[kind]);
     code.title = state.files[kind];
   }
-  $("#folder").textContent = state.folder;
+  $("#folder").textContent = `\u200e${state.folder}`; // cut at its beginning, but read from left to right
   $("#folder").title = state.folder;
   $("#jaw").hidden = !state.has_jaw;
   [$("#opening").min, $("#opening").max] = [1e3 * state.jaw_m[0], 1e3 * state.jaw_m[2]];

@@ -1,0 +1,48 @@
+"""The configuration that a recording brings: the same to the last digit, without secrets, and written nowhere else."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.config.recorded import from_recorded, to_recorded
+from gripmon.records import RecordedConfiguration, RecordedFile
+
+
+@pytest.mark.parametrize("path", sorted(builtin_config("demo.yaml").parent.glob("*.yaml")), ids=lambda path: path.stem)
+def test_a_recorded_configuration_is_the_configuration(path: Path, tmp_path: Path):
+    """All settings but those that decisions don't rest on, to the last digit."""
+    config = load_config(path, check_source=False, with_taught=False)
+    again = from_recorded(
+        msgspec.json.decode(msgspec.json.encode(to_recorded(config)), type=RecordedConfiguration), tmp_path
+    )
+    for name in config.settings.__struct_fields__:
+        if name not in ("source", "publish", "ros2", "state", "view", "gripper"):
+            assert getattr(again.settings, name) == getattr(config.settings, name), name
+    assert again.gripper.model == config.gripper.model and again.reference == config.reference
+    assert again.state_owner == config.state_owner
+
+
+def test_no_password_is_recorded(tmp_path: Path):
+    text = builtin_config("live_camera.yaml").read_text()
+    text = text.replace("grippers/", f"{builtin_config('demo.yaml').parent}/grippers/")
+    text = text.replace("device: 0 ", "device: 'rtsp://operator:sesame1@camera/1' # or sesame2")
+    text = text.replace("connect: [] ", "connect: ['tls/host:7447#password=sesame3'] ")
+    assert "sesame1" in text and "sesame3" in text
+    path = tmp_path / "live.yaml"
+    path.write_text(text)
+    recorded = msgspec.json.encode(to_recorded(load_config(path, check_source=False)))
+    assert b"sesame" not in recorded and b"coefficients" in recorded
+
+
+@pytest.mark.parametrize("name", ["../outside.yaml", "/tmp/outside.yaml", "..", "a/b.yaml", ""])
+def test_a_recording_writes_nowhere_else(tmp_path: Path, name: str):
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    recorded = RecordedConfiguration("monitor.yaml", {name: RecordedFile("robot: x")})
+    with pytest.raises(ConfigError, match="a plain name"):
+        from_recorded(recorded, inside)
+    assert [path.name for path in tmp_path.iterdir()] == ["inside"] and not list(inside.iterdir())
