@@ -11,9 +11,10 @@ from plate_views import CORNERS_M, EXACT, LENS, NAMES, Trial, moved, seen_by, so
 from scipy.stats import binom, chi2
 
 from gripmon.calibration.plane import FingerCorners, GivenCamera, corners_of, lengths_of
-from gripmon.calibration.plane_equations import back_project, coincide_linear, infer_rectangle
+from gripmon.calibration.plane_equations import back_project, coincide_linear, infer_rectangle, stand
 from gripmon.calibration.plate_pose import plate_pose
 from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import make_camera
 from gripmon.geometry import perturbation_between
 
 TRIALS = 100
@@ -256,9 +257,8 @@ def test_a_corner_beyond_the_lens_is_refused():
     )
     uv_px = made.corners.uv_px.copy()
     uv_px[0] = -400.0, -400.0
-    far = Trial(made.cam_T_grip, made.sighting, FingerCorners(NAMES, uv_px, made.corners.covariance_px))
     with pytest.raises(CalibrationError, match="outside of what the lens maps"):
-        solved(far, camera=GivenCamera(lens))
+        stand(make_camera(lens), made.cam_T_grip, uv_px, made.corners.each_px2, CORNERS_M)
 
 
 def test_the_projection_of_these_tests_is_the_papers():
