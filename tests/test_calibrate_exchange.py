@@ -12,6 +12,7 @@ import pytest
 import yaml
 from plate_fingers import DISCS, OPENING_M, box_gripper, standing
 from plates import Look
+from sample_messages import MEASURED, NOTHING
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
 from urdf_parser_py.urdf import URDF
 
@@ -31,7 +32,7 @@ from gripmon.corners.taught import gripper_digest
 from gripmon.geometry import perturb, to_record
 from gripmon.gripper import contents_of
 from gripmon.provenance import provenance_of, sha256_of
-from gripmon.records import Cause, MonitorState, ReferenceRecord
+from gripmon.records import Cause, MonitorState, ReferenceRecord, to_json
 from gripmon.simulator.scenario import Sensor
 from gripmon.statefile import Calibration, Owner, pack
 
@@ -160,6 +161,19 @@ def test_the_hand_eye_of_every_source_is_the_same(made: Path, tmp_path: Path, ca
     assert "revision 3, recalibration" in gripmon(capsys, "export", state, "--format", "ros-static")[1]
     easy = gripmon(capsys, "export", state, "--format", "easy_handeye2", "--name", "wrist")[1]
     assert yaml.full_load(easy)["parameters"]["name"] == "wrist"
+
+
+def test_the_last_valid_estimate_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    other = msgspec.structs.replace(MEASURED, cam_T_grip=to_record(TRUE), seq=1)
+    path = tmp_path / "estimates.jsonl"
+    path.write_bytes(b"\n".join(map(to_json, (other, MEASURED, NOTHING))) + b"\n\n")
+    code, out, _ = gripmon(capsys, "export", path, "--format", "json")
+    content = json.loads(out)
+    assert code == 0 and content["cam_T_grip"] == json.loads(to_json(MEASURED.cam_T_grip))
+    assert f"frame {MEASURED.seq} (line 2)" in " ".join(content["notes"])
+    path.write_bytes(to_json(NOTHING))
+    code, _, said = gripmon(capsys, "export", path, "--format", "json")
+    assert code == 2 and "no line has a valid transform" in said
 
 
 def test_verify_tells_equal_hand_eyes_from_different_ones(

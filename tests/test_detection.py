@@ -10,6 +10,7 @@ import pytest
 from plates import Look, fingers, points_of, pose, render, true_uv
 from scipy.spatial import cKDTree
 
+from gripmon.calibration.chequers import _Turns
 from gripmon.calibration.detection import detect
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import Chequerboard, parse_target
@@ -176,3 +177,19 @@ def test_of_two_boards_the_one_that_was_described():
     sight = found_in(image)
     checked(sight, LENS, pose(BOARD, (-0.06, 0.0, 0.5), (0.2, 0.1)))
     assert len(sight) >= 40
+
+
+def test_a_fisheyes_border_where_steps_shrink_by_a_third():
+    board = parse_target("chequerboard:8x7:0.02")
+    T = pose(board, (0.003, -0.004, 0.063), (0.63, 0.63), 0.8)
+    distance = checked(found_in(render(FISHEYE, T, board, QUICK), board), FISHEYE, T, board)
+    assert len(distance) >= 40 and np.median(distance) < 0.05
+
+
+def test_a_knights_move_is_no_step_of_a_chequerboard():
+    """It leads to a corner of the other kind, too; where the true neighbours are hidden it must not count."""
+    turns = _Turns(np.ones(1, np.complex128))
+    right, down = np.array([30.0, 4.0]), np.array([-6.0, 26.0])
+    assert turns.basis(0, right, down)
+    assert not turns.basis(0, right, down + 2.0 * right)
+    assert not turns.basis(0, right - 2.0 * down, down)

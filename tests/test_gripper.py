@@ -214,3 +214,14 @@ def test_shipped_files_keep_their_order_and_their_bevels(path: Path):
     np.testing.assert_array_equal(gripper.edge_bevel_m, [e.get("bevel_m", 0.0) for e in written["edges"].values()])
     named = [(gripper.point_ids[i], gripper.point_ids[j]) for i, j in gripper.edge_points]
     assert named == [(e["from"], e["to"]) for e in written["edges"].values()]
+
+
+def test_an_inferred_gripper_keeps_where_it_comes_from(tmp_path: Path):
+    """A provenance's time is written without quotes, and is text all the same."""
+    model = yaml.safe_load(SHIPPED[0].read_text())
+    at = "2026-03-01T10:20:30+00:00"
+    origin = {"gripmon": "1", "time": "AT", "command": "gripmon calibrate plane", "versions": {}, "inputs": []}
+    path = tmp_path / "inferred.yaml"
+    path.write_text(yaml.safe_dump(model | {"provenance": origin}).replace("AT", at))
+    provenance = load_gripper(path).model.provenance
+    assert provenance is not None and provenance.time == at

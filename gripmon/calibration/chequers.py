@@ -34,7 +34,12 @@ class _Turns:
         return product.real < -0.4 * abs(product)
 
     def basis(self, at: int, a_px: Array, b_px: Array) -> bool:
-        return True
+        # A knight's move leads to a negative, too; then less two steps the other way it is shorter.
+        return all(
+            np.hypot(*(one + side * two)) > np.hypot(*one)
+            for one, two in ((a_px, 2.0 * b_px), (b_px, 2.0 * a_px))
+            for side in (1.0, -1.0)
+        )
 
 
 def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[float, float]]]:

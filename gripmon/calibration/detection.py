@@ -16,6 +16,8 @@ from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 from gripmon.records import Array, Image
 
+_CHARUCO = cv2.aruco.CharucoParameters()
+_CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
 _Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
 WINDOW = 0.42
 """Radius of what is looked at about a corner, in squares."""
@@ -42,11 +44,13 @@ def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
 def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     shown = to_bytes(grey)
     board, corners, ids, marks = _marked_corners(shown, target)
-    if len(ids) < FEWEST["charuco"]:
-        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) >= FEWEST["charuco"]:
+    if 2 * len(ids) < (target.columns - 1) * (target.rows - 1):
+        # In a mirrored board some marks look like others of the dictionary.
+        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
             return NotFound("the board is mirrored; an image that isn't flipped")
-        blurred = _blurred(grey)
-        return NotFound(blurred or f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}")
+        if len(ids) < FEWEST["charuco"]:
+            said = f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}"
+            return NotFound(_blurred(grey) or said)
     plate = np.asarray(board.getChessboardCorners(), np.float64)
     # Marks stand in the white squares, and must not stand in the windows.
     margin = 0.5 * (1.0 - target.marker_m / target.square_m)
@@ -68,13 +72,28 @@ def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
     for legacy in (False, True) if target.rows % 2 == 0 else (False,):
         board = cv2.aruco.CharucoBoard((target.columns, target.rows), target.square_m, target.marker_m, dictionary)
         board.setLegacyPattern(legacy)
-        corners, ids, _, marks = cv2.aruco.CharucoDetector(board).detectBoard(shown)
+        corners, ids, _, marks = cv2.aruco.CharucoDetector(board, _CHARUCO).detectBoard(shown)
         numbers = np.zeros(0, np.intp) if ids is None else np.asarray(ids, np.intp).ravel()
         places = np.asarray(corners if len(numbers) else [], np.float64).reshape(-1, 2)
-        found.append((board, places, numbers, 0 if marks is None else len(marks)))
+        agreeing = _agreeing(np.asarray(board.getChessboardCorners())[numbers], places)
+        found.append((board, places[agreeing], numbers[agreeing], 0 if marks is None else len(marks)))
         if 2 * len(found[-1][2]) > (target.columns - 1) * (target.rows - 1):
             break
     return max(found, key=lambda one: len(one[2]))
+
+
+def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
+    """(n,) which corners lie about where one plane has them: what looks like a mark need not be one."""
+    if len(places) < 5:
+        return np.ones(len(places), bool)
+    tolerance_px = 0.6 * float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+    plane, mask = cv2.findHomography(
+        plate[:, :2].astype(np.float64), places, cv2.RANSAC, tolerance_px, maxIters=500, confidence=0.999
+    )
+    if plane is None or np.linalg.det(plane[:2, :2]) < 0.0:
+        return np.zeros(len(places), bool)
+    out: NDArray[np.bool_] = mask.ravel() > 0
+    return out
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
@@ -196,7 +215,8 @@ def _sharp(grey: Grey, rough: Array, radius_px: Array) -> tuple[Array, Array, ND
     radius = np.clip(radius_px, symmetry.SMALLEST_RADIUS_PX, symmetry.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])
     edge = np.minimum(uv_px, size - 1 - uv_px).min(axis=1)
-    good = (asymmetry < symmetry.ASYMMETRIC) & (edge > radius)
+    crosses, _ = chequers.crossing(grey, np.nan_to_num(uv_px, nan=-1e3), 0.8 * radius)
+    good = (asymmetry < symmetry.ASYMMETRIC) & (edge > radius) & crosses
     return uv_px, covariance, good
 
 

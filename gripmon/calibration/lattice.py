@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 
 from gripmon.records import Array
 
-NEAR = 0.25
-"""A point is the one that was predicted if it lies within this part of the step."""
+NEAR = 0.35
+"""A point is the one that was predicted if it lies within this part of the step; a fisheye's steps change that much."""
 SEEDS = 60
 """How many starting points are tried."""
 _NEIGHBOURS = 8

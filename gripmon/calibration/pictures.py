@@ -11,7 +11,7 @@ from gripmon.records import Array, Image
 Grey = NDArray[np.float32]
 _TOP = 200.0
 _DIM = 100.0
-_PROFILE = 33
+_SAMPLES = (33, 400)
 _EDGE = float(np.sqrt(2.0 * np.pi))
 """Of a blurred edge, height over greatest slope is this times the blur's standard deviation."""
 
@@ -47,10 +47,12 @@ def edge_blur_px(grey: Grey, start: Array, end: Array) -> float:
     """
     if not len(start):
         return float("inf")
-    share = np.linspace(0.0, 1.0, _PROFILE)[None, :, None]
+    length = np.linalg.norm(end - start, axis=1)
+    samples = int(np.clip(2.0 * length.max(), *_SAMPLES))
+    share = np.linspace(0.0, 1.0, samples)[None, :, None]
     where = (start[:, None] * (1.0 - share) + end[:, None] * share).astype(np.float32)
     levels = cv2.remap(grey, where[:, :, 0], where[:, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    spacing = np.linalg.norm(end - start, axis=1) / (_PROFILE - 1)
+    spacing = length / (samples - 1)
     # Over three samples: the noise of two alone would look like a slope.
     slope = np.abs(levels[:, 3:] - levels[:, :-3]).max(axis=1) / (3.0 * spacing)
     height = np.abs(levels[:, :4].mean(axis=1) - levels[:, -4:].mean(axis=1))

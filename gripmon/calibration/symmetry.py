@@ -19,7 +19,7 @@ from gripmon.records import Array
 Grey = NDArray[np.float32]
 LARGEST_RADIUS_PX = 12.0
 SMALLEST_RADIUS_PX = 2.5
-ASYMMETRIC = 0.1
+ASYMMETRIC = 0.06
 """Root mean square of what isn't symmetric, over the contrast, beyond what the noise explains."""
 SYSTEMATIC_PX = 0.015
 """Of a point's place, that no noise explains."""

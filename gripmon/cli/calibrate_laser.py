@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gripmon.calibration.documents import CameraCalibration
     from gripmon.calibration.laser.calibrating import LaserResult, Spots
     from gripmon.calibration.laser.document import LaserCalibration
+    from gripmon.calibration.laser.planning import Plan
     from gripmon.calibration.laser.samples import Samples
     from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise
     from gripmon.records import Array
@@ -30,6 +31,7 @@ _EXAMPLES = """\
   gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --picture laser.png
   gripmon calibrate laser monday.csv tuesday.csv --camera camera.yaml --out laser.yaml --recording laser.rrd
   gripmon calibrate laser spots.yaml --camera camera.yaml --refine-lens --arm-noise 0.0001:0.0002 --out laser.yaml
+  gripmon calibrate laser spots.csv --camera camera.yaml --out laser.yaml --plan next.csv --reach 0.85
 
 exit codes: 0 written; 2 wrong usage or files; 3 the spots can't be calibrated from, and why:
 nothing is written then"""
@@ -58,7 +60,16 @@ def add_parser(methods: Any) -> None:
         metavar="M:RAD",
         help="standard deviations of the arm's poses, position (m) and rotation (rad), each axis (default: none)",
     )
+    parser.add_argument("--plan", metavar="FILE.csv", help="also write which poses would help the most next; --reach")
+    parser.add_argument("--poses", type=_count, default=10, metavar="N", help="how many are planned (default 10)")
+    parser.add_argument("--reach", type=common.positive_number, metavar="M", help="how far the arm reaches (m)")
     parser.add_argument("--force", action="store_true", help="replace files that are there")
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 200:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number of poses; 1 to 200")
+    return int(text)
 
 
 def _arm_noise(text: str) -> tuple[float, float]:
@@ -80,18 +91,29 @@ def run(arguments: argparse.Namespace) -> int:
         files.check_picture(Path(arguments.picture), force=arguments.force)
     if arguments.recording is not None:
         files.check_output(Path(arguments.recording), force=arguments.force, option="--recording")
+    if arguments.plan is not None:
+        if arguments.reach is None:
+            raise common.CommandFailedError("--plan needs --reach: how far the arm reaches; metres", common.EXIT_USAGE)
+        files.check_output(Path(arguments.plan), force=arguments.force, option="--plan")
     calibration = _camera(arguments.camera)
     samples, spots, inputs, notes = _data(arguments, calibration)
     result = _calibrated(calibration, samples, spots, arguments)
     written = _document(result, samples, notes, inputs, arguments)
+    planned = _planned(result, arguments)
     if arguments.picture is not None:
         from gripmon.calibration.laser.picture import draw
 
         files.write_picture(draw(result, samples.base_T_ee, written), Path(arguments.picture))
     if arguments.recording is not None:
         _record(result, samples.base_T_ee, Path(arguments.recording))
+    if planned is not None:
+        from gripmon.cli.laser_tables import write_plan
+
+        write_plan(planned, Path(arguments.plan))
     files.write_document(written, out)
     _report(written)
+    if planned is not None:
+        _report_plan(planned)
     print(f"written: {out}")
     return common.EXIT_DONE
 
@@ -186,7 +208,7 @@ def _document(
     options = {
         "--camera": arguments.camera, "--out": arguments.out, "--picture": arguments.picture,
         "--recording": arguments.recording, "--refine-lens": arguments.refine_lens, "--arm-noise": noise,
-        "--force": arguments.force,
+        "--plan": arguments.plan, "--reach": arguments.reach, "--force": arguments.force,
     }  # fmt: skip
     provenance = provenance_of(files.command_line("laser", arguments.data, options), inputs, SEED)
     other = [name for name, k in zip(samples.names, result.candidate, strict=True) if k > 0]
@@ -203,6 +225,26 @@ def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
         write(path, result.refined, base_T_ee, result.uv_px)
     except OSError as error:
         raise common.not_writable(path, error, "--recording") from None
+
+
+def _planned(result: LaserResult, arguments: argparse.Namespace) -> Plan | None:
+    from gripmon.calibration.laser.planning import Arm, plan
+    from gripmon.calibration.sighting import CalibrationError
+
+    if arguments.plan is None:
+        return None
+    try:
+        return plan(result.refined, Arm(arguments.reach), arguments.poses)
+    except CalibrationError as error:
+        raise common.CommandFailedError(f"calibrate laser --plan: {error}") from None
+
+
+def _report_plan(planned: Plan) -> None:
+    now, then = planned.sigmas[0], planned.sigmas[-1]
+    print(
+        f"camera's position known to {1e3 * now[0]:.2f} mm, after {len(planned.uv_px)} more to {1e3 * then[0]:.2f} mm; "
+        f"rotation to {57.29578 * now[1]:.3f} deg, then {57.29578 * then[1]:.3f} deg"
+    )
 
 
 def _report(written: LaserCalibration) -> None:

@@ -185,14 +185,14 @@ def _hand_eyes(
 
 
 def _hand_eye_lines(found: HandEyeDifference, shift_mm: float, turn_deg: float) -> list[str]:
-    lines = ["second less first, camera axes        x                  y                  z"]
+    lines = ["second less first, camera axes    " + "".join(f"{axis:<19}" for axis in "xyz").rstrip()]
     rows = (
         ("TCP (mm)", 1e3 * found.position_m, 1e3 * found.position_sigma_m),
         ("rotation (deg)", found.rotation_rad * 180.0 / math.pi, found.rotation_sigma_rad * 180.0 / math.pi),
     )
     for name, values, sigmas in rows:
         cells = "".join(f"{v:+9.4f} ± {s:<7.4f}" for v, s in zip(values.tolist(), sigmas.tolist(), strict=True))
-        lines.append(f"{name:<28}{cells}")
+        lines.append(f"{name:<28}{cells}".rstrip())
     lines.append(
         f"together {shift_mm:.4f} mm at the TCP (probability {found.position_p:.2g}), {turn_deg:.4f} degrees "
         f"(probability {found.rotation_p:.2g})"

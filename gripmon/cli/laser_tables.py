@@ -9,6 +9,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.calibration.laser.calibrating import Spots
+    from gripmon.calibration.laser.planning import Plan
     from gripmon.calibration.laser.samples import Samples
 
 _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
@@ -101,6 +102,26 @@ def _text(path: Path) -> str:
         raise common.CommandFailedError(
             f"{path}: can't be read ({error.strerror}); a table of samples", common.EXIT_USAGE
         ) from None
+
+
+def write_plan(planned: Plan, path: Path) -> None:
+    """A table as those that are read, with the expected spots; whole or not at all."""
+    import csv
+    import io
+
+    from gripmon.atomic import write_atomically
+    from gripmon.calibration.laser.samples import POSITION, QUATERNION
+    from gripmon.geometry import quaternion_xyzw
+
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*POSITION, *QUATERNION, "expected_u_px", "expected_v_px"])
+    for pose, uv in zip(planned.base_T_ee, planned.uv_px, strict=True):
+        writer.writerow([*pose[:3, 3].tolist(), *quaternion_xyzw(pose[:3, :3]), *uv.round(1).tolist()])
+    try:
+        write_atomically(path, text.getvalue().encode())
+    except OSError as error:
+        raise common.not_writable(path, error, "--plan") from None
 
 
 def image_files(samples: Samples, origins: list[Path]) -> list[Path]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -39,18 +40,36 @@ class _Layer:
     light: NDArray[np.float32]
 
 
+class Backdrop(Protocol):
+    """What is seen behind the gripper: light (height, width) in DN, as blurred as the lens makes it."""
+
+    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> NDArray[Any]: ...
+
+
 class Renderer:
-    """Renders scene states of one scenario; keeps the latest gripper layers, because often nothing moves."""
+    """Renders scene states of one scenario; keeps the latest gripper layers, because often nothing moves.
+
+    ``backdrop`` stands in for the scenario's table.
+    """
 
     def __init__(
-        self, camera: Camera, bodies: Bodies, scene: Scene, scenario: Scenario, nominal_cam_T_grip: Array, seed: int
+        self,
+        camera: Camera,
+        bodies: Bodies,
+        scene: Scene,
+        scenario: Scenario,
+        nominal_cam_T_grip: Array,
+        seed: int,
+        backdrop: Backdrop | None = None,
     ) -> None:
         self._camera, self._bodies, self._scene, self._scenario = camera, bodies, scene, scenario
         self.rays = RayGrid(camera)
         psf_px = scenario.sensor.psf_sigma_px
         self._raster = CoverageRaster(camera, psf_px)
         self._cover_raster = CoverageRaster(camera, _COVER_BLUR_PX)
-        self._table = TableView(camera, self.rays, scenario.background, nominal_cam_T_grip, seed, psf_px)
+        self._table: Backdrop = backdrop or TableView(
+            camera, self.rays, scenario.background, nominal_cam_T_grip, seed, psf_px
+        )
         rng = np.random.default_rng([seed, 5])
         painter = Painter(rng, scenario.fingers, nominal_cam_T_grip, camera.fx_px)
         self._surfaces = {solid.name: painter.metal(solid, 1.0) for solid in bodies.fingers}

@@ -10,7 +10,7 @@ from gripmon.gripper import Gripper
 from gripmon.records import Array, Frame
 from gripmon.simulator import disturbance
 from gripmon.simulator.bodies import Bodies
-from gripmon.simulator.render import Renderer
+from gripmon.simulator.render import Backdrop, Renderer
 from gripmon.simulator.scenario import Scenario
 from gripmon.simulator.scene import Scene
 from gripmon.simulator.sensor import SensorModel
@@ -22,11 +22,19 @@ class Simulator:
 
     Frame i is a pure function of camera, gripper, calibration, scenario, seed and i.  Not for several threads at once.
     Raises ValueError when the scenario doesn't fit the gripper, or the gripper has no closed convex fingers.
+    ``backdrop`` stands in for the scenario's table: a calibration plate, say.
     """
 
     def __init__(
-        self, camera: Camera, gripper: Gripper, nominal_cam_T_grip: Array, scenario: Scenario, seed: int = 0
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        nominal_cam_T_grip: Array,
+        scenario: Scenario,
+        seed: int = 0,
+        backdrop: Backdrop | None = None,
     ) -> None:
+        self._backdrop = backdrop
         self.camera, self.gripper, self.scenario, self.seed = camera, gripper, scenario, seed
         self.nominal_cam_T_grip = np.array(nominal_cam_T_grip, dtype=float)
         self._scene = Scene(camera, gripper, self.nominal_cam_T_grip, scenario, seed)
@@ -90,7 +98,8 @@ class Simulator:
         """Renderer and sensor, made when the first picture is asked for: truth needs neither."""
         if self._painting is None:
             scenario, nominal = self.scenario, self.nominal_cam_T_grip
-            renderer = Renderer(self.camera, self._bodies, self._scene, scenario, nominal, self.seed)
+            backdrop = self._backdrop
+            renderer = Renderer(self.camera, self._bodies, self._scene, scenario, nominal, self.seed, backdrop)
             self._painting = renderer, SensorModel(renderer.rays, scenario, self.seed)
         return self._painting
 

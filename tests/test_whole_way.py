@@ -1,0 +1,204 @@
+"""The whole way of a new user, by the commands that the README names: a camera and a gripper of which nobody has a file
+become a monitor that notices a knock, and no file is edited.  Truth comes from the simulator.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import new_user
+import numpy as np
+import pytest
+import yaml
+from teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
+
+from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
+from gripmon.cli import main
+from gripmon.config import load_config
+from gripmon.config.typed import to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.geometry import from_record, perturbation_between
+from gripmon.gripper import load_gripper
+from gripmon.records import Transform
+
+INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
+PORT = 7447
+"""Where a configuration that nobody has edited listens."""
+CHI2_999 = 22.5
+"""Of six degrees of freedom."""
+STEP = round(new_user.STEP_S * new_user.FPS)
+
+
+@pytest.fixture(scope="module")
+def user(tmp_path_factory: pytest.TempPathFactory) -> new_user.NewUser:
+    return new_user.make(tmp_path_factory.mktemp("new"))
+
+
+@pytest.fixture(scope="module")
+def calibrated(user: new_user.NewUser) -> Path:
+    """camera.yaml, gripper.yaml and hand_eye.yaml, by the two off-line methods."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(user.folder)
+        assert gripmon(f"calibrate intrinsics plate --target {new_user.TARGET} --model paper --out camera.yaml") == 0
+        standing = f"calibrate plane standing --target {new_user.TARGET} --camera camera.yaml --corners rough.yaml"
+        assert gripmon(f"{standing} --infer --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml") == 0
+    return user.folder
+
+
+@pytest.fixture(scope="module")
+def driver() -> Iterator[Any]:
+    opened = browser()
+    yield opened
+    opened.quit()
+
+
+def gripmon(words: str) -> int:
+    return main(words.split())
+
+
+def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, calibrated: Path):
+    camera = to_settings(read_yaml(calibrated / "camera.yaml"), CameraCalibration)
+    lens = new_user.PAPER_LENS
+    true = {"fx_px": lens.fx_px, "fy_px": lens.fy_px, "cx_px": lens.cx_px, "cy_px": lens.cy_px}
+    true |= {"kappa_per_px2": lens.kappa_per_px2}
+    off = np.array([getattr(camera.camera, name) - true[name] for name in camera.parameters])
+    covariance = np.reshape(camera.covariance, (len(off), len(off)))
+    assert len(off) == 5 and off @ np.linalg.solve(covariance, off) < 20.5  # 99.9 % of five degrees of freedom
+    assert abs(camera.camera.fx_px - lens.fx_px) < 0.3
+    hand_eye = to_settings(read_yaml(calibrated / "hand_eye.yaml"), HandEyeCalibration)
+    error = perturbation_between(from_record(hand_eye.cam_T_grip), user.cam_T_grip[0])
+    assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()
+    assert error @ np.linalg.solve(np.reshape(hand_eye.covariance, (6, 6)), error) < CHI2_999
+    found, true_gripper = load_gripper(calibrated / "gripper.yaml"), load_gripper(new_user.BOX_FINGERS)
+    corners, real = (g.points_grip_m(new_user.OPENING_M) for g in (found, true_gripper))
+    for name in INNER:
+        twin = f"{name[0].upper()}_{name.split('_', 1)[1].replace('inner', 'in')}"
+        apart = corners[found.point_ids.index(name)] - real[true_gripper.point_ids.index(twin)]
+        assert np.linalg.norm(apart) < 3e-5, name
+    # The fingers close as the real ones do, though the file was made at one opening.
+    closed = found.points_grip_m(0.01)[found.point_ids.index("right_inner_near")]
+    assert closed[0] == pytest.approx(0.005, abs=3e-5)
+
+
+def test_taught_in_the_browser_the_monitor_notices_a_knock(
+    user: new_user.NewUser, calibrated: Path, driver: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    clicks = new_user.corners_px(np.random.default_rng(3), off_px=4.0)
+    first = calibrated / "work" / "000000.png"
+    with page(first, *_given(calibrated), "--out", tmp_path, "--robot", "arm1") as running:
+        visitor = Visitor(driver, running.url)
+        for name in INNER:
+            visitor.drag(name, *clicks[name])
+        assert "TCP" in visitor.text("#expected") or visitor.find("#accuracy").is_displayed()
+        visitor.click("#save")
+        visitor.wait(lambda: "gripmon check" in visitor.text("#saved"), "the files")
+        assert visitor.complaints() == []
+        visitor.click("#done")
+        assert running.ended() == (0, "")
+    assert load_config(tmp_path / "config.yaml").settings.robot == "arm1"
+    _checked(tmp_path / "config.yaml", capsys)
+    _held_against_the_truth(user, _replayed(calibrated, tmp_path))
+
+
+def test_taught_without_a_browser_the_running_monitor_notices_a_knock(
+    user: new_user.NewUser, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    clicks = new_user.corners_px(np.random.default_rng(4), off_px=4.0)
+    rough = tmp_path / "rough.yaml"
+    rough.write_text(yaml.safe_dump({"corners": {name: clicks[name].round().tolist() for name in INNER}}))
+    first = calibrated / "work" / "000000.png"
+    options = [str(word) for word in _given(calibrated)]
+    assert main(["teach", str(first), "--corners", str(rough), *options, "--out", str(tmp_path)]) == 0
+    _checked(tmp_path / "config.yaml", capsys)
+    records = _replayed(calibrated, tmp_path)
+    _held_against_the_truth(user, records)
+    _wait_for_port()
+    ran = subprocess.run(
+        [sys.executable, "-m", "gripmon", "run", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "run")],
+        capture_output=True, text=True, timeout=4 * DEADLINE_S, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert "drift raised" in ran.stderr and "the camera moved against the gripper" in ran.stderr
+    # The daemon decides what the replay decides, frame by frame.
+    live = _lines(tmp_path / "run" / "estimates.jsonl")
+    assert [_decided(r) for r in live] == [_decided(r) for r in records]
+    assert list((tmp_path / "run").glob("*.rrd"))
+
+
+def _given(calibrated: Path) -> list[object]:
+    out: list[object] = []
+    for option, name in (("camera", "camera"), ("gripper", "gripper"), ("reference", "hand_eye")):
+        out += [f"--{option}", calibrated / f"{name}.yaml"]
+    return out
+
+
+def _checked(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(["check", str(config)]) == 0
+    said = capsys.readouterr().out
+    assert "sound" in said and "smallest step that is noticed" in said and "weakest" in said
+
+
+def _replayed(calibrated: Path, folder: Path) -> list[dict[str, Any]]:
+    out = folder / "replay.jsonl"
+    config = str(folder / "config.yaml")
+    assert main(["replay", str(calibrated / "work"), "--config", config, "--out", str(out)]) == 0
+    return _lines(out)
+
+
+def _lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def _decided(record: dict[str, Any]) -> dict[str, Any]:
+    """What a frame's record says, without how long it took and where the frame came from."""
+    return {key: value for key, value in record.items() if key not in ("latency_ns", "name")}
+
+
+def _held_against_the_truth(user: new_user.NewUser, records: list[dict[str, Any]]) -> None:
+    """No alert before the knock, one after it with the right size; the TCP within what is stated, before and after."""
+    assert len(records) == len(user.cam_T_grip)
+    raised = [k for k, record in enumerate(records) if any(a["kind"] == "drift" for a in record["alerts"])]
+    assert raised and STEP <= raised[0] <= STEP + 15, raised
+    assert records[STEP - 1]["state"] == "tracking" and records[-1]["state"] == "drifting"
+    errors, sizes = [], []
+    for record, true in zip(records, user.cam_T_grip, strict=True):
+        error = perturbation_between(_pose(record["cam_T_grip"]), true)
+        errors.append(error)
+        sizes.append(error @ np.linalg.solve(np.reshape(record["covariance"], (6, 6)), error))
+    across = np.linalg.norm(np.array(errors)[:, :2], axis=1)
+    settled = slice(-30, None)
+    assert np.median(across[:STEP]) < 3e-5 and np.median(across[settled]) < 3e-5
+    assert np.median(sizes[:STEP]) < CHI2_999 and np.median(sizes[settled]) < CHI2_999
+    shift = np.median([record["drift"]["tcp_shift_m"] for record in records[settled]], axis=0)
+    true_shift = user.cam_T_grip[-1][:3, 3] - user.cam_T_grip[0][:3, 3]
+    assert abs(true_shift[1]) > 8e-4
+    np.testing.assert_allclose(shift[:2], true_shift[:2], atol=3e-5)
+
+
+def _pose(value: dict[str, Any]) -> np.ndarray:
+    return from_record(Transform(tuple(value["translation_m"]), tuple(value["rotation_xyzw"])))
+
+
+def _wait_for_port() -> None:
+    """Until nobody else listens where the monitor will."""
+    deadline = time.monotonic() + DEADLINE_S
+    while True:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", PORT))
+            except OSError:
+                if time.monotonic() > deadline:
+                    pytest.skip(f"another program listens on port {PORT}")
+                time.sleep(0.2)
+            else:
+                return

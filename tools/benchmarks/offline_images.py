@@ -1,0 +1,194 @@
+"""Images for ``tools/bench offline``: calibration plates behind the simulator's fingers, and plates alone.
+
+Edges of the plate are ramps as wide as a sample, so that an outline is at its true place to first order whatever the
+sampling; blur, vignetting and noise are the simulator's.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.machine import ROOT
+from gripmon.calibration.targets import Chequerboard, CircleGrid
+from gripmon.camera import LensSettings, PaperLens, make_camera
+from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.gripper import Gripper, load_gripper
+from gripmon.records import Array
+from gripmon.simulator import Scenario, Simulator
+from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+
+PAPER_LENS = PaperLens(
+    width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7
+)
+DISCS = CircleGrid(8, 8, 0.008, 0.004)
+OPENING_M = 0.05
+"""The fingers then stand near the left and the right border, as in the paper."""
+TILT_RAD = np.radians(32.0)
+DISTANCE_M = 0.115
+_GRIPPER = ROOT / "configs" / "grippers" / "two_box_fingers.yaml"
+_SAMPLES = 2
+_DARK, _LIGHT = 40.0, 200.0
+_MARGIN = 1.5
+
+Grey = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A flat target at ``cam_T_plate`` (4, 4); ``errors_m`` (rows, columns, 2): by which its discs are off."""
+
+    target: CircleGrid | Chequerboard
+    cam_T_plate: Array
+    errors_m: Array | None = None
+
+    def light(self, lens: LensSettings, blur_px: float) -> Grey:
+        """Light (height, width) on the sensor, DN."""
+        rays = _rays(lens)
+        to_plate = np.linalg.inv(np.column_stack([self.cam_T_plate[:, :2], self.cam_T_plate[:, 3]])[:3])
+        x, y, w = np.moveaxis(rays @ to_plate.T, -1, 0)
+        x, y = x / w, y / w
+        dark = self._discs(x, y) if isinstance(self.target, CircleGrid) else self._squares(x, y)
+        grey = (_LIGHT + (_DARK - _LIGHT) * dark).astype(np.float32)
+        grey[~np.isfinite(grey)] = _LIGHT
+        blurred = cv2.GaussianBlur(grey, (0, 0), blur_px * _SAMPLES)
+        size = (lens.height_px, _SAMPLES, lens.width_px, _SAMPLES)
+        return np.ascontiguousarray(blurred.reshape(size).mean(axis=(1, 3)))
+
+    def _discs(self, x: Array, y: Array) -> Array:
+        target = self.target
+        assert isinstance(target, CircleGrid)
+        i, j = np.rint(x / target.spacing_m), np.rint(y / target.spacing_m)
+        inside = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows)
+        dx, dy = x - i * target.spacing_m, y - j * target.spacing_m
+        if self.errors_m is not None:
+            off = self.errors_m[np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
+            dx, dy = dx - off[..., 0], dy - off[..., 1]
+        r = np.maximum(np.hypot(dx, dy), 1e-9)
+        return np.where(inside, _covered((0.5 * target.diameter_m - r) / _step(x, y, dx / r, dy / r)), 0.0)
+
+    def _squares(self, x: Array, y: Array) -> Array:
+        target = self.target
+        assert isinstance(target, Chequerboard)
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        steps = _step(x, y, one, zero), _step(x, y, zero, one)
+        signs, inside = [], np.ones_like(x)
+        for value, step, count in zip((x, y), steps, (target.columns, target.rows), strict=True):
+            square = value / target.square_m
+            whole = np.floor(square)
+            to_line = (0.5 - np.abs(square - whole - 0.5)) * np.where(whole % 2 == 0, 1.0, -1.0) * target.square_m
+            signs.append(2.0 * _covered(to_line / step) - 1.0)
+            middle, half = 0.5 * (count - 1) * target.square_m, 0.5 * (count + 1) * target.square_m
+            inside = inside * _covered((half - np.abs(value - middle)) / step)
+        return inside * (0.5 + 0.5 * signs[0] * signs[1])
+
+
+def _covered(samples: Array) -> Array:
+    """Part of a sample that lies on the inner side of an edge which is so many samples away."""
+    return np.clip(0.5 + samples, 0.0, 1.0)
+
+
+def _step(x: Array, y: Array, nx: Array, ny: Array) -> Array:
+    """How far (m) one sample reaches along a direction on the plate."""
+    across = nx * np.gradient(x, axis=1) + ny * np.gradient(y, axis=1)
+    down = nx * np.gradient(x, axis=0) + ny * np.gradient(y, axis=0)
+    return np.maximum(np.hypot(across, down), 1e-12)
+
+
+@functools.lru_cache(maxsize=2)
+def _rays(lens: LensSettings) -> Array:
+    """(rows, columns, 3) of all samples."""
+    u = (np.arange(lens.width_px * _SAMPLES) + 0.5) / _SAMPLES - 0.5
+    v = (np.arange(lens.height_px * _SAMPLES) + 0.5) / _SAMPLES - 0.5
+    grid = np.stack(np.meshgrid(u, v), axis=-1)
+    xy = make_camera(lens).undistort(grid.reshape(-1, 2)).reshape(grid.shape)
+    return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2)
+
+
+class _Standing:
+    """The plate as the simulator's backdrop."""
+
+    def __init__(self, plate: Plate, lens: LensSettings, blur_px: float) -> None:
+        self._light = plate.light(lens, blur_px)
+
+    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> Grey:
+        return self._light.copy()
+
+
+@functools.lru_cache(maxsize=1)
+def gripper() -> Gripper:
+    return load_gripper(_GRIPPER)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One image of the gripper on the plate: where it is, how the plate lies, what isn't as it should be."""
+
+    cam_T_grip: Array
+    grip_T_plate: Array
+    errors_m: Array | None = None
+
+    @classmethod
+    def random(
+        cls, rng: np.random.Generator, *, print_m: float = 0.0, tilt_rad: tuple[float, float] = (0.0, 0.0),
+        gap_m: float = 0.0,
+    ) -> Setting:  # fmt: skip
+        """The paper's geometry, scattered; a plate turned any way, printed with errors (standard deviation each axis)
+        and standing off the gripper's contact plane by a tilt about its x and y and a gap.
+        """
+        nominal = make_transform(exp_rotation(np.array([TILT_RAD, 0.0, 0.0])), np.array([0.0, 0.002, DISTANCE_M]))
+        cam_T_grip = perturb(nominal, rng.normal(0.0, [2e-3] * 3 + [0.02] * 3))
+        turn = exp_rotation(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        middle = 0.5 * DISCS.spacing_m * np.array([DISCS.columns - 1.0, DISCS.rows - 1.0, 0.0])
+        shift = np.array([*rng.uniform(-4e-3, 4e-3, 2), 0.0])
+        off = make_transform(exp_rotation(np.array([*tilt_rad, 0.0])), np.array([0.0, 0.0, gap_m]))
+        errors = rng.normal(0.0, print_m, (DISCS.rows, DISCS.columns, 2)) if print_m else None
+        return cls(cam_T_grip, off @ make_transform(turn, shift - turn @ middle), errors)
+
+    def simulators(self, seed: int, noises_dn: tuple[float, ...]) -> list[Simulator]:
+        """The same scene with sensors of so much read noise each, sharing one plate."""
+        plate = Plate(DISCS, self.cam_T_grip @ self.grip_T_plate, self.errors_m)
+        backdrop = _Standing(plate, PAPER_LENS, Sensor().psf_sigma_px)
+        made = []
+        for noise in noises_dn:
+            scenario = Scenario(
+                name="plate",
+                background=Background(kind="plain", boxes=0, cables=0, motion="still"),
+                fingers=FingerLook(carriers=False),
+                jaw=JawScript(knots=((0.0, OPENING_M),)),
+                sensor=msgspec.structs.replace(Sensor(), read_noise_dn=noise, exposure_time_s=0.0),
+            )
+            camera = make_camera(PAPER_LENS)
+            made.append(Simulator(camera, gripper(), self.cam_T_grip, scenario, seed, backdrop))
+        return made
+
+
+def views(
+    lens: LensSettings, target: Chequerboard, count: int, rng: np.random.Generator, noise_dn: float = 1.5
+) -> list[NDArray[np.uint8]]:
+    """Images of a plate held before a camera, tilted to all sides, whole in every view."""
+    images: list[NDArray[np.uint8]] = []
+    camera = make_camera(lens)
+    size = np.array([target.columns - 1, target.rows - 1]) * target.square_m
+    outer = np.array([[-1, -1], [target.columns, -1], [target.columns, target.rows], [-1, target.rows]])
+    corners_m = np.concatenate([outer * target.square_m, np.zeros((4, 1))], axis=1)
+    while len(images) < count:
+        way = rng.uniform(0.0, 2.0 * np.pi)
+        tilt = rng.uniform(0.2, 0.75) * np.array([np.cos(way), np.sin(way), 0.0])
+        rotation = exp_rotation(tilt) @ exp_rotation(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        depth = 1.15 * lens.fx_px * size[0] / lens.width_px * rng.uniform(1.0, 1.7)
+        middle = depth * np.array([*rng.uniform(-0.2, 0.2, 2), 1.0])
+        cam_T_plate = make_transform(rotation, middle - rotation @ np.array([*(0.5 * size), 0.0]))
+        with np.errstate(invalid="ignore"):
+            uv = camera.project(corners_m @ rotation.T + cam_T_plate[:3, 3])
+            if not ((uv > 4.0) & (uv < np.array([lens.width_px, lens.height_px]) - 5.0)).all():
+                continue
+        light = Plate(target, cam_T_plate).light(lens, Sensor().psf_sigma_px)
+        noisy = light + rng.normal(0.0, noise_dn, light.shape)
+        images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
+    return images
