@@ -81,6 +81,17 @@ def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
         assert average([found], not known).warnings == ()
 
 
+def test_a_chequerboards_lines_beside_a_finger_arent_taken_for_its_edges():
+    """The board's lines run along the fingers' edges, some pixels beside them."""
+    frame = standing(CHEQUERBOARD, turn_rad=0.0, shift_m=(0.0, 0.0), look=Look(supersampling=3))
+    seen = detect(frame, CHEQUERBOARD, "along.png")
+    assert isinstance(seen, Sighting), seen
+    for seed in range(12):
+        guess = rough(outline_pixels(TRUE), seed, 6.0)
+        found = UnknownGripper(GivenCamera(PAPER_LENS)).look(frame, seen, guess).coincidence
+        assert np.linalg.norm(found.corners.uv_px - true_of(found, PAPER_LENS), axis=1).max() < 1.0, seed
+
+
 def test_a_strong_lens_bends_edges_and_they_are_still_lines():
     for method, guess in (
         (KnownGripper(GivenCamera(STRONG_LENS), box_gripper(), OPENING_M), true_corners(TRUE, STRONG_LENS)),

@@ -13,7 +13,14 @@ from gripmon.calibration.plane_average import PlaneCalibration, against
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.camera import make_camera
 from gripmon.gripper import Gripper, GripperModel
-from gripmon.onboarding.measuring import check_rough, contact_height_m, measure_known, measure_outlines, rough_pose
+from gripmon.onboarding.measuring import (
+    check_rough,
+    contact_height_m,
+    measure_known,
+    measure_outlines,
+    printed_lines,
+    rough_pose,
+)
 from gripmon.onboarding.outlines import Outline, inferred_model, outlines_of, points_in_gripper
 from gripmon.provenance import Provenance
 from gripmon.records import Array, Image
@@ -79,7 +86,9 @@ class UnknownGripper:
     def look(self, image: Image, sighting: Sighting, rough: Rough) -> Look:
         """Raises :class:`CalibrationError`."""
         outline = outlines_of(rough)
-        corners, snapped = measure_outlines(make_camera(self.camera.lens), image, outline)
+        camera = make_camera(self.camera.lens)
+        printed = printed_lines(camera, plate_pose(self.camera.lens, sighting)[0], sighting)
+        corners, snapped = measure_outlines(camera, image, outline, printed)
         found = calibrate_plane(self.camera, sighting, corners, None)
         return Look(found, {}, outline, snapped.points)
 

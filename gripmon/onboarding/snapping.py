@@ -6,9 +6,11 @@ its own, as the rough ends may be off by several pixels each in any direction.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera
@@ -37,9 +39,15 @@ SEEN_SHARE = 0.4
 """Part of its profiles that must show an edge."""
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
+PRINTED_WORTH = 0.2
+"""Of a point of an edge that may as well be the plate's print."""
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
+
+
+Printed = Callable[[Array], NDArray[np.bool_]]
+"""Which of some pixels (n, 2) lie on a line of the plate's pattern."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +73,9 @@ class _Base:
     way: Array
 
 
-def snap(camera: Camera, image: Image, outline: Outline) -> Snapped:
-    """The outline on the edges that the image shows.  Raises :class:`CalibrationError`, which names the corner or edge:
+def snap(camera: Camera, image: Image, outline: Outline, printed: Printed | None = None) -> Snapped:
+    """The outline on the edges that the image shows; where ``printed`` says that the plate has a line of its own, an
+    edge needs much more support.  Raises :class:`CalibrationError`, which names the corner or edge:
     outside of the image, not seen, or no corner.
     """
     points = outline.points
@@ -76,7 +85,7 @@ def snap(camera: Camera, image: Image, outline: Outline) -> Snapped:
         for a, b in outline.edges:
             names = f"{outline.names[a]} to {outline.names[b]}"
             base, reach_px = _lay(camera, points[a], points[b], REACH_PX if turn == 0 else FINAL_REACH_PX, names)
-            lines.append(_line(camera, image, base, reach_px, names, anywhere=turn == 0))
+            lines.append(_line(camera, image, base, reach_px, names, printed, anywhere=turn == 0))
             bases.append(base)
         found = _meet(camera, outline, points, bases, [line.ends_px for line in lines])
         moved_px = float(np.linalg.norm(found - points, axis=1).max())
@@ -114,7 +123,9 @@ def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) 
     return _Base(uv_px, normal, np.linspace(0.0, 1.0, len(fraction))), reach_px
 
 
-def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str, *, anywhere: bool) -> Line:
+def _line(
+    camera: Camera, image: Image, base: _Base, reach_px: float, names: str, printed: Printed | None, *, anywhere: bool
+) -> Line:
     offsets = profile_offsets_px(reach_px + 3.0)
     row = np.arange(-(ROWS // 2), ROWS // 2 + 1)[:, None, None]
     along = np.column_stack([base.normal[:, 1], -base.normal[:, 0]])
@@ -138,7 +149,13 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
         np.flatnonzero(near),
         np.array([int(ok.sum())]),
     )
-    line = settle_line(points, _start(points, reach_px) if anywhere else np.zeros(2)) if len(sample) else None
+    worth = np.sqrt(np.abs(points.step))
+    if anywhere and printed is not None and len(sample):
+        worth *= np.where(
+            printed(base.uv_px[sample] + points.offset_px[:, None] * base.normal[sample]), PRINTED_WORTH, 1.0
+        )
+    start = _start(points, worth, reach_px) if anywhere and len(sample) else np.zeros(2)
+    line = settle_line(points, start) if len(sample) else None
     if line is None or line.seen < SEEN_SHARE:
         seen = 0.0 if line is None else 100.0 * line.seen
         raise CalibrationError(
@@ -148,20 +165,18 @@ def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str
     return line
 
 
-def _start(points: EdgePoints, reach_px: float) -> Array:
-    """The line (2,), its offsets at both ends, that most points support, of those alike the nearest to the rough one.
-
-    High steps count more: fingers stand out of what is printed on a plate as a rule.
+def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
+    """The line (2,), its offsets at both ends, that most points by their ``worth`` (k,) support, of those alike the
+    nearest to the rough one.
     """
     steps = np.arange(-reach_px, reach_px + 0.5 * _GRID_PX, _GRID_PX)
     ends = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     votes = np.zeros(len(ends))
-    weight = np.sqrt(np.abs(points.step))
     for k in range(0, len(ends), 256):
         part = ends[k : k + 256]
         lines = part[:, :1] * (1.0 - points.way) + part[:, 1:] * points.way
         nearness = np.maximum(1.0 - np.square((points.offset_px - lines) / _START_PX), 0.0)
-        votes[k : k + 256] = nearness @ weight
+        votes[k : k + 256] = nearness @ worth
     away = np.square(ends).mean(axis=1) / reach_px**2
     best: Array = ends[int((votes * (1.0 - 0.3 * away)).argmax())]
     return best
