@@ -16,7 +16,7 @@ from taught_by_hand import Rig, make_rig
 from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.camera import make_camera
 from gripmon.cli import main
-from gripmon.config import Settings, load_config
+from gripmon.config import Settings, builtin_config, load_config
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
@@ -32,6 +32,7 @@ from gripmon.teaching.placing import place, usual_view
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 OPENING_M = 0.034
+PHOTOGRAPHS = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "visp_cube"
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +94,30 @@ def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
     assert "no fingers are seen" in str(bench.look(empty, put(good), (), OPENING_M).snapped.refused)
     away = {name: [u, v - 150.0] for name, (u, v) in good.items()}
     assert bench.look(rig.image, put(away), (), OPENING_M).snapped.refused is not None
+
+
+@pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="../shared/data/visp_cube is not there")
+def test_a_photograph_of_a_box_without_jaw():
+    """Wherever the corners were put by hand, the same ones are measured; four are enough."""
+    config = load_config(builtin_config("visp_cube.yaml"), check_source=False)
+    image = cv2.imread(str(PHOTOGRAPHS / "image0000.png"), cv2.IMREAD_GRAYSCALE)
+    points_m = config.gripper.points_grip_m()[config.gripper.corner_points]
+    shown = config.camera.project(points_m @ config.cam_T_grip[:3, :3].T + config.cam_T_grip[:3, 3])
+    bench, rng = Bench(config.camera, config.gripper, config.settings.monitor, None), np.random.default_rng(3)
+    poses, corners = [], []
+    for taken in ((0, 1, 3, 5, 6, 7), (0, 3, 6, 7), (0, 1, 5, 6), (1, 3, 4, 6)):
+        hand = {config.gripper.corner_ids[k]: shown[k] + rng.normal(0.0, 4.0, 2) for k in taken}
+        found = bench.look(image, hand, (), None)
+        assert found.reference is not None, (found.no_reference, found.snapped.refused)
+        poses.append(from_record(found.reference.cam_T_grip))
+        corners.append({c.name: c.uv_px for c in found.snapped.corners if c.uv_px is not None})
+    for pose, seen in zip(poses[1:], corners[1:], strict=True):
+        assert np.linalg.norm(pose[:3, 3] - poses[0][:3, 3]) < 5e-4
+        assert seen.keys() == corners[0].keys()
+        assert max(np.linalg.norm(at - corners[0][name]) for name, at in seen.items()) < 0.2
+    # Four points that somebody clicked on: some mm and degrees.
+    xi = perturbation_between(config.cam_T_grip, poses[0])
+    assert np.linalg.norm(xi[:3]) < 0.012 and np.linalg.norm(xi[3:]) < 0.05
 
 
 def test_what_is_expected_is_what_check_says(rig: Rig, bench: Bench):

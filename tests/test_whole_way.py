@@ -17,7 +17,6 @@ from typing import Any
 import new_user
 import numpy as np
 import pytest
-import yaml
 from teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
 from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
@@ -111,10 +110,7 @@ def test_taught_in_the_browser_the_monitor_notices_a_knock(
 def test_taught_without_a_browser_the_running_monitor_notices_a_knock(
     user: new_user.NewUser, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    clicks = new_user.corners_px(np.random.default_rng(4), off_px=4.0)
-    rough = tmp_path / "rough.yaml"
-    rough.write_text(yaml.safe_dump({"corners": {name: clicks[name].round().tolist() for name in INNER}}))
-    first = calibrated / "work" / "000000.png"
+    first, rough = calibrated / "work" / "000000.png", calibrated / "rough.yaml"  # which calibrate plane took, too
     options = [str(word) for word in _given(calibrated)]
     assert main(["teach", str(first), "--corners", str(rough), *options, "--out", str(tmp_path)]) == 0
     _checked(tmp_path / "config.yaml", capsys)

@@ -85,10 +85,12 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
     with _faults_of(path):
         rough = to_settings(_yaml(path), RoughCorners)
-    fault = rough_fault(rough.corners, gripper)
+    # The file may be the one of calibrate plane --infer, which also names points on edges: they are no corners.
+    corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
+    fault = rough_fault(corners, gripper)
     if fault is not None:
         raise common.CommandFailedError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}", common.EXIT_USAGE)
-    return rough.corners
+    return corners
 
 
 def _gripper(name: str | None) -> tuple[Gripper, Path]:

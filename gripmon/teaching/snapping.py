@@ -28,8 +28,8 @@ SURE_SHARE = 0.8
 FARTHEST_SIGMAS = 6.0
 """The gripper may show so far from the corners put by hand, in their standard deviations (root mean square)."""
 
-MISFIT_SIGMAS = 4.0
-"""So far one of them may be from where all together put it; farther, and it has another corner's name."""
+MISFIT_SIGMAS = (4.0, 12.0)
+"""A corner so far from where all together put it is named where nothing is found; so far, it has another one's name."""
 
 _SPREAD = 24  # poses about what the corners say
 _KEPT = (6, 3)  # of them, that are followed to the next finer zoom
@@ -102,14 +102,12 @@ class Snapper:
         if not known and len(put_px) < FEWEST_PUT:
             left = FEWEST_PUT - len(put_px)
             return self._rough(placed[0], jaw_opening_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
-        far = self._misfit(placed[0])
-        if far is not None:
-            name, away_px = far
-            why = f"{name} is {away_px:.0f} px from where the others put it; another corner, or another jaw opening?"
-            return self._rough(placed[0], jaw_opening_m, why)
+        if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
+            return self._rough(placed[0], jaw_opening_m, misfit)
         found = self._found(image, placed, start_m, jaw_opening_m is not None)
         if found is None or not found.trusted:
-            return self._rough(placed[0], jaw_opening_m, "no fingers are seen here; corners nearer to the fingertips")
+            why = self._misfit(placed[0], MISFIT_SIGMAS[0]) or "no fingers are seen here; corners nearer to the tips"
+            return self._rough(placed[0], jaw_opening_m, why)
         away_px = self._away_px(found, put_px)
         if away_px > FARTHEST_SIGMAS * rough_sigma_px(self.camera):
             why = f"the edges found lie {away_px:.0f} px from your corners; corners nearer to the fingertips"
@@ -139,10 +137,12 @@ class Snapper:
         meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
         return meter.measure(image, cam_T_grip, jaw_opening_m, _USUAL_SHARE, _NARROW, reported)
 
-    def _misfit(self, placed: Placed) -> tuple[str, float] | None:
-        """The corner that fits the others least, where it doesn't fit at all."""
+    def _misfit(self, placed: Placed, sigmas: float) -> str | None:
+        """The corner that fits the others least, in words, where it is farther from them than that."""
         name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
-        return (name, away_px) if away_px > MISFIT_SIGMAS * rough_sigma_px(self.camera) else None
+        if away_px <= sigmas * rough_sigma_px(self.camera):
+            return None
+        return f"{name} is {away_px:.0f} px from where the others put it; another corner, or another jaw opening?"
 
     def _away_px(self, found: Measurement, put_px: Mapping[str, Array]) -> float:
         """Root mean square distance between the corners put by hand and where the measured gripper has them."""
@@ -170,7 +170,9 @@ class Snapper:
         gripper = self.gripper
         has_jaw = gripper.has_jaw
         opening_m = found.jaw_opening_m if jaw_opening_m is None else jaw_opening_m
-        jaw_sigma_m = float(np.sqrt(found.covariance[6, 6])) if jaw_opening_m is None else self._jaw_sigma_m
+        jaw_sigma_m = self._jaw_sigma_m
+        if has_jaw and jaw_opening_m is None:
+            jaw_sigma_m = float(np.sqrt(found.covariance[6, 6]))
         model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m if has_jaw else None)
         corners = tuple(
             self._corner(found, index, name, model_px[name]) for index, name in enumerate(gripper.corner_ids)

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture is not None:
         from benchmarks import offline_plots
 
-        offline_plots.draw(errors, revealed, fits, arguments.picture)
+        offline_plots.draw(errors, revealed, arguments.picture)
     return 1 if faults else 0
 
 

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from benchmarks.offline_intrinsics import Fits
 from benchmarks.offline_plane import Errors, Revealed
 
 _COLOURS = {"known": "#0072b2", "inferred": "#d55e00", "single": "#009e73"}
 _LABELS = {"known": "gripper known", "inferred": "gripper inferred", "single": "camera from the same image"}
 
 
-def draw(errors: list[Errors], revealed: list[Revealed], fits: list[Fits], path: Path) -> None:
+def draw(errors: list[Errors], revealed: list[Revealed], path: Path) -> None:
     """Write the picture."""
     os.environ.setdefault("MPLBACKEND", "Agg")
     from matplotlib import pyplot
@@ -34,19 +34,20 @@ def draw(errors: list[Errors], revealed: list[Revealed], fits: list[Fits], path:
         panel.axvline(limit, color="#222222", linewidth=0.8)
         panel.set(xscale="log", xlabel=f"TCP error {what} the optical axis (µm)", ylim=(0.0, 1.0))
     left.set(ylabel="part of the trials")
-    left.legend(fontsize=6, loc="lower right")
+    left.legend(fontsize=6, loc="upper left")
     _draw_apart(right, revealed)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
 
 
-def _draw_apart(panel: object, revealed: list[Revealed]) -> None:
+def _draw_apart(panel: Any, revealed: list[Revealed]) -> None:
     kinds = list(dict.fromkeys(row.what for row in revealed))
     for kind, colour in zip(kinds, ("#999999", "#0072b2", "#56b4e9", "#d55e00"), strict=False):
         rows = [row for row in revealed if row.what == kind and row.count]
         told = [100.0 * max(row.by_apart, row.by_residuals) / row.count for row in rows]
-        panel.plot([row.noise_dn for row in rows], told, "o-", color=colour, label=kind)  # type: ignore[attr-defined]
-    panel.set(  # type: ignore[attr-defined]
-        xscale="log", xlabel="noise of the image (DN)", ylabel="told of (% of the images)", ylim=(-3, 103)
-    )
-    panel.legend(fontsize=7)  # type: ignore[attr-defined]
+        panel.plot([row.noise_dn for row in rows], told, "o-", color=colour, label=kind)
+    panel.set(xscale="log", xlabel="noise of the image (DN)", ylabel="told of (% of the images)", ylim=(-3, 103))
+    noises = sorted({row.noise_dn for row in revealed})
+    panel.set_xticks(noises, labels=[f"{noise:g}" for noise in noises])
+    panel.minorticks_off()
+    panel.legend(fontsize=7)
