@@ -130,8 +130,8 @@ def calibrate_plane(
     cam_T_plate, plate_covariance, bundle = plate_pose(camera.lens, sighting)
     if bundle.rms_px > LARGEST_RMS_SHARE * camera.lens.width_px:
         raise CalibrationError(
-            f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, and "
-            "the target as it is"
+            f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, "
+            "and the target as it is"
         )
     made = make_camera(camera.lens)
     given = _Given(made, cam_T_plate, corners.uv_px)
