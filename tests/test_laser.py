@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher_f
 
 from gripmon.calibration.laser import closed_form, common_plane
+from gripmon.calibration.laser.calibrating import Spots, calibrate
 from gripmon.calibration.laser.planar_start import planar_start
 from gripmon.calibration.laser.refinement import refine
 from gripmon.calibration.laser.setup import (
@@ -405,6 +406,23 @@ def test_an_arms_noise_that_is_modelled_makes_the_errors_smaller_and_the_covaria
         assert 0.7 < found.scale < 1.3  # spots and arm together explain the residuals
     assert np.sqrt(np.mean(np.square(modelled))) < np.sqrt(np.mean(np.square(plain)))
     assert 0.7 < np.mean(sizes) < 1.4
+
+
+def test_spots_noise_that_nobody_told_is_what_the_arms_leaves():
+    sizes = []
+    noise = PoseNoise(position_m=2e-4, rotation_rad=1e-3)
+    for seed in range(16):
+        data = scene(seed, orientations=9, reach_m=(0.05, 0.6))
+        rng = np.random.default_rng(seed + 500)
+        uv = data.uv_px + rng.normal(0.0, 0.2, data.uv_px.shape)
+        root = np.sqrt(noise.covariance().diagonal())
+        poses = np.stack([perturb(T, root * rng.normal(size=6)) for T in data.base_T_ee])
+        labels = tuple(map(str, data.group))
+        found = calibrate(data.camera, poses, Spots(uv), labels, pose_noise=noise).refined
+        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
+        sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
+        assert 0.7 < found.scale < 1.3
+    assert 0.6 < np.mean(sizes) < 1.7
 
 
 def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_its_prior_has_a_part_in_it():

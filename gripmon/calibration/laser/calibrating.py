@@ -20,8 +20,13 @@ from gripmon.records import Array
 FARTHEST_PLANE_M = 50.0
 LEAST_AGREEING = 0.5
 """Part of the spots that has to agree: with fewer, another set-up might explain as many."""
+MOST_TURN_RAD = 0.02
+"""Of samples that are said to be of one orientation: more than an arm's noise."""
 SUSPECT_PX = 3.0
 """Noise of spots from which it is asked whether poses and images are out of step."""
+LEAST_NOISE_PX = 0.02
+"""Of spots, however much an arm's noise explains."""
+_NOISE_ROUNDS = 8
 _OFFSETS = (1, -1, 2, -2)
 
 
@@ -50,16 +55,12 @@ def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np
     """Orientation groups from labels, or from the poses.  Raises :class:`CalibrationError` where a label's samples are
     turned against each other.
     """
-    found = orientation_groups(base_T_ee)
     if labels is None:
-        return found
-    own = np.empty(len(labels), dtype=np.intp)
-    for k, members in enumerate(found):
-        own[members] = k
+        return orientation_groups(base_T_ee)
     out = []
     for label in dict.fromkeys(labels):
         members = np.flatnonzero(np.array([other == label for other in labels]))
-        if len(set(own[members].tolist())) > 1:
+        if len(orientation_groups(base_T_ee[members], MOST_TURN_RAD)) > 1:
             raise CalibrationError(
                 f"the end-effector turns within group {label}; groups of shifts without turning, or no groups: they "
                 "are found from the poses"
@@ -114,9 +115,23 @@ def _refined(
     pose_noise: PoseNoise | None,
 ) -> LaserResult:
     def solved(uv_px: Array, setup: LaserSetup) -> Refined:
-        return refine(
-            SpotProblem(camera, base_T_ee, uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise), setup
-        )
+        noise = spots.covariance_px
+        problem = SpotProblem(camera, base_T_ee, uv_px, noise, lens=lens, pose_noise=pose_noise)
+        if pose_noise is None or noise is not None:
+            return refine(problem, setup)
+        return _told_apart(problem, uv_px, refine(SpotProblem(camera, base_T_ee, uv_px, lens=lens), setup))
+
+    def _told_apart(problem: SpotProblem, uv_px: Array, found: Refined) -> Refined:
+        # The arm's noise is given in metres: the spots' own is what is left of the residuals.
+        sigma_px = found.scale
+        for _ in range(_NOISE_ROUNDS):
+            noise = np.tile(sigma_px**2 * np.eye(2), (len(uv_px), 1, 1))
+            problem = SpotProblem(camera, base_T_ee, uv_px, noise, lens=lens, pose_noise=pose_noise)
+            found = refine(problem, found.setup)
+            if abs(found.scale - 1.0) < 0.03 or sigma_px <= LEAST_NOISE_PX:
+                break
+            sigma_px = max(sigma_px * min(found.scale, 1.0) ** 2, LEAST_NOISE_PX)
+        return found
 
     uv_px, choice = spots.uv_px, np.zeros(len(spots.uv_px), dtype=np.intp)
     found = solved(uv_px, start)

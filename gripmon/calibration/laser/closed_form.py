@@ -32,7 +32,7 @@ ON_A_LINE = 3e-3
 """Second singular value over the first below which image points are said to lie on a line."""
 FLAT = 1e-3
 """Third singular value over the first below which shifts are said to lie in a plane."""
-SAME_ORIENTATION_RAD = 2e-3
+SAME_ORIENTATION_RAD = 4e-3
 
 
 @dataclass(frozen=True, slots=True)

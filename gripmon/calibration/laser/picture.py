@@ -38,7 +38,8 @@ def _residuals(result: LaserResult, written: LaserCalibration) -> Image:
     used = refined.used
     largest = max(float(np.linalg.norm(refined.residuals_px[used], axis=1).max()), 1e-9)
     camera = refined.camera
-    stretch = 10.0 ** np.floor(np.log10(0.06 * camera.width_px / largest))
+    most = 0.06 * camera.width_px / largest
+    stretch = max(step * 10.0 ** np.floor(np.log10(most / step)) for step in (1.0, 2.0, 5.0))
     residuals = written.residuals
     image = _canvas(
         f"residuals x {stretch:g}: RMS {residuals.rms_px:.3f} px, {residuals.used} of {residuals.spots} spots used"
