@@ -126,7 +126,12 @@ def test_taught_without_a_browser_the_running_monitor_notices_a_knock(
     # The daemon decides what the replay decides, frame by frame.
     live = _lines(tmp_path / "run" / "estimates.jsonl")
     assert [_decided(r) for r in live] == [_decided(r) for r in records]
-    assert list((tmp_path / "run").glob("*.rrd"))
+    capsys.readouterr()
+    assert main(["report", str(tmp_path / "run"), "--out", str(tmp_path / "report.html")]) == 0
+    assert "moved once" in capsys.readouterr().out and (tmp_path / "report.html").exists()
+    estimates = str(tmp_path / "run" / "estimates.jsonl")
+    assert main(["calibrate", "verify", str(calibrated / "hand_eye.yaml"), estimates]) == 3
+    assert "different" in capsys.readouterr().out
 
 
 def _given(calibrated: Path) -> list[object]:
