@@ -141,7 +141,7 @@ def draw(results: Results, path: Path) -> None:
             panel.set_xlabel(label)
             panel.set_ylabel(f"mean relative error, {measure} (%)")
             panel.grid(visible=True, which="both", alpha=0.25)
-    axes[0, 0].legend(fontsize=8)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     figure.suptitle(f"base_T_cam by laser pointer and by Dornaika-Horaud; {results['trials']} trials a point")
     figure.savefig(path, dpi=90)
     pyplot.close(figure)
