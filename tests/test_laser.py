@@ -1,19 +1,16 @@
-"""The laser-pointer method: its geometry, each step of its closed form, degenerate set-ups by name, its refinement."""
+"""The laser-pointer method: its geometry, each step of its closed form, degenerate set-ups by name."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from laser_scenes import PAPER_LENS, paper_setup, sampled
+from laser_scenes import paper_setup, sampled
 from scipy.spatial.transform import Rotation
-from scipy.stats import f as fisher_f
 
 from gripmon.calibration.laser import closed_form, common_plane
-from gripmon.calibration.laser.calibrating import Spots, calibrate
 from gripmon.calibration.laser.planar_start import planar_start
 from gripmon.calibration.laser.refinement import refine
 from gripmon.calibration.laser.setup import (
-    PARAMETERS,
     LaserSetup,
     basis,
     laser_lines,
@@ -23,10 +20,9 @@ from gripmon.calibration.laser.setup import (
     spots_on_plane,
     spots_on_rays,
 )
-from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
-from gripmon.calibration.lens_models import LensModel
+from gripmon.calibration.laser.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import invert, make_transform, perturb, perturbation_between
+from gripmon.geometry import invert, make_transform, perturb
 
 STEP = 1e-6
 
@@ -339,129 +335,3 @@ def test_poses_the_wrong_way_round_are_refused_or_fit_nothing():
     inverted = np.stack([invert(T) for T in data.base_T_ee])
     with pytest.raises(CalibrationError):
         common_plane.solve(ideal(data), inverted)
-
-
-# ---- refinement
-
-
-def noisy(seed, sigma_px=0.5, **options):
-    data = scene(seed, **options)
-    return data, data.uv_px + np.random.default_rng(seed + 1000).normal(0.0, sigma_px, data.uv_px.shape)
-
-
-def test_rows_of_the_problem_are_those_of_central_differences_lens_and_prior_included():
-    data = scene(3)
-    model = LensModel("brown_conrady", 640, 480)
-    values = np.array([543.0, 545.0, 322.0, 238.0, -0.1, 0.02, 1e-3, -5e-4])
-    lens = LensPrior(model, values, (0, 1, 2, 3, 4), np.diag([1.0, 1.0, 2.0, 2.0, 1e-4]))
-    covariance = np.tile([[0.3, 0.1], [0.1, 0.2]], (50, 1, 1))
-    problem = SpotProblem(model.camera(values), data.base_T_ee, data.uv_px, covariance, lens=lens)
-    state = problem.start(data.truth).moved(1e-3 * np.random.default_rng(1).normal(size=18))
-
-    def whitened(change):
-        return problem.linearised(state.moved(change))[1]
-
-    assert np.abs(problem.linearised(state)[0] + numeric(whitened, 18)).max() < 1e-3
-    rows, _ = problem.prior(state)
-    assert np.abs(rows + numeric(lambda d: problem.prior(state.moved(d))[1], 18)).max() < 1e-6
-
-
-def test_refinement_reaches_the_truth_without_noise():
-    data = scene(6)
-    start = data.truth.moved(np.array([0.02, -0.01, 0.02, 0.03, 0.02, -0.02, 0.03, 0.02, 0.02, 0.02, 0.02, 0.01, 0.01]))
-    assert_same(refine(SpotProblem(data.camera, data.base_T_ee, data.uv_px), start).setup, data.truth, 1e-8)
-
-
-def test_errors_are_what_the_covariance_says():
-    inside, normalised = 0, []
-    trials = 120
-    for seed in range(trials):
-        data, uv = noisy(seed, orientations=9)
-        found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
-        size = error @ np.linalg.solve(found.covariance[:6, :6], error)
-        normalised.append(size / 6.0)
-        inside += size < 6.0 * fisher_f.ppf(0.95, 6, found.degrees_of_freedom)
-    # 0.95 with a standard error of 0.02: three of them.
-    assert 0.89 <= inside / trials <= 1.0
-    assert 0.8 < np.mean(normalised) < 1.3
-
-
-def test_an_arms_noise_that_is_modelled_makes_the_errors_smaller_and_the_covariance_true():
-    plain, modelled, sizes = [], [], []
-    noise = PoseNoise(position_m=2e-4, rotation_rad=1e-3)
-    for seed in range(40):
-        data = scene(seed, orientations=9, reach_m=(0.05, 0.6))
-        rng = np.random.default_rng(seed + 500)
-        uv = data.uv_px + rng.normal(0.0, 0.1, data.uv_px.shape)
-        root = np.sqrt(noise.covariance().diagonal())
-        poses = np.stack([perturb(T, root * rng.normal(size=6)) for T in data.base_T_ee])
-        pixel = np.tile(0.01 * np.eye(2), (len(uv), 1, 1))
-        without = refine(SpotProblem(data.camera, poses, uv, pixel), data.truth)
-        found = refine(SpotProblem(data.camera, poses, uv, pixel, pose_noise=noise), data.truth)
-        plain.append(perturbation_between(without.setup.cam_T_base, data.truth.cam_T_base))
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
-        modelled.append(error)
-        sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
-        assert 0.7 < found.scale < 1.3  # spots and arm together explain the residuals
-    assert np.sqrt(np.mean(np.square(modelled))) < np.sqrt(np.mean(np.square(plain)))
-    assert 0.7 < np.mean(sizes) < 1.4
-
-
-def test_spots_noise_that_nobody_told_is_what_the_arms_leaves():
-    sizes = []
-    noise = PoseNoise(position_m=2e-4, rotation_rad=1e-3)
-    for seed in range(16):
-        data = scene(seed, orientations=9, reach_m=(0.05, 0.6))
-        rng = np.random.default_rng(seed + 500)
-        uv = data.uv_px + rng.normal(0.0, 0.2, data.uv_px.shape)
-        root = np.sqrt(noise.covariance().diagonal())
-        poses = np.stack([perturb(T, root * rng.normal(size=6)) for T in data.base_T_ee])
-        labels = tuple(map(str, data.group))
-        found = calibrate(data.camera, poses, Spots(uv), labels, pose_noise=noise).refined
-        error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
-        sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
-        assert 0.7 < found.scale < 1.3
-    assert 0.6 < np.mean(sizes) < 1.7
-
-
-def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_its_prior_has_a_part_in_it():
-    model = LensModel("brown_conrady", 640, 480)
-    right = np.array([543.0, 543.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])
-    prior = np.diag([16.0, 16.0, 9.0, 9.0])
-    fixed, freed = [], []
-    for seed in range(24):
-        data, uv = noisy(seed, 0.2, orientations=12)
-        believed = right.copy()
-        believed[:4] += np.sqrt(prior.diagonal()) * np.random.default_rng(seed + 50).normal(size=4)
-        lens = LensPrior(model, believed, (0, 1, 2, 3), prior)
-        start = common_plane.solve(model.camera(believed).undistort(uv), data.base_T_ee)
-        for out, found in (
-            (fixed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)),
-            (freed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens), start)),
-        ):
-            error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
-            out.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
-        assert found.lens_covariance.shape == (4, 4) and found.covariance.shape == (13, 13)
-        assert (found.lens_covariance.diagonal() <= prior.diagonal() * 1.001).all()
-        assert found.camera.fx_px == pytest.approx(believed[0] + found.lens[0])
-    assert 0.6 < np.mean(freed) < 1.6
-    assert np.mean(fixed) > 5.0
-
-
-def test_what_is_not_determined_is_refused():
-    data = scene(orientations=5)
-    one = data.group == 0
-    with pytest.raises(CalibrationError, match=r"don't tell all|agree with each other"):
-        refine(SpotProblem(data.camera, data.base_T_ee[one], data.uv_px[one]), data.truth)
-    behind = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, -1.0, data.truth.point_ee_m,
-                        data.truth.direction_ee)  # fmt: skip
-    with pytest.raises(CalibrationError, match="before the camera"):
-        refine(SpotProblem(data.camera, data.base_T_ee, data.uv_px), behind)
-
-
-def test_parameters_have_as_many_names_as_the_covariance_has_rows():
-    data, uv = noisy(1)
-    found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
-    assert found.covariance.shape == (len(PARAMETERS), len(PARAMETERS))
-    assert found.camera == PAPER_LENS
