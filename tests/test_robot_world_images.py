@@ -1,0 +1,61 @@
+"""``gripmon calibrate robot-world`` from rendered images of a ChArUco board on the hand."""
+
+from __future__ import annotations
+
+import csv
+
+import cv2
+import msgspec
+import numpy as np
+import yaml
+from plates import pose, render
+from test_robot_world import columns, transform
+
+from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibration.targets import parse_target
+from gripmon.camera import BrownConradyLens
+from gripmon.cli import main
+from gripmon.config.yaml_file import as_yaml
+from gripmon.geometry import invert
+from gripmon.provenance import provenance_of
+
+LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)
+TARGET = "charuco:8x6:0.03:0.022:DICT_4X4_250"
+
+
+def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
+    rng = np.random.default_rng(2)
+    cam_T_base, ee_T_target = transform(rng), transform(rng, 0.1)
+    rows = []
+    for k in range(6):
+        tilt = rng.uniform(-0.5, 0.5, 2)
+        seen = pose(parse_target(TARGET), [*rng.uniform(-0.03, 0.03, 2), 0.5], tilt, rng.uniform(-0.5, 0.5))
+        cv2.imwrite(str(tmp_path / f"{k}.png"), render(LENS, seen, parse_target(TARGET), seed=k))
+        rows.append({"image": f"{k}.png", **columns("", invert(cam_T_base) @ seen @ invert(ee_T_target))})
+    with (tmp_path / "views.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    calibration = CameraCalibration(
+        camera=LENS,
+        parameters=(),
+        covariance=(),
+        residuals=CameraResiduals(rms_px=0.1, views=1, points=4, outliers=0),
+        target=TARGET,
+        provenance=provenance_of("test"),
+    )
+    (tmp_path / "camera.yaml").write_text(as_yaml(msgspec.to_builtins(calibration)))
+    out = tmp_path / "rw.yaml"
+    command = ["calibrate", "robot-world", str(tmp_path / "views.csv"), "--camera", str(tmp_path / "camera.yaml")]
+    assert main([*command, "--target", TARGET, "--out", str(out)]) == 0
+    written = yaml.safe_load(out.read_text())
+    for name, truth in (("cam_T_base", cam_T_base), ("ee_T_target", ee_T_target)):
+        error = np.array(written["transforms"][name]["translation_m"]) - truth[:3, 3]
+        sigmas = np.array([written["sigmas"][f"{name}.{axis}_m"] for axis in "xyz"])
+        assert (np.abs(error) < 6.0 * sigmas + 1e-4).all()
+        assert np.abs(error).max() < 3e-3
+    assert len(written["provenance"]["inputs"]) == 8
+    cv2.imwrite(str(tmp_path / "3.png"), np.full((480, 640), 128, np.uint8))
+    assert main([*command, "--target", TARGET, "--out", str(tmp_path / "no.yaml")]) == 3
+    assert "3.png" in capsys.readouterr().err
+    assert not (tmp_path / "no.yaml").exists()
