@@ -87,6 +87,21 @@ def test_errors_of_the_print_dont_average_out():
     assert sigma[1] > 0.95 * sigma[0]
 
 
+def test_one_print_in_images_from_different_places_isnt_taken_for_new_ones():
+    """Whichever way its errors come into each image, the mean's stated spread holds them."""
+    sizes, one = [], []
+    for seed in range(TRIALS):
+        rng = np.random.default_rng(seed)
+        errors_m = rng.normal(0.0, 5e-5, (64, 2))
+        made = [trial(rng, noise_px=0.02, corner_px=0.02, print_errors_m=errors_m, cam_T_grip=TRUE) for _ in range(4)]
+        looks = [solved(m) for m in made]
+        for found, into in ((average(looks, False), sizes), (average(looks[:1], False), one)):
+            error = perturbation_between(found.cam_T_grip, TRUE)
+            into.append(error @ np.linalg.solve(found.covariance, error))
+    for found in (sizes, one):
+        assert np.mean(found) < chi2.ppf(1.0 - 5e-5, 6 * TRIALS) / TRIALS
+
+
 def test_images_that_contradict_each_other_are_said_and_count_less():
     images = views(4, True)
     odd = trial(np.random.default_rng(5), noise_px=0.05, corner_px=0.05, name="odd.png",

@@ -77,10 +77,11 @@ class KnownCorners:
 class Coincidence:
     """What one image on the plate tells.
 
-    ``cam_T_grip`` (4, 4); ``corners_m`` (c, 3) the gripper's corners, given or inferred.  ``own`` and ``common`` (6 +
-    s, k) say what each of k independent errors, in its standard deviations, does to position of the TCP and rotation
-    (camera axes) and to the s lengths that were inferred: ``own`` those of this image alone, ``common`` those that come
-    with the camera and the plate into every image.  ``covariance`` (6, 6) follows.
+    ``cam_T_grip`` (4, 4); ``corners_m`` (c, 3) the gripper's corners, given or inferred.  ``own``, ``printed`` and
+    ``common`` (6 + s, k) say what each of k independent errors, in its standard deviations, does to position of the TCP
+    and rotation (camera axes) and to the s lengths that were inferred: ``own`` those of this image alone, ``printed``
+    those of the plate's print, which come into every image but into each in another way, ``common`` those of the
+    camera, the same errors in all images.  ``covariance`` (6, 6) follows.
 
     ``residuals_m`` (c, 2) on the plate, gripper axes, ``residuals_px`` (c, 2) measured less predicted; ``p_value``: the
     probability of residuals as large by chance, 1 where nothing is left over to test (two known corners leave one
@@ -97,6 +98,7 @@ class Coincidence:
     cam_T_grip: Array
     corners_m: Array
     own: Array
+    printed: Array
     common: Array
     residuals_m: Array
     residuals_px: Array
@@ -113,7 +115,7 @@ class Coincidence:
     @property
     def covariance(self) -> Array:
         """(6, 6) of the error: position of the TCP, then rotation, camera axes."""
-        slopes = np.concatenate([self.own[:6], self.common[:6]], axis=1)
+        slopes = np.concatenate([self.own[:6], self.printed[:6], self.common[:6]], axis=1)
         return slopes @ slopes.T
 
 
@@ -145,9 +147,9 @@ def calibrate_plane(
     # Residuals beyond what their covariances say are the print's: the same plate brings them into every image.
     print_share = 1.0 - 1.0 / max(bundle.scale, 1.0) ** 2
     own = [*_plate_directions(given, (1.0 - print_share) * plate_covariance), *_corner_directions(given, corners)]
-    common = _plate_directions(given, print_share * plate_covariance) if print_share > 0.0 else []
-    common += _camera_directions(given, camera, sighting)
-    slopes = [_slope(solve, direction) for direction in (*own, *common)]
+    printed = _plate_directions(given, print_share * plate_covariance) if print_share > 0.0 else []
+    common = _camera_directions(given, camera, sighting)
+    slopes = [_slope(solve, direction) for direction in (*own, *printed, *common)]
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
     p_value = float(chi2.sf(size, freedom)) if freedom else 1.0
@@ -162,7 +164,8 @@ def calibrate_plane(
         cam_T_grip=found.cam_T_grip,
         corners_m=found.corners_m,
         own=motion[:, : len(own)],
-        common=motion[:, len(own) :],
+        printed=motion[:, len(own) : len(own) + len(printed)],
+        common=motion[:, len(own) + len(printed) :],
         residuals_m=found.residuals_m,
         residuals_px=corners.uv_px - made.project(points),
         p_value=p_value,

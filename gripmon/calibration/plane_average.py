@@ -52,8 +52,8 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     """The weighted mean of all images on the manifold, pose and inferred lengths jointly.
 
     Weights are the images' own covariances; what the camera, or the plate's print, is off by comes into all of them
-    and doesn't average out.  Where the images differ by more than their covariances allow, the mean's is enlarged by
-    as much (Birge, "The calculation of errors by the method of least squares", 1932), and that is a warning.
+    and isn't taken to average out.  Where the images differ by more than their covariances allow, the mean's is
+    enlarged by as much (Birge, "The calculation of errors by the method of least squares", 1932), which is a warning.
     :class:`CalibrationError` for inferred grippers of different corners.
     """
     if inferred and len({i.corners.names for i in images}) > 1:
@@ -80,8 +80,8 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
             f"{farthest[0].sighting.name}, {1e3 * float(np.linalg.norm(farthest[1][:3])):.2f} mm off: the camera moved "
             f"between them, or the gripper didn't stand on the plate; uncertainty x {np.sqrt(size / freedom):.1f}"
         )
-    common = np.sum([g @ _padded(i.common, images) for g, i in zip(gains, images, strict=True)], axis=0)
-    covariance = total + common @ common.T
+    common = np.sum([g @ i.common for g, i in zip(gains, images, strict=True)], axis=0)
+    covariance = total + common @ common.T + _of_print([g @ i.printed for g, i in zip(gains, images, strict=True)])
     return PlaneCalibration(
         cam_T_grip,
         0.5 * (covariance + covariance.T)[:6, :6],
@@ -110,10 +110,19 @@ def _away(image: Coincidence, cam_T_grip: Array, lengths: Array) -> Array:
     return np.concatenate([pose, lengths_of(image.corners_m) - lengths]) if len(lengths) else pose
 
 
-def _padded(common: Array, images: Sequence[Coincidence]) -> Array:
-    """The camera's errors are the last columns, in all images alike; before them come the plate's, if there are any."""
-    most = max(image.common.shape[1] for image in images)
-    return np.pad(common, ((0, 0), (most - common.shape[1], 0)))
+def _of_print(slopes: Sequence[Array]) -> Array:
+    """A covariance (6 + s, 6 + s) that holds however the images' errors by the print, each (6 + s, k), go together.
+
+    Which of the print's errors an image shows, and how they turn into the pose's, depends on where the plate lies in
+    it.  For weights w that sum to one the sum of C / w over the images is never below the covariance of the errors' sum
+    (Cauchy-Schwarz); with w in proportion to their sizes it is also the smallest such, and equal images are worth one.
+    """
+    parts = [slope @ slope.T for slope in slopes]
+    scale = np.maximum(np.sum(parts, axis=0).diagonal(), 1e-300)
+    sizes = np.array([np.sqrt((part.diagonal() / scale).sum()) for part in parts])
+    per_weight = [sizes.sum() / size if size > 0.0 else 0.0 for size in sizes]
+    out: Array = np.sum([part * per for part, per in zip(parts, per_weight, strict=True)], axis=0)
+    return out
 
 
 def _inverse(covariance: Array) -> Array:
