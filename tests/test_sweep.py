@@ -11,6 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from meters import FISHEYE_LENS, box_gripper, difference
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
@@ -322,6 +323,23 @@ def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert coloured[110:300].mean() > 0.3
     grey = (np.ptp(picture.astype(int), axis=2) < 12) & (picture.mean(axis=2) < 200) & (picture.mean(axis=2) > 20)
     assert grey[-420:].mean() > 0.3
+
+
+def test_a_gripper_without_faces_is_drawn_by_its_edges(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As one is that was inferred from images."""
+    content = yaml.safe_load(DEMO.read_text())
+    gripper = yaml.safe_load((DEMO.parent / content["gripper"]).read_text())
+    del gripper["faces"]
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(gripper))
+    config, path = tmp_path / "config.yaml", tmp_path / "sweep.png"
+    config.write_text(yaml.safe_dump(content | {"gripper": "gripper.yaml"}))
+    assert (
+        main(["check", str(config), "--sweep", "--distance", "0.115", "--tilt", "32,40", "--picture", str(path)]) == 0
+    )
+    assert "best " in capsys.readouterr().out
+    # The present mount's thumbnail, the second of three, shows dark lines on blank grey and little else.
+    second = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[-400:-120, 530:970]
+    assert 0.01 < (second < 80).mean() < 0.2 and (abs(second.astype(int) - 170) < 4).mean() > 0.6
 
 
 def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -15,15 +15,18 @@ import numpy as np
 from PIL import Image as Pictures
 from PIL import ImageDraw, ImageFont
 
+from gripmon.gripper import Gripper
 from gripmon.outlook.sweep import Grid, Trial
 from gripmon.outlook.visibility import Rig
-from gripmon.records import Array
+from gripmon.records import Array, Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, JawScript
+from gripmon.simulator.solids import finger_solids
 
 _WIDTH, _EDGE, _GAP = 1500, 30, 36
 _INK, _FAINT, _PAPER, _MARK = (20, 20, 20), (95, 95, 95), (255, 255, 255), (226, 32, 38)
 _NOTHING = (206, 206, 206)
+_BLANK = 170
 _LEFT, _ROW, _BELOW = 50, 46, 46
 _CUT = 15
 _THUMB = 460
@@ -234,12 +237,7 @@ def _ring(draw: ImageDraw.ImageDraw, at: tuple[float, float] | None) -> None:
 
 def _look(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Pictures.Image:
     """A simulated image with the corners marked: visible ones green, others red."""
-    camera, gripper = rig.camera, rig.gripper
-    jaw = JawScript(knots=((0.0, jaw_opening_m),)) if gripper.has_jaw and jaw_opening_m is not None else JawScript()
-    image = Simulator(
-        camera, gripper, trial.cam_T_grip, Scenario(background=_STILL, fingers=_FINGERS, jaw=jaw), 1
-    ).render(0)
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = _simulated(rig, trial, jaw_opening_m) if _is_solid(rig.gripper) else _edges(rig, trial, jaw_opening_m)
     picture = Pictures.fromarray(grey).convert("RGB")
     scale = _THUMB / picture.width
     picture = picture.resize((_THUMB, round(picture.height * scale)), Pictures.Resampling.LANCZOS)
@@ -249,6 +247,40 @@ def _look(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Pictures.Image
             x, y = (uv + 0.5) * scale - 0.5
             draw.ellipse((x - 5, y - 5, x + 5, y + 5), outline=(0, 190, 60) if visible else _MARK, width=2)
     return picture
+
+
+def _is_solid(gripper: Gripper) -> bool:
+    """Whether its file says all faces; one that was inferred from images has edges alone."""
+    try:
+        finger_solids(gripper)
+    except ValueError:
+        return False
+    return True
+
+
+def _simulated(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
+    has_jaw = rig.gripper.has_jaw
+    jaw = JawScript(knots=((0.0, jaw_opening_m),)) if has_jaw and jaw_opening_m is not None else JawScript()
+    scenario = Scenario(background=_STILL, fingers=_FINGERS, jaw=jaw)
+    image = Simulator(rig.camera, rig.gripper, trial.cam_T_grip, scenario, 1).render(0)
+    return image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+
+
+def _edges(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
+    """The edges of the model as dark lines."""
+    camera, gripper = rig.camera, rig.gripper
+    image = np.full((camera.height_px, camera.width_px), _BLANK, dtype=np.uint8)
+    points_m = gripper.points_grip_m(jaw_opening_m) @ trial.cam_T_grip[:3, :3].T + trial.cam_T_grip[:3, 3]
+    way = np.linspace(0.0, 1.0, 50)[:, None]
+    thickness = max(round(camera.width_px / 250), 1)
+    for first, last in gripper.edge_points:
+        uv = camera.project(points_m[first] + way * (points_m[last] - points_m[first]))
+        # What lies far outside of the image overflows OpenCV's integers.
+        seen: Array = np.isfinite(uv).all(axis=1) & (np.abs(uv) < 1e5).all(axis=1)
+        whole = np.rint(np.where(seen[:, None], uv, 0.0)).astype(int).tolist()
+        for k in np.flatnonzero(seen[:-1] & seen[1:]):
+            cv2.line(image, whole[k], whole[k + 1], 40, thickness, cv2.LINE_AA)
+    return image
 
 
 def _name(trial: Trial, what: str) -> str:
@@ -272,7 +304,8 @@ def _caption(draw: ImageDraw.ImageDraw, trial: Trial, at: tuple[int, int], width
     ]
     if trial.covariance is not None:
         x, y, z = (1e3 * math.sqrt(v) for v in trial.covariance.diagonal()[:3].tolist())
-        lines.append(f"TCP to x {x:.3f}, y {y:.3f}, z {z:.3f} mm; notices steps of {1e3 * trial.noticed_m:.3f} mm")
+        noticed = f"steps of {1e3 * trial.noticed_m:.3f} mm" if math.isfinite(trial.noticed_m) else "no steps"
+        lines.append(f"TCP to x {x:.3f}, y {y:.3f}, z {z:.3f} mm; notices {noticed}")
     if trial.reasons:
         lines += _wrapped(trial.reasons[0], width)
     for k, line in enumerate(lines[:4]):
