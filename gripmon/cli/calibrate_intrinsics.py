@@ -141,8 +141,10 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
             else:
                 views.sightings.append(sight)
             step()
-    for name, reason in views.not_found.items():
-        print(f"{name}: {reason}", file=sys.stderr)
+    # Of images that all have the same fault the last line says enough.
+    if views.sightings or len(set(views.not_found.values())) > 1:
+        for name, reason in views.not_found.items():
+            print(f"{name}: {reason}", file=sys.stderr)
     if not views.sightings:
         (reason, times), *_ = Counter(views.not_found.values()).most_common(1)
         why = reason if times == len(paths) else f"{times} of them: {reason}"

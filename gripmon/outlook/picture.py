@@ -276,7 +276,7 @@ def _edges(rig: Rig, trial: Trial, jaw_opening_m: float | None) -> Image:
     for first, last in gripper.edge_points:
         uv = camera.project(points_m[first] + way * (points_m[last] - points_m[first]))
         # What lies far outside of the image overflows OpenCV's integers.
-        seen: Array = np.isfinite(uv).all(axis=1) & (np.abs(uv) < 1e5).all(axis=1)
+        seen = np.all(np.isfinite(uv) & (np.abs(uv) < 1e5), axis=1)
         whole = np.rint(np.where(seen[:, None], uv, 0.0)).astype(int).tolist()
         for k in np.flatnonzero(seen[:-1] & seen[1:]):
             cv2.line(image, whole[k], whole[k + 1], 40, thickness, cv2.LINE_AA)
