@@ -323,6 +323,15 @@ def test_corners_without_fingers_fail_and_write_nothing(rig: Rig, tmp_path: Path
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
 
 
+def test_a_blurred_image_is_refused_and_nothing_is_written(rig: Rig, tmp_path: Path, capsys):
+    cv2.imwrite(str(tmp_path / "blurred.png"), cv2.GaussianBlur(rig.image, (0, 0), 6.0))
+    rough = rough_file(rig, tmp_path / "rough.yaml")
+    options = ["--jaw-opening", OPENING_M, "--out", tmp_path / "out"]
+    code, _, err = run(["teach", tmp_path / "blurred.png", "--corners", rough, *rig.options, *options], capsys)
+    assert code == 3 and err.count("\n") == 1 and "blurred.png" in err
+    assert not (tmp_path / "out").exists() or not list((tmp_path / "out").iterdir())
+
+
 def test_the_file_of_corners_is_as_the_contract_says(rig: Rig, tmp_path: Path, capsys):
     """A mapping of names to columns and rows, and nothing else."""
     rough = rough_file(rig, tmp_path / "rough.yaml")

@@ -69,6 +69,7 @@ class FileSaving:
         exists = tuple(str(paths[kind]) for kind in wanted if paths[kind].exists())
         if exists and not order.replace:
             return Saved(exists=exists)
+        self._check_sharp(pictures)
         texts: dict[str, str] = {}
         if "corners" in wanted:
             texts["corners"] = self._corners(order, found, pictures[number].name)
@@ -107,6 +108,20 @@ class FileSaving:
                 path = self._inputs.folder / IMAGES / Path(picture.name).with_suffix(ending)
                 out[str(path)] = data.tobytes()
         return out
+
+    @staticmethod
+    def _check_sharp(pictures: Sequence[Picture]) -> None:
+        from gripmon.calibration.detection import BLURRED_PX
+        from gripmon.calibration.pictures import sharpest_blur_px, to_grey
+        from gripmon.teachpage import SavingRefused
+
+        for picture in pictures:
+            blur_px = sharpest_blur_px(to_grey(picture.image))
+            if blur_px > BLURRED_PX:
+                raise SavingRefused(
+                    f"{picture.name}: blurred: its sharpest edges have a standard deviation of {blur_px:.1f} px, at "
+                    f"most {BLURRED_PX:g} px; an image in focus, without motion"
+                )
 
     def _taught(
         self,
