@@ -10,10 +10,12 @@ import numpy as np
 import pytest
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
+from gripmon.hindsight import correct
 from gripmon.records import (
     AlertEvent,
     AlertKind,
     Cause,
+    FrameRecord,
     RecordedConfiguration,
     Severity,
     Verdict,
@@ -281,6 +283,45 @@ def test_whatever_a_run_holds_there_is_a_report(seed: int):
     report, told = build([Run(run, references=(REFERENCE,) * (seed % 2), image_seqs=np.arange(0, 200, 3))])
     assert msgspec.json.decode(to_json(report), type=Report).recordings[0].running.frames == len(run)
     assert report.summary and (seed % 8 or page(report, told))
+
+
+def repeated(*frames: FrameRecord) -> list[FrameRecord]:
+    """Thirty times each, to the last digit."""
+    every = [frame for frame in frames for _ in range(30)]
+    return [msgspec.structs.replace(f, seq=i, stamp_ns=START_NS + i * PERIOD_NS) for i, f in enumerate(every)]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("frames", ["one", "two", "no_covariance", "far_away", "all_far_away"])
+def test_frames_that_have_no_noise_or_no_place_are_looked_back_on(frames: str):
+    first, moved = records(np.array([[0.0, 0.0, 0.0], [0.0, 3e-3, 0.0]]))
+    far = msgspec.structs.replace(moved.cam_T_grip, translation_m=(1e160, 0.0, 0.1))
+    far_away = msgspec.structs.replace(moved, cam_T_grip=far)
+    run = {
+        "one": repeated(first),
+        "two": repeated(first, moved),
+        "no_covariance": repeated(msgspec.structs.replace(first, covariance=(0.0,) * 36)),
+        "far_away": repeated(first, far_away, first),
+        "all_far_away": repeated(far_away),
+    }[frames]
+    source = Run(run)
+    table = source.frames
+    matrices, measured = table.matrices(), np.isfinite(table.cam_T_grip).all(axis=1)
+    if frames in ("no_covariance", "all_far_away"):
+        with pytest.raises(ValueError, match="30 frames.* not used"):
+            correct(table.stamp_ns, matrices, table.covariance, measured)
+    else:
+        made = correct(table.stamp_ns, matrices, table.covariance, measured)
+        assert np.isfinite(made.cam_T_grip).all() and np.isfinite(made.covariance).all()
+        assert [point.index for point in made.change_points] == ([30] if frames == "two" else [])
+        assert bool(made.faults) == (frames == "far_away")
+
+
+def test_a_step_between_frames_without_noise_is_an_event():
+    first, moved = records(np.array([[0.0, 0.0, 0.0], [0.0, 3e-3, 0.0]]))
+    (event,) = only(Run(repeated(first, moved))).events
+    assert event.onset.found_by == "hindsight" and event.moved.size_m == pytest.approx(3e-3, rel=0.02)
+    assert event.onset.earliest_ns <= START_NS + 30 * PERIOD_NS <= event.onset.latest_ns
 
 
 def test_a_clock_that_jumps_by_years_stretches_nothing():
