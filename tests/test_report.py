@@ -309,7 +309,7 @@ def test_frames_that_have_no_noise_or_no_place_are_looked_back_on(frames: str):
     table = source.frames
     matrices, measured = table.matrices(), np.isfinite(table.cam_T_grip).all(axis=1)
     if frames in ("no_covariance", "all_far_away"):
-        with pytest.raises(ValueError, match="30 frames.* not used"):
+        with pytest.raises(ValueError, match=r"30 frames.* not used"):
             correct(table.stamp_ns, matrices, table.covariance, measured)
     else:
         made = correct(table.stamp_ns, matrices, table.covariance, measured)
