@@ -52,6 +52,7 @@ class Run:
     states: tuple[StateRecord, ...] = ()
     configuration: RecordedConfiguration | None = None
     faults: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ()
     meta: Meta | None = None
     recording_id: str = "run-1"
     files: tuple[Path, ...] = (Path("run-0001.rrd"),)

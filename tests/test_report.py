@@ -8,6 +8,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
+from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
 from gripmon.hindsight import correct
@@ -158,6 +159,34 @@ def test_what_was_lost_is_told():
     assert recording.running.gaps == 1
     assert "for 2.0 s there was no transform" in recording.summary
     assert "100 frames (20 %) are missing" in recording.summary
+
+
+GAP, DAMAGE = "run-0001.rrd: 40 frames of the run are missing", "run-0001.rrd: has 1 damaged message"
+
+
+@pytest.mark.parametrize(
+    ("faults", "monitor", "recorder", "dropped"),
+    [
+        ((GAP,), 0, 0, True),
+        ((GAP,), 30, 10, True),
+        ((GAP, DAMAGE), 30, 10, True),
+        ((GAP, DAMAGE), 30, 9, False),
+        ((GAP, DAMAGE), 0, 0, False),
+    ],
+)
+def test_frames_that_were_dropped_are_no_damage(faults: tuple[str, ...], monitor: int, recorder: int, dropped: bool):
+    run = stepped(faults=faults, gaps=(GAP,))
+    del run.records[300:340]
+    state = msgspec.structs.replace(state_record(), frames_dropped=monitor, recording_dropped=recorder)
+    run.states = (state,)
+    report, told = build([run])
+    (recording,) = report.recordings
+    assert recording.running.frames_dropped == 40
+    assert recording.running.dropped == ((GAP,) if dropped else ())
+    assert recording.faults == tuple(fault for fault in faults if not (dropped and fault == GAP))
+    text = text_of(page(report, told))
+    assert ("What of this recording could not be used" in text) == bool(recording.faults)
+    assert text.index(GAP) > text.index("How the monitor ran") if dropped else text.index(GAP) < text.index("Drift of")
 
 
 def test_noise_rate_latency_and_shares_are_those_of_the_frames():
