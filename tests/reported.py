@@ -37,6 +37,7 @@ START_NS = 1_700_000_000_000_000_000
 NOISE_M = (2e-6, 4e-6, 9e-6)
 NOISE_RAD = 5e-5
 REFERENCE = msgspec.structs.replace(recorded.REFERENCE, origin="recalibration", accepted_by="operator")
+_DIFFERENT = 50
 
 
 @dataclass
@@ -51,6 +52,7 @@ class Run:
     states: tuple[StateRecord, ...] = ()
     configuration: RecordedConfiguration | None = None
     faults: tuple[str, ...] = ()
+    gaps: tuple[str, ...] = ()
     meta: Meta | None = None
     recording_id: str = "run-1"
     files: tuple[Path, ...] = (Path("run-0001.rrd"),)
@@ -85,13 +87,18 @@ def records(shifts_m: np.ndarray, seed: int = 0, start_ns: int = START_NS, first
     """A frame for each row of ``shifts_m`` (n, 3), of the TCP against the reference, with noise; NaN: not measured."""
     reference = from_record(REFERENCE.cam_T_grip)
     rng = np.random.default_rng(seed)
+    shown = [
+        recorded.record(i) for i in range(min(len(shifts_m), _DIFFERENT))
+    ]  # their corners: dear, and not looked at
     out = []
     for i, shift_m in enumerate(shifts_m):
         seen = shift_m + rng.normal(size=3) * NOISE_M
         turn = exp_rotation(rng.normal(size=3) * NOISE_RAD)
         cam_T_grip = make_transform(turn @ reference[:3, :3], reference[:3, 3] + seen)
         drift = Drift(float(np.linalg.norm(seen)), rotation_angle(turn), tuple(seen.tolist()))
-        made = recorded.record(first_seq + i, cam_T_grip=to_record(cam_T_grip), drift=drift)
+        made = msgspec.structs.replace(
+            shown[i % _DIFFERENT], seq=first_seq + i, cam_T_grip=to_record(cam_T_grip), drift=drift
+        )
         if np.isnan(shift_m).any():
             made = msgspec.structs.replace(
                 made, cam_T_grip=None, covariance=None, drift=None, verdict=Verdict.UNKNOWN, state=State.LOST,

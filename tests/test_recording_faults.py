@@ -25,6 +25,7 @@ from recorded import (
     START_NS,
     Recorded,
     frame,
+    image,
     record,
     recorder,
     settings,
@@ -49,9 +50,12 @@ def no_child_left() -> Iterator[None]:
     assert set(psutil.Process().children()) <= before
 
 
+PICTURE = image(0)
+
+
 def offer(writer: ProcessRecorder, first: int, count: int) -> None:
     for i in range(first, first + count):
-        writer.offer(frame(i), record(i), partial(trace, i))
+        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
 
 
 def offer_and_wait(writer: ProcessRecorder, first: int, count: int) -> None:
@@ -132,9 +136,9 @@ def test_a_stalled_process_costs_frames_not_memory(tmp_path: Path) -> None:
     writer = recorder(tmp_path, queue_frames=100, queue_images=4, image_rate_hz=1000.0)
     worker = running_worker(writer)
     os.kill(worker, signal.SIGSTOP)
-    count = 3000
+    count = 600
     offer(writer, 0, count)
-    time.sleep(0.5)
+    time.sleep(0.1)
     offer(writer, count, 200)
     # A pipe's worth of records left, the rest waits in the queue or is dropped.
     assert 0 < writer.dropped < count + 100
@@ -247,8 +251,11 @@ def test_a_directory_that_vanishes_is_reported(tmp_path: Path) -> None:
 def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -> None:
     writer = recorder(tmp_path, max_file_bytes=150_000, flush_period_s=0.05, image_rate_hz=1000.0)
     running_worker(writer)
-    for i in range(0, 200, 10):
-        offer_and_wait(writer, i, 10)
+    for i in range(0, 32, 4):
+        for k in range(i, i + 4):
+            noise = np.random.default_rng(k).integers(0, 256, PICTURE.shape, np.uint8)
+            writer.offer(frame(k, noise), record(k), partial(trace, k))
+        wait_until(lambda count=i + 4: writer.frames_written == count)
     writer.close(10.0)
     paths = sorted(tmp_path.glob("*.rrd"))
     assert len(paths) > 3
@@ -261,7 +268,7 @@ def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -
         if seqs := told.seqs():
             assert told.timed("rig/reference") and told.by_seq("status/state", "state")[seqs[0]] == ["tracking"]
         seen += told.seqs()
-    assert seen == list(range(200))
+    assert seen == list(range(32))
     assert len(Recorded(*paths).recording_ids) == 1
 
 

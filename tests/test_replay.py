@@ -178,8 +178,8 @@ def test_a_lossless_recording_replays_to_the_same_transforms(sequence: Path, tmp
 def test_a_file_that_is_no_recording_is_named(tmp_path: Path, sequence: Path, capsys: pytest.CaptureFixture[str]):
     broken = tmp_path / "broken.rrd"
     broken.write_bytes(b"RRF2 but no more")
-    assert main(["replay", str(broken), "--config", str(sequence / "config.yaml"), "--out", "-"]) == 2
-    assert f"{broken} can't be read" in capsys.readouterr().err
+    assert main(["replay", str(broken), "--config", str(sequence / "config.yaml"), "--out", "-"]) == 3
+    assert f"{broken}: is cut short before its recording begins" in capsys.readouterr().err
 
 
 def test_an_output_that_cannot_be_written_is_said_before_work_begins(

@@ -8,12 +8,15 @@ import re
 import msgspec
 import numpy as np
 import pytest
+from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
+from gripmon.hindsight import correct
 from gripmon.records import (
     AlertEvent,
     AlertKind,
     Cause,
+    FrameRecord,
     RecordedConfiguration,
     Severity,
     Verdict,
@@ -158,6 +161,34 @@ def test_what_was_lost_is_told():
     assert "100 frames (20 %) are missing" in recording.summary
 
 
+GAP, DAMAGE = "run-0001.rrd: 40 frames of the run are missing", "run-0001.rrd: has 1 damaged message"
+
+
+@pytest.mark.parametrize(
+    ("faults", "monitor", "recorder", "dropped"),
+    [
+        ((GAP,), 0, 0, True),
+        ((GAP,), 30, 10, True),
+        ((GAP, DAMAGE), 30, 10, True),
+        ((GAP, DAMAGE), 30, 9, False),
+        ((GAP, DAMAGE), 0, 0, False),
+    ],
+)
+def test_frames_that_were_dropped_are_no_damage(faults: tuple[str, ...], monitor: int, recorder: int, dropped: bool):
+    run = stepped(faults=faults, gaps=(GAP,))
+    del run.records[300:340]
+    state = msgspec.structs.replace(state_record(), frames_dropped=monitor, recording_dropped=recorder)
+    run.states = (state,)
+    report, told = build([run])
+    (recording,) = report.recordings
+    assert recording.running.frames_dropped == 40
+    assert recording.running.dropped == ((GAP,) if dropped else ())
+    assert recording.faults == tuple(fault for fault in faults if not (dropped and fault == GAP))
+    text = text_of(page(report, told))
+    assert ("What of this recording could not be used" in text) == bool(recording.faults)
+    assert text.index(GAP) > text.index("How the monitor ran") if dropped else text.index(GAP) < text.index("Drift of")
+
+
 def test_noise_rate_latency_and_shares_are_those_of_the_frames():
     running = only(stepped(n=2000)).running
     assert running.noise.position_m == pytest.approx(NOISE_M, rel=0.1)
@@ -239,18 +270,19 @@ def test_the_data_are_what_the_page_shows_and_come_back_from_json():
 
 
 def test_a_long_run_is_short_on_the_page_and_loses_no_outlier():
-    n = 40_000
+    """Longer than what is looked back on as a whole."""
+    n, wild, step = 21_000, 6_345, 15_000
     shifts_m = np.zeros((n, 3))
-    shifts_m[12_345, 0] = 2e-3  # one wild frame
-    shifts_m[30_000:, 1] = 1e-3
+    shifts_m[wild, 0] = 2e-3
+    shifts_m[step:, 1] = 1e-3
     run = records(shifts_m)
-    said(run, 30_002)
+    said(run, step + 2)
     recording = only(Run(run))
     assert len(recording.affected) == 1, "one frame affects nothing"
     x = next(c for c in recording.curves if c.name == "x_m")
     assert len(x.stamp_ns) < 4000
     assert max(x.high) == pytest.approx(2e-3, abs=1e-4)
-    near = [t for t in x.stamp_ns if abs(t - (START_NS + 30_000 * PERIOD_NS)) <= SECOND_NS]
+    near = [t for t in x.stamp_ns if abs(t - (START_NS + step * PERIOD_NS)) <= SECOND_NS]
     assert len(near) == 2 * FPS + 1, "around a motion every frame is there"
 
 
@@ -281,6 +313,45 @@ def test_whatever_a_run_holds_there_is_a_report(seed: int):
     report, told = build([Run(run, references=(REFERENCE,) * (seed % 2), image_seqs=np.arange(0, 200, 3))])
     assert msgspec.json.decode(to_json(report), type=Report).recordings[0].running.frames == len(run)
     assert report.summary and (seed % 8 or page(report, told))
+
+
+def repeated(*frames: FrameRecord) -> list[FrameRecord]:
+    """Thirty times each, to the last digit."""
+    every = [frame for frame in frames for _ in range(30)]
+    return [msgspec.structs.replace(f, seq=i, stamp_ns=START_NS + i * PERIOD_NS) for i, f in enumerate(every)]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("frames", ["one", "two", "no_covariance", "far_away", "all_far_away"])
+def test_frames_that_have_no_noise_or_no_place_are_looked_back_on(frames: str):
+    first, moved = records(np.array([[0.0, 0.0, 0.0], [0.0, 3e-3, 0.0]]))
+    far = msgspec.structs.replace(moved.cam_T_grip, translation_m=(1e160, 0.0, 0.1))
+    far_away = msgspec.structs.replace(moved, cam_T_grip=far)
+    run = {
+        "one": repeated(first),
+        "two": repeated(first, moved),
+        "no_covariance": repeated(msgspec.structs.replace(first, covariance=(0.0,) * 36)),
+        "far_away": repeated(first, far_away, first),
+        "all_far_away": repeated(far_away),
+    }[frames]
+    source = Run(run)
+    table = source.frames
+    matrices, measured = table.matrices(), np.isfinite(table.cam_T_grip).all(axis=1)
+    if frames in ("no_covariance", "all_far_away"):
+        with pytest.raises(ValueError, match=r"30 frames.* not used"):
+            correct(table.stamp_ns, matrices, table.covariance, measured)
+    else:
+        made = correct(table.stamp_ns, matrices, table.covariance, measured)
+        assert np.isfinite(made.cam_T_grip).all() and np.isfinite(made.covariance).all()
+        assert [point.index for point in made.change_points] == ([30] if frames == "two" else [])
+        assert bool(made.faults) == (frames == "far_away")
+
+
+def test_a_step_between_frames_without_noise_is_an_event():
+    first, moved = records(np.array([[0.0, 0.0, 0.0], [0.0, 3e-3, 0.0]]))
+    (event,) = only(Run(repeated(first, moved))).events
+    assert event.onset.found_by == "hindsight" and event.moved.size_m == pytest.approx(3e-3, rel=0.02)
+    assert event.onset.earliest_ns <= START_NS + 30 * PERIOD_NS <= event.onset.latest_ns
 
 
 def test_a_clock_that_jumps_by_years_stretches_nothing():

@@ -57,6 +57,8 @@ _ENVIRONMENT = {
     # A camera that is absent, or a file that is no video, we report in our own words.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
+    # rerun's own lines, read when it is imported: so are a disk that is full and a file that is damaged.
+    "RUST_LOG": "off",
 }
 
 _DESCRIPTION = """\

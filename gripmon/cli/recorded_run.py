@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli import common
+from gripmon.cli.one_recording import keep
 from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
@@ -125,9 +126,7 @@ class RecordedRun:
             yield recorder
         finally:
             recorder.close()
-            part.replace(path)
-        if recorder.failure:
-            print(f"replay: {path} isn't complete ({recorder.failure})", file=sys.stderr)
+            keep([part], path, recorder.failure, whole=recorder.failure is None)
 
     def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
         from gripmon.config import ConfigError

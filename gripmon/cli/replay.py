@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import logging
 import math
 import sys
 import tempfile
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.cli.one_recording import keep
 from gripmon.cli.recorded_run import RecordedRun, is_recording
 from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
@@ -41,8 +43,8 @@ _EXAMPLES = """\
   gripmon replay recordings/ --out again.jsonl                             all files of one run
   gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
-exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used; 130 interrupted (what
-was done until then is in FILE)"""
+exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used, or writing failed (a
+FILE.rrd from before stays then); 130 interrupted (what was done until then is in FILE)"""
 
 
 _LATENCY_BIN = 0.02  # natural logarithm
@@ -93,6 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     cv2.setNumThreads(1)
     paths = [Path(name) for name in arguments.input]
+    _refuse_empty_folder(paths)
     with contextlib.ExitStack() as opened:
         recorded = RecordedRun(paths, arguments.config, opened) if is_recording(paths) else None
         config = recorded.config if recorded else _given_config(paths[0], arguments.config)
@@ -117,6 +120,25 @@ def run(arguments: argparse.Namespace) -> int:
             if recorded:
                 print(recorded.summary(), file=sys.stderr)
     return common.EXIT_DONE if counts.usable else common.EXIT_FAILED
+
+
+def _refuse_empty_folder(paths: list[Path]) -> None:
+    """Before anything else is asked for, which would not help."""
+    from gripmon.playback import recordings_below
+    from gripmon.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+
+    for path in paths:
+        if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():
+            continue
+        try:
+            images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir())
+        except OSError as error:
+            raise common.CommandFailedError(f"{path}: can't be read ({error.strerror})", common.EXIT_USAGE) from None
+        if not images:
+            raise common.CommandFailedError(
+                f"{path}: no recordings and no images in it; .rrd files, or images such as *.png, *.jpg, *.tif, *.pgm",
+                common.EXIT_USAGE,
+            )
 
 
 def _given_config(path: Path, name: str | None) -> Config:
@@ -274,20 +296,25 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             patience_s=_RECORDING_PATIENCE_S,
             configuration=to_recorded(config),
         )
+        opened.enter_context(_told_at_the_end())
         try:
             yield recorder
         finally:
             recorder.close(timeout_s=60.0)
-            _keep(Path(scratch), path)
-        if recorder.dropped or recorder.failure:
-            reason = f" ({recorder.failure})" if recorder.failure else ""
-            print(f"replay: {recorder.dropped} frames are missing in {path}{reason}", file=sys.stderr)
+            keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure)
+        if recorder.dropped:
+            print(f"replay: {recorder.dropped} frames are missing in {path}", file=sys.stderr)
 
 
-def _keep(scratch: Path, path: Path) -> None:
-    """Give the finished recording its name."""
-    for written in scratch.glob("*.rrd"):
-        try:
-            written.replace(path)
-        except OSError as error:
-            raise common.CommandFailedError(f"--recording {path}: writing failed ({error.strerror})") from None
+@contextmanager
+def _told_at_the_end() -> Iterator[None]:
+    """What a daemon logs of its recording while it goes on, a replay says in one line when it is over."""
+    logger = logging.getLogger("gripmon.recording")
+    propagates, silent = logger.propagate, logging.NullHandler()
+    logger.addHandler(silent)
+    logger.propagate = False
+    try:
+        yield
+    finally:
+        logger.propagate = propagates
+        logger.removeHandler(silent)

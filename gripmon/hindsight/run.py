@@ -18,6 +18,8 @@ Ints = NDArray[np.int64]
 LEAST_FRAMES = 3
 LONGEST_GAP_S = 3600.0
 """Beyond, everything may have happened: more time in a gap says no more, and ends what numbers can hold."""
+FARTHEST_M = 1e6
+"""A transform that reaches farther is none, and its squares end what numbers can hold."""
 LEAST_VARIANCE, LEAST_EIGENVALUE = 1e-24, 1e-9
 """Of a covariance (m², rad²: a picometre, no camera's) and of its correlations: below, it is taken for none."""
 WILD, WILD_NEIGHBOURS, WILD_RUN = 8.0, 9, 2
@@ -48,8 +50,12 @@ class Run:
 def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bools) -> Run:
     stamp_ns = np.asarray(stamp_ns, np.int64)
     usable = np.asarray(measured, bool) & np.isfinite(cam_T_grip).all(axis=(1, 2))
-    known = usable & are_definite(covariance)
     faults = []
+    near = usable & (np.abs(cam_T_grip[:, :3, 3]) < FARTHEST_M).all(axis=1)
+    if (bad := int((usable & ~near).sum())) > 0:
+        faults.append(f"the transforms of {bad} frames reach {FARTHEST_M:.0e} m or farther: these frames were not used")
+    usable = near
+    known = usable & are_definite(covariance)
     if (bad := int((usable & ~known).sum())) > 0:
         faults.append(f"the covariances of {bad} frames aren't positive definite: these frames were not used")
     usable = known

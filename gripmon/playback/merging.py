@@ -51,6 +51,7 @@ class Merged:
     configuration: RecordedConfiguration | None
     image_seqs: IntArray
     faults: tuple[str, ...]
+    gaps: tuple[str, ...]
 
 
 def merge(contents: Sequence[Contents]) -> Merged:
@@ -66,7 +67,8 @@ def merge(contents: Sequence[Contents]) -> Merged:
     robot, camera = _names(parts, meta, states)
     table, rows_block, blocks, said = _frames(parts)
     faults += said
-    faults += _gaps(parts, table, rows_block, blocks)
+    gaps = _gaps(parts, table, rows_block, blocks)
+    faults += gaps
     faults += _backwards(parts, table, rows_block, blocks)
     seqs = [part.image_seqs for part in parts]
     return Merged(
@@ -84,6 +86,7 @@ def merge(contents: Sequence[Contents]) -> Merged:
         configuration=next((c for part in parts for c in part.events.get(entities.CONFIGURATION, ())), None),
         image_seqs=np.unique(np.concatenate(seqs)),
         faults=tuple(faults),
+        gaps=tuple(gaps),
     )
 
 

@@ -86,7 +86,8 @@ class Recording:
     ``frames`` has no number twice.  ``meta`` is None for files that are older than it; ``robot`` and ``camera`` are
     ``unknown`` where the files don't say.  ``alerts`` are those of the frames' records and the daemon's own.
     ``faults`` are one line each: what is wrong, in which file, and what was used; ``file_faults`` those of them that a
-    file has by itself, whether the others of its run are there or not.
+    file has by itself, whether the others of its run are there or not, ``gaps`` those that tell of frames whose numbers
+    are missing.
     """
 
     def __init__(self, contents: Sequence[Contents]) -> None:
@@ -109,6 +110,7 @@ class Recording:
         self.configuration: RecordedConfiguration | None = merged.configuration
         self.image_seqs: IntArray = merged.image_seqs
         self.faults: tuple[str, ...] = merged.faults
+        self.gaps: tuple[str, ...] = merged.gaps
         self.file_faults: tuple[str, ...] = tuple(
             f"{part.path}: {said}" for part in merged.parts for said in part.faults
         )

@@ -23,8 +23,7 @@ def whole_bytes(path: Path) -> int:
     with path.open("rb") as file:
         if file.read(4) != _MAGIC:
             return size
-        file.seek(max(size - _TRAILER_BYTES, 0))
-        if _FOOTER_MAGIC in file.read(_TRAILER_BYTES):
+        if is_complete(path):
             return size
         end = _FILE_HEADER_BYTES
         while True:
@@ -36,6 +35,14 @@ def whole_bytes(path: Path) -> int:
             if after > size:
                 return end
             end = after
+
+
+def is_complete(path: Path) -> bool:
+    """Whether a recording was finished: it ends with a footer.  OSError."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(max(size - _TRAILER_BYTES, 0))
+        return _FOOTER_MAGIC in file.read(_TRAILER_BYTES)
 
 
 def repair(path: Path) -> int:

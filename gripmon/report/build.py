@@ -21,7 +21,7 @@ from gripmon.report.hindsight import look_back
 from gripmon.report.limits import limits_of
 from gripmon.report.lives import MOTIONS, lives_of
 from gripmon.report.motions import motions_of
-from gripmon.report.running import running_of
+from gripmon.report.running import dropped_of, running_of
 from gripmon.report.source import Source, main_text
 from gripmon.report.track import Track, displacement, make_track
 from gripmon.report.words import headline, paragraph
@@ -78,6 +78,7 @@ def _tell(source: Source, affected_m: float | None, affected_rad: float | None) 
     affected += verdict_ranges(track, table.VERDICTS, table.verdict, list(keys))
     meta = source.meta
     last = np.flatnonzero(track.measured)[-_END_FRAMES:]
+    dropped = dropped_of(source)
     report = RecordingReport(
         robot=source.robot,
         camera=source.camera,
@@ -94,13 +95,13 @@ def _tell(source: Source, affected_m: float | None, affected_rad: float | None) 
         last_measured_ns=int(clock.stamp_ns[last[-1]]) if last.size else None,
         events=_numbered(events, source, track),
         affected=tuple(sorted(affected, key=lambda a: (a.start_ns, a.what))),
-        running=running_of(table, clock, track, source.states),
+        running=running_of(table, clock, track, source.states, dropped),
         curves=curves_of(track, [event.onset.stamp_ns for event in motions]),
         references=tuple(_references(source, in_force_ns)),
         commands=tuple(
             CommandEntry(clock.of(c.seq, c.stamp_ns), c.name, c.argument, c.done, c.text) for c in source.commands
         ),
-        faults=(*source.faults, *clock_faults),
+        faults=(*(fault for fault in source.faults if fault not in dropped), *clock_faults),
     )
     return Told(source, msgspec.structs.replace(report, summary=paragraph(report)))
 

@@ -165,6 +165,9 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
 
     frames: int
     frames_dropped: Annotated[int, Meta(description="numbers missing between the first frame and the last")]
+    dropped: Annotated[
+        tuple[str, ...], Meta(description="where frames are missing that nobody recorded; damage is among the faults")
+    ]
     frames_refused: Annotated[int, Meta(description="that couldn't be measured")]
     monitor_dropped: Annotated[
         int | None, Meta(description="of these those that it had no time for; null: not recorded")

@@ -13,6 +13,7 @@ from gripmon.report.affected import runs_of_equal
 from gripmon.report.clock import SECOND_NS, Clock
 from gripmon.report.content import Noise, Running, Share, Slice, Stretch
 from gripmon.report.onsets import robust_sigma
+from gripmon.report.source import Source
 from gripmon.report.track import Track
 
 if TYPE_CHECKING:
@@ -24,14 +25,31 @@ _MOST_STRETCHES = 2000  # of a history; shorter ones than a part of it are joine
 _NEIGHBOURS_NS = SECOND_NS // 2
 
 
-def running_of(table: FrameTable, clock: Clock, track: Track, states: Sequence[StateRecord]) -> Running:
-    """Of one recording; ``states`` tell what the recorder dropped."""
+def dropped_of(source: Source) -> tuple[str, ...]:
+    """Those of the faults that tell of frames which the monitor or its recorder had no time for, or nothing is wrong
+    with the files: these are no damage.
+    """
+    seq = source.frames.seq
+    missing = int(seq[-1] - seq[0]) + 1 - len(seq) if len(seq) else 0
+    by_choice = sum(
+        max((getattr(state, name) for state in source.states), default=0)
+        for name in ("frames_dropped", "recording_dropped")
+    )
+    whole = set(source.faults) <= set(source.gaps)
+    return tuple(source.gaps) if whole or missing <= by_choice else ()
+
+
+def running_of(
+    table: FrameTable, clock: Clock, track: Track, states: Sequence[StateRecord], dropped: tuple[str, ...]
+) -> Running:
+    """Of one recording; ``states`` tell how much the recorder dropped, ``dropped`` where."""
     steps_s = 1e-9 * np.diff(clock.stamp_ns)
     latency_s = 1e-9 * table.latency_ns[table.latency_ns > 0]
     pauses_s = steps_s[steps_s > 1.0]
     return Running(
         frames=len(table),
         frames_dropped=int(table.seq[-1] - table.seq[0]) + 1 - len(table) if len(table) else 0,
+        dropped=dropped,
         frames_refused=int(table.refused.sum()),
         monitor_dropped=max((s.frames_dropped for s in states), default=None),
         recording_dropped=max((s.recording_dropped for s in states), default=None),

@@ -44,6 +44,10 @@ class Source(Protocol):
     @property
     def faults(self) -> Sequence[str]: ...
     @property
+    def gaps(self) -> Sequence[str]:
+        """Those of the faults that tell of frames whose numbers are missing."""
+
+    @property
     def image_seqs(self) -> NDArray[np.int64]: ...
     def picture(self, seq: int) -> Picture | None:
         """The image of a frame with its overlay; None if it isn't recorded."""
