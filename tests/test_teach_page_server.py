@@ -15,17 +15,22 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from simulated import PAPER_LENS
 from taught_by_hand import Rig, make_rig
 
+from gripmon.calibration.plane import GivenCamera
+from gripmon.cli.plane_inputs import _read_rough
 from gripmon.monitor import MonitorSettings
+from gripmon.onboarding import UnknownGripper
 from gripmon.records import Frame
 from gripmon.sources import Waiting
 from gripmon.teaching.bench import Bench, Found
-from gripmon.teachpage import Desk, PageServer, Picture, Saved, SaveOrder, SavingRefused
+from gripmon.teachpage import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
 from gripmon.teachpage.desk import BadRequest, Labels
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
 DEADLINE_S = 30.0
+INFER = UnknownGripper(GivenCamera(PAPER_LENS))
 
 
 class Told:
@@ -302,3 +307,48 @@ def test_images_of_more_bits_are_shown_as_pictures(rig: Rig, saving: Told):
     assert shown.dtype == np.uint8 and shown.shape[:2] == rig.image.shape[:2]
     assert int(shown.max()) - int(shown.min()) > 200
     desk.close()
+
+
+def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_path: Path):
+    image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
+    path = tmp_path / "rough.yaml"
+    desk = RoughDesk(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command")
+    server = PageServer(desk)
+    names = [
+        f"{finger}_{point}_{side}"
+        for finger in ("left", "right")
+        for point in ("inner", "rise")
+        for side in ("near", "far")
+    ]
+    put = {name: [10.0 * k + 0.25, 2.5 - k] for k, name in enumerate(names)}
+
+    def save(corners: dict[str, list[float]], **more: object) -> tuple[int, dict[str, object]]:
+        order = {"put": {"corners": corners}, "robot": "r", "camera_name": "c", **more}
+        status, _, data = ask(server, "save", "POST", json.dumps(order).encode())
+        return status, json.loads(data)
+
+    try:
+        state = json.loads(ask(server, "state")[2])
+        assert state["corners_only"] and (state["width_px"], state["height_px"]) == (64, 48)
+        assert set(names) < set(state["corners"]) == set(state["places"])
+        assert all(0 < u < 64 and 0 < v < 48 for u, v in state["places"].values())
+        assert ask(server, "image/0.png")[2].startswith(b"\x89PNG") and ask(server, "image/1.png")[0] == 400
+        assert look(server, {"corners": put})[0] == ask(server, "live.jpg")[0] == 400
+        for corners, why in (
+            ({}, "corners.left_inner_near: is missing"),
+            ({n: at for n, at in put.items() if "inner" in n}, "only one edge of its own is given"),
+            (put | {"left_end_near": [1.0, 1.0]}, "corners.left_end_near: is there beside left_rise_near"),
+            (put | {"nose": [1.0, 1.0]}, "corners.nose: is no name"),
+        ):
+            status, answer = save(corners, replace=True)
+            assert status == 200 and why in str(answer["refused"]) and not path.exists()
+        assert save(put)[1]["next"] == "the next command"
+        assert {n: list(at) for n, at in _read_rough(path, INFER).items()} == put
+        before = path.read_bytes()
+        moved = put | {"left_inner_far": [7.0, 8.0]}
+        assert save(moved)[1]["exists"] == [str(path)] and path.read_bytes() == before
+        assert save(moved, replace=True)[1]["written"] == {str(path): "rough corners"}
+        assert _read_rough(path, INFER)["left_inner_far"] == (7.0, 8.0)
+        assert list(tmp_path.iterdir()) == [path]
+    finally:
+        server.close()

@@ -32,6 +32,7 @@ can open, sees the edges snap and what accuracy to expect, and saves the taught 
 a configuration for gripmon check and gripmon run; no configuration is needed for that, only the
 camera's calibration and the gripper file.  Without --reference the pose comes from the corners,
 less exactly than from a plate (gripmon calibrate plane).  --corners does the same without a page.
+With neither --gripper nor --config the page writes rough.yaml, for gripmon calibrate plane --infer.
 
 Best are three to ten images without any motion of the camera, in focus, the fingers free and lit as
 in use, each before another background, some with the jaws opened otherwise."""
@@ -40,6 +41,9 @@ _EXAMPLES = """\
   gripmon teach first/*.png --config mine/arm1.yaml
   gripmon teach now.png --config mine/arm1.yaml --jaw-opening 0.034 --picture taught.png
   gripmon check mine/arm1.yaml
+
+a gripper without a file: rough.yaml for gripmon calibrate plane --infer
+  gripmon teach --page on_plate.png --camera camera.yaml
 
 a new robot, without any configuration: put corners on the fingertips, on a page in your browser
   gripmon teach --page first/*.png --camera camera.yaml --gripper gripper.yaml --out mine

@@ -16,6 +16,7 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
     from gripmon.teaching.bench import Found
+    from gripmon.teachpage import Desk, RoughDesk
 
 _LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -23,9 +24,12 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon teach --page`` and ``--corners``."""
+    from gripmon.cli import teach_rough
     from gripmon.cli.teach_inputs import read_inputs
 
     _check_options(arguments)
+    if teach_rough.is_meant(arguments):
+        return _rough_page(arguments, teach_rough.rough_desk(arguments))
     inputs = read_inputs(arguments)
     return _page(arguments, inputs) if arguments.page else _without_page(arguments, inputs)
 
@@ -50,12 +54,23 @@ def _check_options(arguments: argparse.Namespace) -> None:
         refuse("--config has camera, gripper and reference already; either that, or --camera and --gripper")
 
 
+def _rough_page(arguments: argparse.Namespace, desk: RoughDesk) -> int:
+    """Serve, then say what was saved, however the page ended."""
+    try:
+        return _serve(arguments, desk)
+    finally:
+        if desk.saved is not None:
+            for path, what in desk.saved.written.items():
+                print(f"written: {path} ({what})")
+            print(f"next: {desk.saved.next}", flush=True)
+
+
 def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
-    """Serve until the person is done."""
+    """Teach with a gripper."""
     from gripmon.cli.teach_inputs import live_settings
     from gripmon.cli.teach_saving import FileSaving
     from gripmon.sources import SourceError, open_source
-    from gripmon.teachpage import Desk, PageServer
+    from gripmon.teachpage import Desk
 
     live = None
     if arguments.live is not None:
@@ -64,7 +79,13 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
         except SourceError as error:
             raise common.CommandFailedError(f"--live: {error}", common.EXIT_USAGE) from None
     saving = FileSaving(inputs)
-    desk = Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live)
+    return _serve(arguments, Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live))
+
+
+def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
+    """Until the person is done."""
+    from gripmon.teachpage import PageServer
+
     try:
         server = PageServer(desk, arguments.port)
     except OSError as error:

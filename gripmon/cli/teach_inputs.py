@@ -116,7 +116,7 @@ def _calibrations(
     """Camera and reference from their files; a reference's file holds its camera, too."""
     from gripmon.camera import make_camera
 
-    lens, error = (None, None) if arguments.camera is None else _lens(Path(arguments.camera))
+    lens, error = (None, None) if arguments.camera is None else read_lens(Path(arguments.camera))
     reference = None
     if arguments.reference is not None:
         lens, reference = _hand_eye(Path(arguments.reference), lens, gripper)
@@ -142,7 +142,7 @@ def _named(arguments: argparse.Namespace) -> dict[str, Path]:
     return {key: path for key, path in paths.items() if "schema" in _yaml(path)}
 
 
-def _lens(path: Path) -> tuple[LensSettings, CameraError | None]:
+def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
     import numpy as np
 

@@ -32,7 +32,7 @@ FINGERS = ("left", "right")
 SIDES = ("near", "far")
 INNERMOST = tuple(f"{finger}_inner_{side}" for finger in FINGERS for side in SIDES)
 RISE = "_rise_"
-_KINDS = ("inner", "outer", "end", "rise")
+POINTS = ("inner", "outer", "end", "rise")
 _HALF_OPENING = {"left": -0.5, "right": 0.5}
 
 
@@ -52,7 +52,7 @@ def outlines_of(rough: Mapping[str, tuple[float, float]]) -> Outline:
     """The outlines of both fingertips from rough corners by name.  :class:`CalibrationError` for names that are none,
     or too few of them.
     """
-    known = [f"{finger}_{kind}_{side}" for finger in FINGERS for kind in _KINDS for side in SIDES]
+    known = [f"{finger}_{kind}_{side}" for finger in FINGERS for kind in POINTS for side in SIDES]
     strange = [name for name in rough if name not in known]
     if strange:
         raise CalibrationError(f"corners.{strange[0]}: is no name of a fingertip's corner; one of {', '.join(known)}")
@@ -71,12 +71,12 @@ def outlines_of(rough: Mapping[str, tuple[float, float]]) -> Outline:
 
 
 def _edges_of(finger: str, rough: Mapping[str, tuple[float, float]]) -> list[tuple[str, str]]:
-    near, far = ([n for n in (f"{finger}_{kind}_{side}" for kind in _KINDS) if n in rough] for side in SIDES)
+    near, far = ([n for n in (f"{finger}_{kind}_{side}" for kind in POINTS) if n in rough] for side in SIDES)
     for side, names in zip(SIDES, (near, far), strict=True):
         if f"{finger}_end_{side}" in names and f"{finger}_rise_{side}" in names:
             raise CalibrationError(f"corners.{finger}_end_{side}: is there beside {finger}_rise_{side}; one of the two")
         if len(names) < 2:
-            others = " or ".join(f"{finger}_{kind}_{side}" for kind in _KINDS[1:])
+            others = " or ".join(f"{finger}_{kind}_{side}" for kind in POINTS[1:])
             raise CalibrationError(
                 f"corners.{finger}_inner_{side}: only one edge of its own is given; {others}, on the next one"
             )
@@ -152,4 +152,4 @@ def _edge_name(outline: Outline, a: int, b: int) -> str:
         return f"{finger}_{kind_a}"
     if "inner" in (kind_a, kind_b) and "rise" not in (kind_a, kind_b):
         return f"{finger}_{side_a}"
-    return f"{finger}_{kind_a if _KINDS.index(kind_a) > _KINDS.index(kind_b) else kind_b}_{side_a}"
+    return f"{finger}_{kind_a if POINTS.index(kind_a) > POINTS.index(kind_b) else kind_b}_{side_a}"

@@ -160,11 +160,11 @@ class Desk:
 
     def still(self, number: int) -> bytes:
         """An image as PNG.  Raises :class:`BadRequest`."""
-        return _encoded(self._picture(number).image, ".png")
+        return encoded(self._picture(number).image, ".png")
 
     def live(self) -> bytes:
         """The live image as JPEG.  Raises :class:`BadRequest`."""
-        return _encoded(self._picture(None).image, ".jpg")
+        return encoded(self._picture(None).image, ".jpg")
 
     def _found(self, put: Put, picture: Picture) -> Found:
         gripper = self._bench.gripper
@@ -288,8 +288,8 @@ def _places(points: Array) -> tuple[Place, ...]:
     return tuple((u, v) for u, v in np.round(points, 3).tolist())
 
 
-def _encoded(image: Image, ending: str) -> bytes:
-    """For a browser: eight bits; more of them are stretched over what is there."""
+def encoded(image: Image, ending: str) -> bytes:
+    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
     grey = image
     if image.dtype != np.uint8:
         low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()

@@ -51,7 +51,7 @@ class PictureInfo(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class State(msgspec.Struct, frozen=True, kw_only=True):
-    """What the page begins with."""
+    """What the page begins with.  ``corners_only``: there is no gripper, nothing snaps."""
 
     version: str
     width_px: int
@@ -71,6 +71,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
     fixed_names: bool
     folder: str
     files: dict[str, str]
+    corners_only: bool = False
 
 
 class CornerReply(msgspec.Struct, frozen=True, kw_only=True):

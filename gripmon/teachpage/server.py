@@ -21,6 +21,7 @@ import msgspec
 
 from gripmon.teachpage.desk import BadRequest, Desk
 from gripmon.teachpage.messages import Failure, Nothing, Put, SaveOrder
+from gripmon.teachpage.rough_desk import RoughDesk
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -52,7 +53,7 @@ _HEADERS = {
 class PageServer:
     """Serves one desk until it is done.  OSError from the constructor if the port is taken."""
 
-    def __init__(self, desk: Desk, port: int = 0):
+    def __init__(self, desk: Desk | RoughDesk, port: int = 0):
         self.done = threading.Event()
         token = secrets.token_urlsafe(_TOKEN_BYTES)
         # Not with the address itself: a look-up of its name may take seconds.
@@ -73,7 +74,7 @@ class PageServer:
 class _Shop:
     """What the handlers share."""
 
-    def __init__(self, desk: Desk, token: str, hosts: frozenset[str], done: threading.Event):
+    def __init__(self, desk: Desk | RoughDesk, token: str, hosts: frozenset[str], done: threading.Event):
         self.desk, self.token, self.hosts, self.done = desk, token, hosts, done
         folder = importlib.resources.files("gripmon.teachpage") / "page"
         self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}

@@ -35,11 +35,16 @@ function show() {
   $("#undo").disabled = !corners.canUndo;
   $("#redo").disabled = !corners.canRedo;
   $("#clear").disabled = !corners.current.size;
-  $("#save").disabled = !reply || busy;
+  $("#save").disabled = busy || !(state.corners_only ? corners.current.size : reply);
   document.body.dataset.busy = busy;
 }
 
 function tell() {
+  if (state.corners_only) {
+    const inner = state.corners.filter((name) => name.includes("_inner_") && !corners.current.has(name)).length;
+    const todo = inner ? `${inner} of the 4 inner corners to go` : "the inner corners are there";
+    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${todo}. Nothing snaps or is foretold without a gripper file.`, inner ? "" : "good");
+  }
   const missing = state.needed - corners.current.size;
   if (!corners.current.size && missing > 0) {
     panel.status(`Drag ${state.needed} corners onto the fingertips; the others follow by themselves.`);
@@ -70,6 +75,7 @@ function put() {
 async function look() {
   clearTimeout(timer);
   if (ended) return;
+  if (state.corners_only) { tell(); return; }
   if (busy) { again = true; return; }
   busy = true;
   show();
@@ -88,7 +94,7 @@ async function look() {
 }
 
 function changed(later = 0) {
-  if (asking) { asking = false; panel.saved(null, false); }
+  if (asking) { asking = false; panel.saved(null, false, state); }
   show();
   clearTimeout(timer);
   timer = setTimeout(look, later);
@@ -182,7 +188,7 @@ async function save() {
   busy = false;
   if (result.refused) result.error = result.refused;
   asking = Boolean(result.exists?.length);
-  panel.saved(result, asking);
+  panel.saved(result, asking, state);
   $("#save").scrollIntoView({ block: "nearest" });
   show();
 }
@@ -201,7 +207,7 @@ function connect() {
   $("#opening").addEventListener("change", () => changed());
   $("#picture").addEventListener("change", (event) => choose(event.target.value === "" ? null : Number(event.target.value)));
   for (const id of ["save-config", "save-taught", "save-corners"]) {
-    $(`#${id}`).addEventListener("change", () => { asking = false; panel.saved(null, false); });
+    $(`#${id}`).addEventListener("change", () => { asking = false; panel.saved(null, false, state); });
   }
 }
 
@@ -211,7 +217,7 @@ async function begin() {
     select,
     put: (name, at) => { corners.put(name, at, false); changed(); },
     // A corner that has followed the others is right where it is: a click says so.
-    click: (name, at) => { if (shown(name).state === "idle" && corners.current.size) { corners.put(name, at, false); changed(); } },
+    click: (name, at) => { if (!state.corners_only && shown(name).state === "idle" && corners.current.size) { corners.put(name, at, false); changed(); } },
     viewed: (scale) => { $("#zoom").textContent = `${Math.round(100 * scale)} %`; },
   });
   stage.begin([state.width_px, state.height_px], state.corners);

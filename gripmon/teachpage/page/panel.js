@@ -31,6 +31,11 @@ export function begin(state) {
   }
   $("#folder").textContent = `\u200e${state.folder}`; // cut at its beginning, but read from left to right
   $("#folder").title = state.folder;
+  if (state.corners_only) {
+    for (const kind of ["config", "taught"]) $(`#save-${kind}`).parentElement.hidden = true;
+    for (const part of ["#save-corners", "#corners thead", "#expected", "#legend"]) $(part).hidden = true;
+    saved(null, false, state);
+  }
   $("#jaw").hidden = !state.has_jaw;
   [$("#opening").min, $("#opening").max] = [1e3 * state.jaw_m[0], 1e3 * state.jaw_m[2]];
 }
@@ -108,7 +113,7 @@ export function expected(reply, state) {
   $("#expected-note").textContent = notes.join(" ");
 }
 
-export function saved(result, asking) {
+export function saved(result, asking, state) {
   const lines = [];
   if (result?.error) lines.push(element("p", result.error, { class: "warn" }));
   for (const path of result?.exists ?? []) lines.push(element("p", `${path} is there already.`, { class: "warn" }));
@@ -120,7 +125,7 @@ export function saved(result, asking) {
     lines.push(line);
   }
   $("#saved").replaceChildren(...lines);
-  $("#save").textContent = asking ? "Replace what is there" : "Save";
+  $("#save").textContent = asking ? "Replace what is there" : state.corners_only ? "Save corners" : "Save";
   $("#save").className = asking ? "ask" : "main";
 }
 
