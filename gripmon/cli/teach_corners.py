@@ -62,6 +62,8 @@ def _rough_page(arguments: argparse.Namespace, desk: RoughDesk) -> int:
         if desk.saved is not None:
             for path, what in desk.saved.written.items():
                 print(f"written: {path} ({what})")
+            for note in desk.saved.notes:
+                print(f"note: {note}")
             print(f"next: {desk.saved.next}", flush=True)
 
 

@@ -17,6 +17,7 @@ from gripmon.teachpage.desk import BadRequest, Picture, encoded
 from gripmon.teachpage.messages import PictureInfo, Place, Put, Reply, Saved, SaveOrder, State
 
 _NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)
+_NOTE = "TARGET is the plate, such as circles:12x10:0.008:0.004; with jaws that move also --jaw-range MIN:MAX (m)"
 _COLUMNS = {"left": 0.06, "right": 0.8}
 
 
@@ -90,7 +91,7 @@ class RoughDesk:
                 write_atomically(self._path, self._text(corners).encode())
             except OSError as error:
                 return Saved(refused=f"{self._path}: can't be written ({error.strerror or error})")
-            self.saved = Saved(written={str(self._path): "rough corners"}, next=self._follows)
+            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(_NOTE,), next=self._follows)
             return self.saved
 
     def _text(self, corners: Mapping[str, Place]) -> str:
