@@ -53,6 +53,7 @@ def results():
 
 
 def test_the_report_has_every_point_and_verdict(results, tmp_path):
+    pytest.importorskip("matplotlib")
     text = laser_report.as_text(results)
     assert "2 trials a point, seed 1" in text
     said = [line for line in text.splitlines() if line.startswith(("met ", "NOT MET"))]

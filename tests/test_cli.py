@@ -125,7 +125,7 @@ def test_wrong_usage_ends_with_2(arguments: list[str], capsys: pytest.CaptureFix
     assert "gripmon" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [["check"], ["run"], ["replay", ".", "--out", "-", "--config"]])
+@pytest.mark.parametrize("command", [["check"], ["run"], ["replay", str(ROOT / "docs"), "--out", "-", "--config"]])
 def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(tmp_path: Path, command: list[str]):
     path = tmp_path / "broken.yaml"
     path.write_text(builtin_config("demo.yaml").read_text().replace("fx_px: 962.0", "fx_px: 0.9"))
@@ -144,7 +144,7 @@ def test_a_fault_in_the_configuration_is_one_line_and_exit_code_2(tmp_path: Path
         (["check", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["run", "nowhere.yaml"], "nowhere.yaml: there is no such file"),
         (["replay", "nowhere", "--config", "{config}", "--out", "-"], "nowhere: there is no such file or folder"),
-        (["replay", "{folder}", "--config", "{config}", "--out", "-"], "no image in"),
+        (["replay", "{folder}", "--config", "{config}", "--out", "-"], "no images in"),
         (["replay", "{config}", "--config", "{config}", "--out", "-"], "can't be opened as a video"),
         (["simulate", "nonsense", "--out", "{folder}/x"], "there is no 'nonsense'; one of demo, "),
         (["simulate", "bump", "--out", "{folder}/.."], "is not empty"),

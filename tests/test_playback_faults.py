@@ -323,7 +323,8 @@ def test_a_file_that_vanishes_after_opening(run: Run, tmp_path: Path):
     copies[0].unlink()
     assert found.picture(seqs[0]) is None
     assert [r.seq for r in found.records()] == [seq for seqs in run.seqs[1:] for seq in seqs]
-    assert [shot.seq for shot in found.shots()] == [seq for seq in seqs if seq not in run.seqs[0]]
+    # An image from the ring may lie in the file after its frame's.
+    assert [shot.seq for shot in found.shots()] == opened(*copies[1:]).image_seqs.tolist()
 
 
 def test_files_from_before_there_was_a_meta_entity(tmp_path: Path):

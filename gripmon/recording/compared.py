@@ -6,6 +6,7 @@ names.
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import rerun as rr
@@ -27,6 +28,8 @@ from gripmon.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCom
 RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32
 _FLUSH_TIMEOUT_S = 30.0
+_LEAST_FREE_BYTES = 64_000_000
+"""rerun's files don't say that the disk is full, and whoever goes on writing may wait for ever: this must be free."""
 _WIDE, _THIN = 5.0, 1.5
 
 
@@ -53,7 +56,9 @@ class ComparedRecorder:
         path.open("wb").close()
         self._path, self._source, self._recorded_limits = path, source, recorded_limits
         self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
-        stream.set_sinks(rr.FileSink(path))
+        self.failure: str | None = None
+        if self._has_room():
+            stream.set_sinks(rr.FileSink(path))
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
         stream.send_blueprint(_layout(scene), make_active=True, make_default=True)
         self._writer = RowWriter(stream, scene, 1)
@@ -64,7 +69,6 @@ class ComparedRecorder:
         self._rows_then: list[Row] = []
         self._events = Events(references=[scene.reference])
         self._events_then = Events(commands=list(source.commands))
-        self.failure: str | None = None
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
         """One frame, as it is judged now; what it was judged then comes from the source."""
@@ -99,6 +103,8 @@ class ComparedRecorder:
     def close(self, timeout_s: float = 2.0) -> None:
         """Finish the file."""
         self._write()
+        if self.failure is not None:
+            return
         self._writer.finish()
         self._curves.finish()
         try:
@@ -107,10 +113,15 @@ class ComparedRecorder:
             self.failure = f"can't write {self._path}: {' '.join(str(error).split())}"
         self._stream.disconnect()
 
+    def _has_room(self) -> bool:
+        if self.failure is None and shutil.disk_usage(self._path.parent).free < _LEAST_FREE_BYTES:
+            self.failure = f"can't write {self._path}: less than {1e-6 * _LEAST_FREE_BYTES:.0f} MB are free"
+        return self.failure is None
+
     def _write(self) -> None:
         rows, then, events = self._rows, self._rows_then, self._events
         self._rows, self._rows_then, self._events = [], [], Events()
-        if not rows:
+        if not rows or not self._has_room():
             return
         self._writer.write(rows, events)
         self._curves.write(then)
