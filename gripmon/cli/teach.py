@@ -188,18 +188,9 @@ def _out(arguments: argparse.Namespace, config: Config) -> Path:
 
 def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
     """An image that fits the camera, with its jaw opening; anything else ends the command with exit code 2."""
-    from gripmon.inspection import inspect
-    from gripmon.records import Frame
-    from gripmon.sources.folder import read_image
+    from gripmon.cli.teach_inputs import read_fitting_image
 
-    if path.is_dir():
-        raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)
-    image, fault = read_image(path)
-    if image is None:
-        raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
-    refused = inspect(Frame(0, 0, image, None, str(path)), config.camera, config.gripper)
-    if refused is not None:
-        raise common.CommandFailedError(f"{path}: {refused[0]}: {refused[1]}", common.EXIT_USAGE)
+    image = read_fitting_image(path, config.camera, config.gripper)
     opening_m = _opening(path, config, jaw_opening_m)
     return _Input(path, image, hashlib.sha256(path.read_bytes()).hexdigest(), opening_m)
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gripmon.camera import Camera, LensSettings
     from gripmon.config import Config
     from gripmon.gripper import Gripper
-    from gripmon.records import ReferenceRecord
+    from gripmon.records import Image, ReferenceRecord
     from gripmon.sources import FolderSettings, LiveSettings
     from gripmon.teaching.bench import Bench
     from gripmon.teaching.corner_pose import CameraError
@@ -222,21 +222,28 @@ def _faults_of(path: Path) -> Iterator[None]:
         raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
 
 
-def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
-    """An image that fits the camera; else the command ends with exit code 2."""
+def read_fitting_image(path: Path, camera: Camera, gripper: Gripper) -> Image:
+    """An image that fits the camera; anything else ends the command with exit code 2."""
     from gripmon.inspection import inspect
     from gripmon.records import Frame
     from gripmon.sources.folder import read_image
-    from gripmon.teachpage import Picture
 
     if path.is_dir():
         raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)
     image, fault = read_image(path)
     if image is None:
         raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
-    refused = inspect(Frame(0, 0, image, None, str(path)), bench.camera, bench.gripper)
+    refused = inspect(Frame(0, 0, image, None, str(path)), camera, gripper)
     if refused is not None:
         raise common.CommandFailedError(f"{path}: {refused[0]}: {refused[1]}", common.EXIT_USAGE)
+    return image
+
+
+def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
+    """An image that fits the camera; else the command ends with exit code 2."""
+    from gripmon.teachpage import Picture
+
+    image = read_fitting_image(path, bench.camera, bench.gripper)
     return Picture(path.name, image, _opening(path, bench.gripper, config, given_m), str(path))
 
 
