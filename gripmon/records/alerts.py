@@ -31,6 +31,8 @@ class Cause(OpenEnum):
     CAMERA_REPLACED = "camera_replaced"
     CAMERA_FROZEN = "camera_frozen"
     CLOCK = "clock_or_frame_rate"
+    PLANE_MOVED = "plane_moved"
+    LASER_MOVED = "laser_pointer_moved"
     NO_CAMERA = "no_camera"
     UNKNOWN = "unknown"
 

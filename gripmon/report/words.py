@@ -20,6 +20,8 @@ CAUSES: dict[str, str] = {
     Cause.CAMERA_REPLACED: "the camera was replaced",
     Cause.CAMERA_FROZEN: "the camera was frozen",
     Cause.CLOCK: "clock or frame rate were wrong",
+    Cause.PLANE_MOVED: "the plane under the laser moved",
+    Cause.LASER_MOVED: "the laser pointer moved on the arm",
     Cause.NO_CAMERA: "there was no camera",
     Cause.UNKNOWN: "cause unknown",
 }
