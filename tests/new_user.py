@@ -9,7 +9,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import yaml
 from plates import Look, pose, render
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
@@ -44,7 +43,7 @@ _ROUGH = {
 
 @dataclass(frozen=True)
 class NewUser:
-    """Folders ``plate`` (camera), ``standing`` (gripper on the plate, with rough.yaml) and ``work``: frames, of which
+    """Folders ``plate`` (camera), ``standing`` (gripper on the plate) and ``work``: frames, of which
     those after :data:`STEP_S` come from a camera that was knocked; ``cam_T_grip`` (frames, 4, 4) is where it was.
     """
 
@@ -79,15 +78,13 @@ def make(folder: Path) -> NewUser:
         grip_T_plate = make_transform(rotation, middle - rotation @ (0.5 * size))
         simulator = _simulator(_Plate(nominal_cam_T_grip() @ grip_T_plate), 20 + number)
         cv2.imwrite(str(folder / "standing" / f"{number}.png"), simulator.render(0))
-    rough = {"corners": {name: at.round().tolist() for name, at in corners_px(rng, off_px=4.0).items()}}
-    (folder / "rough.yaml").write_text(yaml.safe_dump(rough))
     work = _work()
     write_sequence(work, folder / "work")
     return NewUser(folder, np.array([work.truth(k).cam_T_grip for k in range(work.frame_count)]))
 
 
 def corners_px(rng: np.random.Generator, off_px: float) -> dict[str, Array]:
-    """Where somebody clicks for ``gripmon calibrate plane --infer``."""
+    """Where somebody puts the corners that ``gripmon calibrate plane --infer`` begins with."""
     gripper = load_gripper(BOX_FINGERS)
     points, cam_T_grip = gripper.points_grip_m(OPENING_M), nominal_cam_T_grip()
     out = {}

@@ -99,7 +99,7 @@ class Visitor:
             "const done = arguments[0];"
             "const look = () => document.body.dataset.busy === 'true' ? setTimeout(look, 20)"
             " : requestAnimationFrame(() => requestAnimationFrame(() => done(document.body.dataset.busy !== 'true')));"
-            "setTimeout(look, 200);"
+            "look();"
         )
         self.driver.set_script_timeout(DEADLINE_S)
         self.wait(lambda: self.driver.execute_async_script(drawn), "an answer")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 import signal
 import socket
 import urllib.parse
@@ -16,26 +15,16 @@ import numpy as np
 import psutil
 import pytest
 import yaml
-from simulated import PAPER_LENS
 from taught_by_hand import Rig, make_rig
 from teach_page_browser import DEADLINE_S, Visitor, browser, page
 from test_live_camera import MjpegServer
 
-from gripmon.calibration.plane import GivenCamera
 from gripmon.cli import main
-from gripmon.cli.plane_inputs import _read_rough
 from gripmon.config import load_config
 from gripmon.geometry import from_record, perturbation_between
-from gripmon.onboarding import UnknownGripper
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 SNAPPED_PX = 0.2
-_INFERRED = {
-    "L_in_near": "left_inner_near",
-    "L_in_far": "left_inner_far",
-    "R_in_near": "right_inner_near",
-    "R_in_far": "right_inner_far",
-}
 
 
 @pytest.fixture(scope="module")
@@ -198,46 +187,25 @@ def test_a_configuration_that_is_there_gets_its_line(rig: Rig, driver: Any, tmp_
 
 
 def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
-    """What is dragged is what ``calibrate plane --infer`` reads, by its own reader."""
-    camera = rig.options[1]
-    with page(rig.image_path, "--camera", camera, "--out", tmp_path) as running:
+    """How they become a gripper is tested with the whole way."""
+    with page(rig.image_path, "--camera", rig.options[1], "--out", tmp_path) as running:
         visitor = Visitor(driver, running.url)
         assert "4 of the 4 inner corners to go" in visitor.text("#status")
         assert "Nothing snaps" in visitor.text("#status") and visitor.text("#save") == "Save corners"
         assert visitor.find("#save").get_attribute("disabled")
-        seen = rig.rough(*INNER)
-        for name, at in seen.items():
-            visitor.drag(_INFERRED[name], *at)
-        assert "the inner corners are there" in visitor.text("#status")
-        visitor.click("#save")
-        visitor.wait(lambda: "only one edge of its own" in visitor.text("#saved"), "what is missing")
-        assert not list(tmp_path.iterdir())
-        visitor.script("document.querySelector('#stage').focus()")
-        for name, (u, v) in seen.items():
-            visitor.drag(_INFERRED[name].replace("inner", "rise"), u + (-90 if name.startswith("L") else 90), v)
+        u, v = rig.rough("L_in_near")["L_in_near"]
+        visitor.drag("left_inner_near", u, v)
+        assert visitor.at("left_inner_near") == pytest.approx((u, v), abs=2.0)  # whole pixels of the screen
+        assert "3 of the 4 inner corners to go" in visitor.text("#status")
         visitor.keys("z", control=True)
-        assert visitor.state("right_rise_far") == "idle"
+        assert visitor.state("left_inner_near") == "idle"
         visitor.keys("y", control=True)
-        assert visitor.state("right_rise_far") == "put" and visitor.state("left_outer_near") == "idle"
-        put = {name: visitor.at(name) for k in _INFERRED.values() for name in (k, k.replace("inner", "rise"))}
+        assert visitor.state("left_inner_near") == "put" and visitor.state("left_outer_near") == "idle"
         visitor.click("#save")
-        visitor.wait(lambda: "next: gripmon calibrate plane" in visitor.text("#saved"), "the file")
-        visitor.click("#save")
-        visitor.wait(lambda: "is there already" in visitor.text("#saved"), "the question")
-        assert visitor.complaints() == []
+        visitor.wait(lambda: "left_inner_far: is missing" in visitor.text("#saved"), "what is missing")
+        assert not list(tmp_path.iterdir()) and visitor.complaints() == []
         visitor.click("#done")
-        assert running.process.stdout is not None
-        said = running.process.stdout.read()
-        assert running.process.wait(DEADLINE_S) == 0
-    follows = shlex.split(said.partition("next: ")[2])
-    assert follows[:4] == ["gripmon", "calibrate", "plane", str(rig.image_path)] and "--infer" in follows
-    path = Path(follows[follows.index("--corners") + 1])
-    assert path == tmp_path / "rough.yaml" and follows[follows.index("--camera") + 1] == camera
-    read = _read_rough(path, UnknownGripper(GivenCamera(PAPER_LENS)))
-    assert read.keys() == put.keys()
-    assert all(read[name] == pytest.approx(at, abs=0.01) for name, at in put.items())
-    for name, at in seen.items():
-        assert read[_INFERRED[name]] == pytest.approx(at, abs=2.0)  # whole pixels of the screen
+        assert running.ended() == (0, "")
 
 
 def test_an_interrupt_leaves_nothing_running(rig: Rig, tmp_path: Path):

@@ -10,7 +10,7 @@ const LIVE_MS = 200, AGAIN_MS = 1000, NUDGED_MS = 150;
 
 const corners = new Corners();
 let state, stage, reply = null, chosen = null, selected = null, asking = false;
-let busy = false, again = false, ended = false, timer = 0;
+let busy = false, again = false, ended = false, timer = null;
 
 function shown(name) {
   const put = corners.current.get(name);
@@ -36,7 +36,7 @@ function show() {
   $("#redo").disabled = !corners.canRedo;
   $("#clear").disabled = !corners.current.size;
   $("#save").disabled = busy || !(state.corners_only ? corners.current.size : reply);
-  document.body.dataset.busy = busy;
+  document.body.dataset.busy = busy || timer !== null;
 }
 
 function tell() {
@@ -74,8 +74,9 @@ function put() {
 // One request at a time; while it runs the newest wish waits.
 async function look() {
   clearTimeout(timer);
+  timer = null;
   if (ended) return;
-  if (state.corners_only) { tell(); return; }
+  if (state.corners_only) { tell(); show(); return; }
   if (busy) { again = true; return; }
   busy = true;
   show();
@@ -95,9 +96,9 @@ async function look() {
 
 function changed(later = 0) {
   if (asking) { asking = false; panel.saved(null, false, state); }
-  show();
   clearTimeout(timer);
   timer = setTimeout(look, later);
+  show();
 }
 
 function select(name) { selected = name; show(); }
