@@ -75,6 +75,9 @@ def explained(cause: Cause, part: str | None = None, probability: float = 0.97) 
     return Explanation((probable, others), probable, f"{cause} it is")
 
 
+BENT, KNOCKED = explained(Cause.FINGER_BENT, "left"), explained(Cause.CAMERA_MOUNT)
+
+
 @dataclass(frozen=True)
 class Nothing:
     """A frame without a measurement; with a reason the image was refused."""

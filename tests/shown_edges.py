@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
+import msgspec
 import numpy as np
+import pytest
+from box_models import two_fingers_model
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.camera import Camera, LensSettings, make_camera
 from gripmon.causes import CauseJudge, CauseSettings
-from gripmon.gripper import Gripper
-from gripmon.records import EdgeEvidence
+from gripmon.gripper import Gripper, GripperModel
+from gripmon.records import Cause, EdgeEvidence
 
 OPENING_M = 0.034
 REFERENCE_SIGMA = np.array([1e-4] * 3 + [1e-3] * 3)
 FRACTIONS = (0.15, 0.5, 0.85)
+FRAMES = 8
+"""After so many :func:`told` asks."""
 
 
 def knocked(cam_T_grip: np.ndarray, shift_m: tuple[float, ...], turn_deg: tuple[float, ...] = (0, 0, 0)) -> np.ndarray:
@@ -116,3 +124,23 @@ def bend(gripper: Gripper, finger: str, tip_shift_m: tuple[float, float]) -> np.
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = turn, root - turn @ root
     return motion
+
+
+def two_fingers() -> Gripper:
+    return Gripper(msgspec.convert(two_fingers_model(), GripperModel))
+
+
+def told(shown: Shown, judge: CauseJudge, **scene: Any) -> tuple[Cause, str | None, str]:
+    for _ in range(FRAMES):
+        judge.add(shown.evidence(**scene))
+    explanation = judge.explanation(shown.reference)
+    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
+    assert [c.probability for c in explanation.causes] == sorted(
+        (c.probability for c in explanation.causes), reverse=True
+    )
+    return explanation.probable.cause, explanation.probable.part, explanation.text
+
+
+def ill_seen(evidence: EdgeEvidence, *shares: float) -> EdgeEvidence:
+    """With other shares of the fingers' profiles that agree."""
+    return dataclasses.replace(evidence, finger_share=np.array(shares))

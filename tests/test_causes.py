@@ -3,33 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import re
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
-from box_models import cube_model, two_fingers_model
-from scipy.integrate import quad
-from scipy.stats import norm
-from shown_edges import OPENING_M, REFERENCE_SIGMA, Shown, bend, knocked
+from box_models import cube_model
+from shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_seen, knocked, told, two_fingers
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings, PaperLens, make_camera
-from gripmon.causes import BlurWatch, CauseJudge, CauseSettings, FingerWatch, JawWatch, ResidualWatch
-from gripmon.causes.pooling import pool
-from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
-from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
-from gripmon.geometry import perturb
+from gripmon.causes import CauseSettings
 from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Cause, EdgeEvidence
-
-FRAMES = 8
-
-
-def two_fingers() -> Gripper:
-    return Gripper(msgspec.convert(two_fingers_model(), GripperModel))
+from gripmon.records import Cause
 
 
 def zoomed(factor: float) -> PaperLens:
@@ -41,17 +28,6 @@ def zoomed(factor: float) -> PaperLens:
 def stated(text: str) -> float:
     """The first number of a sentence."""
     return float(re.findall(r"[-+]?\d+\.\d+", text)[0])
-
-
-def told(shown: Shown, judge: CauseJudge, **scene: Any) -> tuple[Cause, str | None, str]:
-    for _ in range(FRAMES):
-        judge.add(shown.evidence(**scene))
-    explanation = judge.explanation(shown.reference)
-    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
-    assert [c.probability for c in explanation.causes] == sorted(
-        (c.probability for c in explanation.causes), reverse=True
-    )
-    return explanation.probable.cause, explanation.probable.part, explanation.text
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
@@ -220,70 +196,6 @@ def test_noise_that_hides_the_fingers_is_the_cause_of_where_they_seem_to_be():
     assert told(shown, shown.judge(), hidden=("left",), noise=0.08)[0] is Cause.IMAGE_BAD
 
 
-def ill_seen(evidence: EdgeEvidence, *shares: float) -> EdgeEvidence:
-    """With other shares of the fingers' profiles that agree."""
-    return dataclasses.replace(evidence, finger_share=np.array(shares))
-
-
-@pytest.mark.parametrize(
-    ("well_seen", "cause"), [(FRAMES, Cause.FINGER_BENT), (3, Cause.FINGER_BENT), (2, Cause.UNKNOWN)]
-)
-def test_a_finger_that_most_of_its_profiles_contradict_is_not_called_bent(well_seen: int, cause: Cause):
-    shown = Shown(sharp_gripper())
-    judge = shown.judge()
-    bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}
-    for k in range(FRAMES):
-        judge.add(ill_seen(shown.evidence(bent=bent), 0.6 if k < well_seen else 0.4, 0.8))
-    explanation = judge.explanation(shown.reference)
-    assert explanation.probable.cause is cause
-    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
-    assert ("too little of the fingers is seen" in explanation.text) == (cause is Cause.UNKNOWN)
-
-
-@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.JAW_OPENING), (0.4, Cause.UNKNOWN)])
-def test_one_finger_alone_does_not_tell_of_the_opening(share: float, cause: Cause):
-    shown = Shown(sharp_gripper())
-    judge = shown.judge()
-    for _ in range(FRAMES):
-        judge.add(ill_seen(shown.evidence(reported_m=OPENING_M + 5e-4), 0.8, share))
-    assert judge.explanation(shown.reference).probable.cause is cause
-
-
-@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.LENS), (0.4, Cause.UNKNOWN)])
-def test_one_finger_alone_does_not_tell_of_the_lens(share: float, cause: Cause):
-    shown = Shown(sharp_gripper())
-    judge = shown.judge()
-    for _ in range(FRAMES):
-        judge.add(ill_seen(shown.evidence(blur_px=1.8), 0.8, share))
-    assert judge.explanation(shown.reference).probable.cause is cause
-
-
-@pytest.mark.parametrize("place", [0, FRAMES // 2, FRAMES - 1])
-def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
-    """A fit in which too little agreed may have ended anywhere; its edge points lie where they lie."""
-    shown = Shown(sharp_gripper())
-    judge = shown.judge()
-    astray = knocked(shown.reference, (0.02, -0.01, 0.01), (6.0, -4.0, 8.0))
-    for k in range(FRAMES):
-        evidence = shown.evidence(opening_m=OPENING_M - 2e-4 * k, reported_m=OPENING_M - 2e-4 * k)
-        judge.add(dataclasses.replace(evidence, cam_T_grip=astray) if k == place else evidence)
-    explanation = judge.explanation(shown.reference)
-    assert explanation.probable.cause is Cause.UNKNOWN
-    assert explanation.text == "every finger and the camera stand where they did"
-
-
-@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (6.0, -4.0, 8.0)])
-def test_pieces_lie_where_a_frame_shows_them_whatever_its_pose(turn_deg: tuple[float, ...]):
-    shown = Shown(sharp_gripper())
-    evidence = shown.evidence()
-    pooled = pool(
-        [dataclasses.replace(evidence, cam_T_grip=knocked(shown.reference, (0.02, 0.0, 0.0), turn_deg))],
-        shown.camera,
-        shown.gripper,
-    )
-    np.testing.assert_allclose(pooled.evidence.xy, evidence.xy, atol=1e-9)
-
-
 def test_another_camera_is_thought_of_only_after_an_interruption():
     shown = Shown(sharp_gripper())
     scene = {
@@ -323,76 +235,9 @@ def test_a_few_mistaken_frames_do_not_decide():
     assert judge.explanation(shown.reference).probable.cause is Cause.UNKNOWN
 
 
-@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
-def test_residuals_are_distances_in_the_image_and_their_derivatives_hold(lens: LensSettings):
-    """Against the camera's projection of the moved gripper, and central differences."""
-    shown, gripper = Shown(two_fingers(), lens), two_fingers()
-    evidence = shown.evidence(opening_m=0.032, sigma_px=0.0)
-    view = EdgeView(shown.camera, gripper, evidence)
-    state = State(shown.reference, 0.032, 0.0, np.zeros((2, 6)))
-    assert np.abs(view.residual(state)[0]).max() < 2e-3
-    # A small known motion of the left finger shows as the projection says.
-    shift = np.array([2e-5, -3e-5, 4e-5])
-    finger = np.zeros((2, 6))
-    finger[0, :3] = shift
-    residual = view.residual(State(shown.reference, 0.032, 0.0, finger))[0]
-    points = gripper.points_grip_m(0.032) @ shown.reference[:3, :3].T + shown.reference[:3, 3]
-    ends = points[gripper.edge_points[evidence.edge]]
-    spot = ends[:, 0] + evidence.fraction[:, None] * (ends[:, 1] - ends[:, 0])
-    own = gripper.edge_finger[evidence.edge] == 0
-    way_px = shown.camera.project(spot + shift) - shown.camera.project(spot)
-    expected = np.where(own, -np.einsum("si,si->s", way_px, evidence.across), 0.0)
-    np.testing.assert_allclose(residual, expected, atol=4e-3)
-    # Derivatives of the prediction, of which the residual has the negative; where the pieces lie on their edges.
-    state = State(perturb(shown.reference, np.full(6, 2e-5)), 0.03201, 1e-4, np.zeros((2, 6)))
-    jacobian = view.residual(state)[1]
-    for unknown in range(FINGERS + 12):
-        step = np.zeros(FINGERS + 12)
-        step[unknown] = 1e-6
-        after, before = view.residual(state.moved(step, gripper))[0], view.residual(state.moved(-step, gripper))[0]
-        scale = max(float(np.abs(jacobian[:, unknown]).max()), 1.0)
-        np.testing.assert_allclose(jacobian[:, unknown] / scale, (before - after) / 2e-6 / scale, atol=3e-3)
-
-
-def test_the_evidence_is_the_integral_over_the_prior():
-    """One free unknown, the opening, and edges without an error of their own: quadrature does it, too."""
-    shown = Shown(sharp_gripper(), seed=5)
-    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
-    view, gripper = EdgeView(shown.camera, shown.gripper, evidence), shown.gripper
-    start = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6)))
-    held, freed, sizes = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12), np.array([1e-4, 1e-3])
-    freed[JAW] = 1.0
-    count = len(evidence.edge)
-    edge = np.unique(evidence.edge, return_inverse=True)[1]
-    errors = Errors(np.zeros(count), np.full(count, 0.2), np.full(count, 1e-6), edge)
-    found = weigh(view, gripper, Model(held, freed, sizes), start, start, errors)
-    residual, jacobian = view.residual(start)
-
-    def density(way_m: float) -> float:
-        error = (residual - jacobian[:, JAW] * way_m) / 0.2
-        likelihood = np.exp(-0.5 * (FREEDOM + 1.0) * np.log1p(error**2 / FREEDOM).sum())
-        return float(likelihood * np.mean(norm.pdf(way_m, scale=sizes)))
-
-    integral = quad(density, -1e-3, 1e-3, points=(8e-5,), limit=200)[0]
-    assert found.log_evidence == pytest.approx(math.log(integral), abs=0.25)
-    assert found.motion[JAW] == pytest.approx(8e-5, abs=3e-5)
-    assert not found.motion[POSE].any() and found.motion[FOCAL] == 0.0
-
-
 def test_settings_refuse_a_probability_that_names_anything():
     with pytest.raises(msgspec.ValidationError, match="probable"):
         msgspec.convert({"probable": 0.4}, CauseSettings)
-
-
-def test_a_blur_that_stays_as_it_is_is_no_news_and_another_one_is():
-    rng = np.random.default_rng(3)
-    watch = BlurWatch()
-    assert not any(watch.add(0.7 + rng.normal(0.0, 0.05)) for _ in range(500))
-    assert not any(watch.add(blur_px) for blur_px in (2.0, 2.1, None))  # two frames decide nothing
-    assert not any(watch.add(0.7) for _ in range(5))
-    assert [watch.add(1.2) for _ in range(5)] == [False, False, True, True, True]
-    assert not [watch.add(0.75) for _ in range(5)][-1]
-    assert [watch.add(0.3) for _ in range(5)][-1]
 
 
 def test_edges_that_lie_anywhere_tell_nothing():
@@ -401,40 +246,3 @@ def test_edges_that_lie_anywhere_tell_nothing():
     cause, _, text = told(shown, judge, sigma_px=3.0, cam_T_grip=knocked(shown.reference, (1e-3, 0.0, 0.0)))
     assert cause is Cause.UNKNOWN
     assert "scatter" in text
-
-
-def test_a_finger_of_which_fewer_profiles_agree_is_worth_asking_about():
-    rng = np.random.default_rng(4)
-    watch = FingerWatch(2)
-    assert not any(watch.add([0.8 + rng.normal(0.0, 0.04), 0.5 + rng.normal(0.0, 0.04)]) for _ in range(300))
-    assert not any(watch.add([0.1, 0.5]) for _ in range(2))  # two frames decide nothing
-    assert not any(watch.add([0.8, 0.5]) for _ in range(5))
-    assert [watch.add([0.8, 0.3]) for _ in range(5)] == [False, False, True, True, True]
-
-
-def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_about():
-    rng = np.random.default_rng(5)
-    bias_px = np.array([0.3, -0.2, 0.0, 0.1, np.nan])
-    watch = ResidualWatch()
-
-    def frame(shift_px: Any = 0.0) -> np.ndarray:
-        return bias_px + shift_px + rng.normal(0.0, 0.02, 5)
-
-    assert not any(watch.add(frame()) for _ in range(300))
-    assert not any(watch.add(frame([0.3, 0.0, 0.0, 0.0, 0.0])) for _ in range(10))  # one edge: the background's
-    assert not any(watch.add(frame()) for _ in range(5))
-    assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]
-
-
-def test_jaws_that_are_seen_elsewhere_against_the_report_than_usually_are_worth_asking_about():
-    rng = np.random.default_rng(6)
-    watch = JawWatch()
-
-    def reported_m() -> float:
-        return OPENING_M + rng.normal(0.0, 3e-5)
-
-    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(500))  # an offset that was always there
-    assert not any(watch.add(OPENING_M - 1e-3, OPENING_M + 2e-4) for _ in range(2))  # two frames decide nothing
-    assert not any(watch.add(None, OPENING_M) for _ in range(20))
-    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(5))
-    assert [watch.add(reported_m() - 3e-4, OPENING_M + 2e-4) for _ in range(5)] == [False, False, True, True, True]

@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from gripmon_process import GRIPMON
 from loopback import frame_record
 
 from gripmon.cli import main
@@ -24,7 +24,6 @@ from gripmon.monitor import Monitor
 from gripmon.records import Frame, FrameRecord, Refusal
 
 ROOT = Path(__file__).resolve().parent.parent
-GRIPMON = (sys.executable, "-m", "gripmon")
 CONTRACT = {
     "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
     "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from gripmon_process import GRIPMON
 
 from gripmon.cli import main
 from gripmon.playback import open_recordings
 
 ROOT = Path(__file__).resolve().parent.parent
-GRIPMON = (sys.executable, "-m", "gripmon")
 DISK_BYTES = 3_000_000
 
 

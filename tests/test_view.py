@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -22,6 +21,7 @@ import psutil
 import pytest
 import recorded
 import rerun_cli
+from gripmon_process import GRIPMON
 from headless import needs_chromium, picture_of
 from loopback import WAIT_S, free_endpoint, wait_until
 from network_daemon import ENVIRONMENT
@@ -32,7 +32,6 @@ from gripmon.config import builtin_config
 from gripmon.recording import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"
-GRIPMON = (sys.executable, "-m", "gripmon")
 MAGENTA = (255, 0, 255)
 
 

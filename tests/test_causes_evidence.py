@@ -1,0 +1,135 @@
+"""The evidence for a cause: shares of a finger's profiles, pieces of edges, residuals, the integral over the prior."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.stats import norm
+from shown_edges import FRAMES, OPENING_M, Shown, bend, ill_seen, knocked, two_fingers
+from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
+
+from gripmon.camera import LensSettings
+from gripmon.causes.pooling import pool
+from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
+from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
+from gripmon.geometry import perturb
+from gripmon.records import Cause
+
+
+@pytest.mark.parametrize(
+    ("well_seen", "cause"), [(FRAMES, Cause.FINGER_BENT), (3, Cause.FINGER_BENT), (2, Cause.UNKNOWN)]
+)
+def test_a_finger_that_most_of_its_profiles_contradict_is_not_called_bent(well_seen: int, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    bent = {"left": bend(shown.gripper, "left", (8e-4, 5e-4))}
+    for k in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(bent=bent), 0.6 if k < well_seen else 0.4, 0.8))
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is cause
+    assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
+    assert ("too little of the fingers is seen" in explanation.text) == (cause is Cause.UNKNOWN)
+
+
+@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.JAW_OPENING), (0.4, Cause.UNKNOWN)])
+def test_one_finger_alone_does_not_tell_of_the_opening(share: float, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(reported_m=OPENING_M + 5e-4), 0.8, share))
+    assert judge.explanation(shown.reference).probable.cause is cause
+
+
+@pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.LENS), (0.4, Cause.UNKNOWN)])
+def test_one_finger_alone_does_not_tell_of_the_lens(share: float, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(ill_seen(shown.evidence(blur_px=1.8), 0.8, share))
+    assert judge.explanation(shown.reference).probable.cause is cause
+
+
+@pytest.mark.parametrize("place", [0, FRAMES // 2, FRAMES - 1])
+def test_a_frame_that_has_the_gripper_elsewhere_moves_no_edge(place: int):
+    """A fit in which too little agreed may have ended anywhere; its edge points lie where they lie."""
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    astray = knocked(shown.reference, (0.02, -0.01, 0.01), (6.0, -4.0, 8.0))
+    for k in range(FRAMES):
+        evidence = shown.evidence(opening_m=OPENING_M - 2e-4 * k, reported_m=OPENING_M - 2e-4 * k)
+        judge.add(dataclasses.replace(evidence, cam_T_grip=astray) if k == place else evidence)
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is Cause.UNKNOWN
+    assert explanation.text == "every finger and the camera stand where they did"
+
+
+@pytest.mark.parametrize("turn_deg", [(0.0, 0.0, 0.0), (6.0, -4.0, 8.0)])
+def test_pieces_lie_where_a_frame_shows_them_whatever_its_pose(turn_deg: tuple[float, ...]):
+    shown = Shown(sharp_gripper())
+    evidence = shown.evidence()
+    pooled = pool(
+        [dataclasses.replace(evidence, cam_T_grip=knocked(shown.reference, (0.02, 0.0, 0.0), turn_deg))],
+        shown.camera,
+        shown.gripper,
+    )
+    np.testing.assert_allclose(pooled.evidence.xy, evidence.xy, atol=1e-9)
+
+
+@pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS])
+def test_residuals_are_distances_in_the_image_and_their_derivatives_hold(lens: LensSettings):
+    """Against the camera's projection of the moved gripper, and central differences."""
+    shown, gripper = Shown(two_fingers(), lens), two_fingers()
+    evidence = shown.evidence(opening_m=0.032, sigma_px=0.0)
+    view = EdgeView(shown.camera, gripper, evidence)
+    state = State(shown.reference, 0.032, 0.0, np.zeros((2, 6)))
+    assert np.abs(view.residual(state)[0]).max() < 2e-3
+    # A small known motion of the left finger shows as the projection says.
+    shift = np.array([2e-5, -3e-5, 4e-5])
+    finger = np.zeros((2, 6))
+    finger[0, :3] = shift
+    residual = view.residual(State(shown.reference, 0.032, 0.0, finger))[0]
+    points = gripper.points_grip_m(0.032) @ shown.reference[:3, :3].T + shown.reference[:3, 3]
+    ends = points[gripper.edge_points[evidence.edge]]
+    spot = ends[:, 0] + evidence.fraction[:, None] * (ends[:, 1] - ends[:, 0])
+    own = gripper.edge_finger[evidence.edge] == 0
+    way_px = shown.camera.project(spot + shift) - shown.camera.project(spot)
+    expected = np.where(own, -np.einsum("si,si->s", way_px, evidence.across), 0.0)
+    np.testing.assert_allclose(residual, expected, atol=4e-3)
+    # Derivatives of the prediction, of which the residual has the negative; where the pieces lie on their edges.
+    state = State(perturb(shown.reference, np.full(6, 2e-5)), 0.03201, 1e-4, np.zeros((2, 6)))
+    jacobian = view.residual(state)[1]
+    for unknown in range(FINGERS + 12):
+        step = np.zeros(FINGERS + 12)
+        step[unknown] = 1e-6
+        after, before = view.residual(state.moved(step, gripper))[0], view.residual(state.moved(-step, gripper))[0]
+        scale = max(float(np.abs(jacobian[:, unknown]).max()), 1.0)
+        np.testing.assert_allclose(jacobian[:, unknown] / scale, (before - after) / 2e-6 / scale, atol=3e-3)
+
+
+def test_the_evidence_is_the_integral_over_the_prior():
+    """One free unknown, the opening, and edges without an error of their own: quadrature does it, too."""
+    shown = Shown(sharp_gripper(), seed=5)
+    evidence = shown.evidence(opening_m=OPENING_M + 8e-5, sigma_px=0.2)
+    view, gripper = EdgeView(shown.camera, shown.gripper, evidence), shown.gripper
+    start = State(shown.reference, OPENING_M, 0.0, np.zeros((2, 6)))
+    held, freed, sizes = np.zeros(FINGERS + 12), np.zeros(FINGERS + 12), np.array([1e-4, 1e-3])
+    freed[JAW] = 1.0
+    count = len(evidence.edge)
+    edge = np.unique(evidence.edge, return_inverse=True)[1]
+    errors = Errors(np.zeros(count), np.full(count, 0.2), np.full(count, 1e-6), edge)
+    found = weigh(view, gripper, Model(held, freed, sizes), start, start, errors)
+    residual, jacobian = view.residual(start)
+
+    def density(way_m: float) -> float:
+        error = (residual - jacobian[:, JAW] * way_m) / 0.2
+        likelihood = np.exp(-0.5 * (FREEDOM + 1.0) * np.log1p(error**2 / FREEDOM).sum())
+        return float(likelihood * np.mean(norm.pdf(way_m, scale=sizes)))
+
+    integral = quad(density, -1e-3, 1e-3, points=(8e-5,), limit=200)[0]
+    assert found.log_evidence == pytest.approx(math.log(integral), abs=0.25)
+    assert found.motion[JAW] == pytest.approx(8e-5, abs=3e-5)
+    assert not found.motion[POSE].any() and found.motion[FOCAL] == 0.0

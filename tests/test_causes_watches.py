@@ -1,0 +1,58 @@
+"""What makes the judge worth asking: a blur, a finger, residuals or jaws otherwise than usually."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from shown_edges import OPENING_M
+
+from gripmon.causes import BlurWatch, FingerWatch, JawWatch, ResidualWatch
+
+
+def test_a_blur_that_stays_as_it_is_is_no_news_and_another_one_is():
+    rng = np.random.default_rng(3)
+    watch = BlurWatch()
+    assert not any(watch.add(0.7 + rng.normal(0.0, 0.05)) for _ in range(500))
+    assert not any(watch.add(blur_px) for blur_px in (2.0, 2.1, None))  # two frames decide nothing
+    assert not any(watch.add(0.7) for _ in range(5))
+    assert [watch.add(1.2) for _ in range(5)] == [False, False, True, True, True]
+    assert not [watch.add(0.75) for _ in range(5)][-1]
+    assert [watch.add(0.3) for _ in range(5)][-1]
+
+
+def test_a_finger_of_which_fewer_profiles_agree_is_worth_asking_about():
+    rng = np.random.default_rng(4)
+    watch = FingerWatch(2)
+    assert not any(watch.add([0.8 + rng.normal(0.0, 0.04), 0.5 + rng.normal(0.0, 0.04)]) for _ in range(300))
+    assert not any(watch.add([0.1, 0.5]) for _ in range(2))  # two frames decide nothing
+    assert not any(watch.add([0.8, 0.5]) for _ in range(5))
+    assert [watch.add([0.8, 0.3]) for _ in range(5)] == [False, False, True, True, True]
+
+
+def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_about():
+    rng = np.random.default_rng(5)
+    bias_px = np.array([0.3, -0.2, 0.0, 0.1, np.nan])
+    watch = ResidualWatch()
+
+    def frame(shift_px: Any = 0.0) -> np.ndarray:
+        return bias_px + shift_px + rng.normal(0.0, 0.02, 5)
+
+    assert not any(watch.add(frame()) for _ in range(300))
+    assert not any(watch.add(frame([0.3, 0.0, 0.0, 0.0, 0.0])) for _ in range(10))  # one edge: the background's
+    assert not any(watch.add(frame()) for _ in range(5))
+    assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]
+
+
+def test_jaws_that_are_seen_elsewhere_against_the_report_than_usually_are_worth_asking_about():
+    rng = np.random.default_rng(6)
+    watch = JawWatch()
+
+    def reported_m() -> float:
+        return OPENING_M + rng.normal(0.0, 3e-5)
+
+    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(500))  # an offset that was always there
+    assert not any(watch.add(OPENING_M - 1e-3, OPENING_M + 2e-4) for _ in range(2))  # two frames decide nothing
+    assert not any(watch.add(None, OPENING_M) for _ in range(20))
+    assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(5))
+    assert [watch.add(reported_m() - 3e-4, OPENING_M + 2e-4) for _ in range(5)] == [False, False, True, True, True]

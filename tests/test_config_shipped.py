@@ -1,0 +1,57 @@
+"""The configurations, grippers and scenarios that come with the package."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripmon.config import ConfigError, builtin_config, load_config, load_scenario
+from gripmon.gripper import load_gripper
+
+ROOT = Path(__file__).resolve().parent.parent
+GRIPPERS = ROOT / "configs" / "grippers"
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
+def test_shipped_configurations_are_sound_and_every_key_says_its_unit(name: str):
+    path = builtin_config(name)
+    load_config(path, check_source=False)
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        has_value = re.match(r"\s*\w+: *[^#\s]", line)
+        assert not has_value or " # " in line, f"{path}:{number}: a comment with the unit or the choices is missing"
+
+
+@pytest.mark.parametrize("name", ["two_box_fingers", "adaptive_arc_fingers"])
+def test_shipped_grippers_close_to_the_tcp(name: str):
+    """The innermost corners of both fingers meet at opening 0, and lie symmetric about the TCP at every opening."""
+    gripper = load_gripper(GRIPPERS / f"{name}.yaml")
+    inner = [gripper.point_ids.index(f"{side}_in_{which}") for which in ("near", "far") for side in ("L", "R")]
+    for opening_m in np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, 7):
+        corners = gripper.points_grip_m(float(opening_m))[inner]
+        np.testing.assert_allclose(corners[1::2, 0] - corners[0::2, 0], opening_m, atol=1e-9)
+        np.testing.assert_allclose(corners[:, :2].mean(axis=0), 0.0, atol=1e-9)
+
+
+def test_adaptive_fingertips_stay_on_their_arc():
+    """Between two rows of the table too: within the sagitta of a 2.5 mm chord on a 57.3 mm radius."""
+    gripper = load_gripper(GRIPPERS / "adaptive_arc_fingers.yaml")
+    tip = gripper.point_ids.index("R_in_near")
+    places = np.array([gripper.points_grip_m(float(o))[tip] for o in np.linspace(0.0, 0.08, 161)])
+    radius_m, top_x_m = 0.0573, 0.006
+    top_z_m = places[:, 2].max()
+    distance_m = np.hypot(places[:, 0] - top_x_m, places[:, 2] - top_z_m + radius_m)
+    assert np.ptp(places[:, 2]) > 0.009
+    np.testing.assert_allclose(distance_m, radius_m, atol=0.0025**2 / 8 / 0.0573)
+
+
+def test_scenarios_load_and_refuse(tmp_path: Path):
+    path = tmp_path / "s.yaml"
+    path.write_text("name: mine\nduration_s: 2\nmount:\n  - {kind: bump, at_s: 1, tcp_shift_m: [0.0, 0.0045]}\n")
+    scenario = load_scenario(path)
+    assert (scenario.name, scenario.mount[0].tcp_shift_m) == ("mine", (0.0, 0.0045))
+    path.write_text("name: mine\nmount:\n  - {kind: bmp}\n")
+    with pytest.raises(ConfigError, match=r"mount\[0\].kind: is 'bmp', did you mean 'bump'"):
+        load_scenario(path)

@@ -1,0 +1,141 @@
+"""The demo: what it promises, what it names, and how it compares with the truth."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import socket
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from gripmon_process import gripmon
+
+from gripmon.cli import demo
+from gripmon.cli.comparison import compare
+from gripmon.geometry import from_record, make_transform, to_record
+from gripmon.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.simulator import FrameTruth
+
+
+def test_the_demo_keeps_what_it_promises(tmp_path: Path):
+    out = tmp_path / "demo"
+    done = gripmon("demo", "--seconds", "10", "--fps", "12", "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    records = [
+        msgspec.json.decode(line, type=FrameRecord) for line in (out / "estimates.jsonl").read_bytes().splitlines()
+    ]
+    assert len(list(out.glob("*.rrd"))) == 1 and summary["recordings"] == ["demo-0001.rrd"]
+    assert summary["frames"] == len(records) > 60
+    assert summary["transforms_received"] == summary["frames"]
+    comparison = summary["comparison"]
+    assert comparison["without_correction"]["across_mm"]["max"] > 4.0
+    assert comparison["after_correction"]["across_mm"]["p95"] < 0.02
+    assert comparison["after_correction"]["along_mm"]["p95"] < 0.06
+    assert comparison["after_correction"]["frames"] > 0.6 * len(records)
+    assert {"creep", "bump", "occlusion"} <= {event["event"] for event in comparison["events"]}
+    assert all((event["noticed_after_s"] is None) == event["harmless"] for event in comparison["events"])
+    assert "after correction" in done.stdout and re.search(r"look at it \S*rerun \S*demo-0001.rrd", done.stdout)
+    assert re.search(r"report +gripmon report \S+/demo-0001.rrd --out \S+/report.html", done.stdout)
+
+
+def test_the_demo_takes_another_port_when_the_usual_one_is_taken(monkeypatch: pytest.MonkeyPatch):
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = server.getsockname()[1]
+        monkeypatch.setattr(demo, "_PREFERRED_PORT", taken)
+        assert demo._free_port() != taken
+    assert demo._free_port() == taken
+
+
+def record(seq: int, error_m: tuple[float, float, float], **changes: Any) -> FrameRecord:
+    transform = to_record(make_transform(np.eye(3), np.array([0.0, 0.0, 0.1]) + truth_shift_m(seq) + error_m))
+    values: dict[str, Any] = {
+        "seq": seq, "stamp_ns": seq, "verdict": Verdict.VALID, "state": State.TRACKING, "source": Origin.UPDATE,
+        "cam_T_grip": transform, "covariance": None, "smoothed": None, "drift": None, "reference_id": "r",
+        "revision": 0, "rms_px": None, "jaw_opening_m": None, "corners": (), "alerts": (),
+    }  # fmt: skip
+    return FrameRecord(**{**values, **changes})
+
+
+def truth_shift_m(seq: int) -> np.ndarray:
+    return np.array([0.003, 0.004, 0.0]) if seq >= 4 else np.zeros(3)
+
+
+def truth(seq: int) -> FrameTruth:
+    shift_m = truth_shift_m(seq)
+    reference = make_transform(np.eye(3), np.array([0.0, 0.0, 0.1]))
+    moved = make_transform(np.eye(3), reference[:3, 3] + shift_m)
+    events = (("bumped",) if seq >= 4 else ()) + (("hand",) if seq in (7, 8) else ())
+    return FrameTruth(
+        index=seq, time_s=0.1 * seq, stamp_ns=seq, cam_T_grip=moved, reference_cam_T_grip=reference,
+        tcp_shift_m=shift_m, jaw_opening_m=0.0, jaw_reported_m=None,
+        corner_ids=(), corner_uv_px=np.zeros((0, 2)), hidden=(), finger_bend=np.zeros((0, 4, 4)),
+        events=events, exposure=1.0, defocus_px=0.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("alerts", "noticed"),
+    [
+        ([("raised", "info", "step")], True),
+        ([("cleared", "info", "step")], False),
+        ([("updated", "warning", "creep")], False),
+        ([("updated", "error", "creep")], True),
+        ([("updated", "warning", "step")], True),
+        ([("noted", "warning", "restarted")], False),
+        ([("noted", "warning", "recalibrated")], False),
+        ([("cleared", "info", "step"), ("raised", "warning", "occluded")], True),
+    ],
+)
+def test_of_alerts_what_is_new_or_worse_is_noticed(alerts: list[tuple[str, str, str]], noticed: bool):
+    """A creep was told of, as a warning, before the bump at frame 4."""
+
+    def alert(event: str, severity: str, kind: str) -> Alert:
+        name = "1-creep" if event != "raised" or kind == "creep" else "2-new"
+        return Alert(AlertKind(kind), Cause.UNKNOWN, Severity(severity), "", event=AlertEvent(event), alert_id=name)
+
+    records = [record(i, (0.0, 0.0, 0.0)) for i in range(7)]
+    records[1] = record(1, (0.0, 0.0, 0.0), alerts=(alert("raised", "warning", "creep"),))
+    records[5] = record(5, (0.0, 0.0, 0.0), alerts=tuple(alert(*each) for each in alerts))
+    [bump] = compare(records, truth).events
+    assert bump.noticed_after_s == (pytest.approx(0.1) if noticed else None)
+
+
+def test_the_comparison_counts_by_hand():
+    jump = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "it moved")
+    recalibrated = Alert(AlertKind.RECALIBRATED, Cause.UNKNOWN, Severity.INFO, "a new reference")
+    records = [record(i, (3e-6, 4e-6, -2e-6)) for i in range(4)]
+    records += [record(4, (3e-6, 4e-6, -2e-6), alerts=(recalibrated,))]
+    records += [record(5, (0.0, 0.0, 1e-5), alerts=(jump,)), record(6, (1.0, 1.0, 1.0), verdict=Verdict.SUSPECT)]
+    records += [
+        record(7, (1.0, 0.0, 0.0), source=Origin.HELD),
+        record(8, (0.0, 0.0, 0.0), state=State.OCCLUDED, cam_T_grip=None),
+    ]
+    result = compare(records, truth)
+    assert result.verdicts == {"valid": 8, "suspect": 1, "unknown": 0}
+    assert result.without_correction.across_mm.max == pytest.approx(5.0)
+    assert result.after_correction.frames == 6, "suspect, held and missing transforms are not counted"
+    assert result.after_correction.across_mm.mean == pytest.approx(5 * 5e-3 / 6)
+    assert result.after_correction.along_mm.max == pytest.approx(1e-2)
+    assert result.smoothed.frames == 0 and result.smoothed.across_mm.mean is None
+    bump, occlusion = result.events
+    assert (bump.event, bump.frames, occlusion.event, occlusion.frames) == ("bump", 3, "occlusion", 2)
+    assert bump.noticed_after_s == pytest.approx(0.1)
+    assert bump.alerts == ("recalibrated (unknown)", "step (camera_mount_moved)"), "in order; the first is no alarm"
+    assert occlusion.noticed_after_s is None and occlusion.alerts == ()
+    assert from_record(records[0].cam_T_grip)[2, 3] == pytest.approx(0.1 - 2e-6)  # type: ignore[arg-type]
+
+
+def test_the_demo_names_what_there_is_to_ask(tmp_path: Path):
+    from gripmon.cli.demo import _report_line
+
+    out = tmp_path / "a shift"
+    asked = shlex.split(_report_line([str(out / "demo-0001.rrd"), str(out / "demo-0002.rrd")], out))
+    assert asked[1:] == [
+        "gripmon", "report", str(out / "demo-0001.rrd"), str(out / "demo-0002.rrd"), "--out", str(out / "report.html"),
+    ]  # fmt: skip
+    assert "none was written" in _report_line([], out)

@@ -1,0 +1,112 @@
+"""The policy while nothing is measured: held, lost, found; and how much less a held transform is worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from policy_runs import (
+    BENT,
+    BLACK,
+    CLEARED,
+    HIDDEN,
+    LOST,
+    RAISED,
+    SUSPECT,
+    UNKNOWN,
+    UPDATED,
+    VALID,
+    Nothing,
+    Run,
+    explained,
+    kinds,
+    seen,
+    settled,
+)
+
+from gripmon.policy import Policy, PolicySettings
+from gripmon.records import AlertKind, Cause
+
+K = AlertKind
+
+
+def test_an_uncertain_transform_is_suspect():
+    run = settled()
+    wide = np.array([4e-6, 4e-6, 1.05e-4, 3e-4, 3e-4, 1e-4])
+    assert run.feed(seen(sigma=wide)).verdict is SUSPECT
+    assert run.feed(seen(sigma=wide * 0.9)).verdict is VALID
+
+
+def test_every_second_frame_hidden_is_never_lost_and_never_valid():
+    run = settled()
+    judgements = run.feed_all([HIDDEN, seen()] * 50)
+    assert {j.verdict for j in judgements} == {SUSPECT}
+    assert kinds(judgements) == [(K.OCCLUDED, RAISED)]
+
+
+def test_a_gripper_that_is_found_for_one_frame_only_was_never_back():
+    run = settled()
+    assert run.feed_all([HIDDEN] * 20)[-1].state is LOST
+    assert kinds([run.feed(seen())]) == []
+    again = run.feed_all([HIDDEN] * 20)
+    assert again[-1].state is LOST
+    assert again[-1].verdict is UNKNOWN
+    assert kinds(again) == []
+    assert kinds(run.feed_all([seen()] * 4)) == [(K.LOST, CLEARED)]
+    assert kinds(run.feed_all([HIDDEN] * 20)) == [(K.OCCLUDED, RAISED), (K.LOST, UPDATED)]
+
+
+def test_lost_is_not_over_while_every_second_frame_is_hidden():
+    run = settled()
+    assert run.feed_all([HIDDEN] * 20)[-1].state is LOST
+    assert kinds(run.feed_all([seen(), HIDDEN] * 20)) == []
+    assert kinds(run.feed_all([seen()] * 3)) == [(K.LOST, CLEARED)]
+
+
+def test_frames_that_are_refused_while_hidden_do_not_restart_the_clock():
+    run = settled()
+    judgements = run.feed_all([HIDDEN, BLACK] * 8)
+    assert [j.state for j in judgements].index(LOST) == 8
+    told = kinds(judgements)
+    assert told.count((K.OCCLUDED, RAISED)) == told.count((K.IMAGE, RAISED)) == 1
+    assert set(told) == {(K.OCCLUDED, RAISED), (K.IMAGE, RAISED), (K.LOST, UPDATED)}
+    assert len(told) <= 4, "lost, and once more that images are bad, too"
+
+
+def test_the_alert_about_a_lost_gripper_tells_images_from_views():
+    blocked = Nothing(explanation=explained(Cause.VIEW_BLOCKED))
+    for nothing, cause in ((HIDDEN, Cause.UNKNOWN), (blocked, Cause.VIEW_BLOCKED), (BLACK, Cause.IMAGE_BAD)):
+        alerts = [a for j in settled().feed_all([nothing] * 15) for a in j.alerts]
+        [lost] = [a for a in alerts if a.kind is K.LOST]
+        assert lost.cause is cause and lost.severity == "error"
+        [*_, last] = [a for a in alerts if a.kind in (K.OCCLUDED, K.IMAGE)]
+        assert last.cause is cause
+
+
+def test_a_gripper_never_seen_is_not_said_to_be_hidden():
+    [lost] = [a for j in Run().feed_all([HIDDEN] * 15) for a in j.alerts]
+    assert (lost.kind, lost.cause) == (K.LOST, Cause.UNKNOWN)
+
+
+def test_why_the_gripper_is_not_seen_is_said_where_it_is_known():
+    hidden = Nothing(explanation=BENT)
+    [alert] = settled().feed(hidden).alerts
+    assert (alert.kind, alert.cause, alert.part, alert.causes) == (K.OCCLUDED, Cause.FINGER_BENT, "left", BENT.causes)
+    assert BENT.text in alert.text
+
+
+@pytest.mark.parametrize("cause", [Cause.CAMERA_MOUNT, Cause.JAW_OPENING])
+def test_what_has_moved_before_does_not_hide_the_gripper(cause: Cause):
+    """A hand before a camera that was knocked a moment ago."""
+    run = settled()
+    run.feed_all([seen(1.0, explanation=explained(cause))] * 3)
+    occluded = [a for j in run.feed_all([Nothing(explanation=explained(cause))] * 15) for a in j.alerts]
+    assert {a.kind for a in occluded} == {K.OCCLUDED, K.LOST}
+    assert all((a.cause, a.causes) == (Cause.UNKNOWN, ()) and str(cause) not in a.text for a in occluded)
+
+
+def test_a_held_transform_grows_less_certain_with_time():
+    policy = Policy(PolicySettings(hold_m_per_sqrt_s=2e-4, hold_rad_per_sqrt_s=3e-3))
+    np.testing.assert_array_equal(policy.hold_variance(0.0), np.zeros(6))
+    np.testing.assert_allclose(policy.hold_variance(0.25), [1e-8] * 3 + [2.25e-6] * 3)
+    # A random walk: variances of two spans add up.
+    np.testing.assert_allclose(policy.hold_variance(0.7) + policy.hold_variance(0.3), policy.hold_variance(1.0))
