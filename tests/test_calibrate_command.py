@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+import yaml
 from plates import Look, fingers, pose, render
 
 from gripmon.calibration.documents import CameraCalibration
@@ -18,6 +20,8 @@ from gripmon.calibration.intrinsics import lens_vector
 from gripmon.calibration.targets import parse_target
 from gripmon.camera import BrownConradyLens, PaperLens
 from gripmon.cli import main
+from gripmon.cli.calibration_files import target_of
+from gripmon.cli.common import CommandFailedError
 from gripmon.config.yaml_file import read_yaml
 
 LENS = BrownConradyLens(
@@ -151,6 +155,8 @@ REFUSALS = {
     "target in millimetres": (range(3), "chequerboard:9x6:20", (), 2, "--target: 'chequerboard:9x6:20'"),
     "no such dictionary": (range(3), "charuco:8x6:0.03:0.02:DICT_0", (), 2, "there is no dictionary DICT_0"),
     "no such parameter": (range(3), TEXT, ("--fix", "f"), 2, "--fix f: is no parameter of the model; fx_px"),
+    "no value to hold a focal length at": (range(3), TEXT, ("--fix", "fx_px"), 2, "fx_px=VALUE (px), above 0"),
+    "a value that is none": (range(3), TEXT, ("--fix", "cx_px=middle"), 2, "is no number; cx_px=VALUE"),
     "a picture of no kind": (range(3), TEXT, ("--picture", "x.txt"), 2, "--picture x.txt: has no known ending"),
 }
 
@@ -211,3 +217,29 @@ def test_a_target_that_is_described_too_large_is_doubted(
     words = ["--target", "chequerboard:11x8:0.02", "--out", str(tmp_path / "c.yaml")]
     assert calibrate(*images(folder), *words) == 0
     assert "no image shows more than 9 x 6 of the target's 11 x 8 points" in capsys.readouterr().out
+
+
+def test_a_target_comes_from_a_calibration_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "he.yaml"
+    for content, what in (
+        ({"target": "circles:8x8:0.008:0.004"}, parse_target("circles:8x8:0.008:0.004")),
+        ({"kind": "chequerboard", "columns": 9, "rows": 6, "square_m": 0.025}, parse_target("chequerboard:9x6:0.025")),
+        ({"provenance": {"command": f"gripmon calibrate plane 'a b.png' --target {TEXT}"}}, parse_target(TEXT)),
+    ):
+        path.write_text(yaml.safe_dump(content))
+        assert target_of(str(path)) == what
+    for content, why in (
+        ("schema: x\n", "names no target; a file of gripmon calibrate"),
+        ("target: he.yaml\n", "names no target"),
+        ("target: 3\n", "names no target"),
+        ("kind: discs\n", "Invalid value 'discs'"),
+        ("target: {kind: circles, columns: 8}\n", "missing required field `rows`"),
+        ("target: circles:8\n", "'circles:8' has 1 parts"),
+        ('provenance: {command: "--target \'"}\n', "names no target"),
+        ("[", "he.yaml"),
+    ):
+        path.write_text(content)
+        with pytest.raises(CommandFailedError, match=re.escape(why)):
+            target_of(str(path))
+    assert calibrate("x.png", "--target", str(tmp_path / "none.yaml"), "--out", str(tmp_path / "c.yaml")) == 2
+    assert "none.yaml" in capsys.readouterr().err

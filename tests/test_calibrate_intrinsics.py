@@ -112,7 +112,7 @@ def test_views_that_support_the_model_badly_are_warned_of():
         tilt = exp_rotation(np.array([0.12, 0.1 * k, 0.0]))
         T[:3, :3] = tilt @ T[:3, :3]
         T[:3, 3] = np.array([0.0, 0.0, 0.55]) - T[:3, :3] @ PLATE_M.mean(axis=0)
-    said = "\n".join(calibrate(seen(BROWN, weak, rng), "brown_conrady", fixed=frozenset({"cx_px", "cy_px"})).warnings)
+    said = "\n".join(calibrate(seen(BROWN, weak, rng), "brown_conrady", fixed={"cx_px": None, "cy_px": None}).warnings)
     assert "the focal length is uncertain by" in said
     assert "not told from 0" in said
     assert "the lens is extrapolated" in said
@@ -168,14 +168,32 @@ def test_cross_validation_measures_what_the_noise_is():
 def test_what_is_fixed_stays():
     rng = np.random.default_rng(18)
     views = seen(BROWN, poses(rng, 6), rng)
-    fixed = frozenset({"cx_px", "cy_px", "aspect", "coefficients.2", "coefficients.3"})
+    fixed = dict.fromkeys(("cx_px", "cy_px", "aspect", "coefficients.2", "coefficients.3"))
     result = calibrate(views, "brown_conrady", fixed=fixed)
     assert result.parameters == ("fx_px", "coefficients.0", "coefficients.1")
     camera = result.camera
     assert (camera.cx_px, camera.cy_px) == (383.5, 287.5) and camera.fx_px == camera.fy_px
     assert camera.coefficients[2:] == (0.0, 0.0)
     with pytest.raises(CalibrationError, match=r"focal is no parameter of paper; one of fx_px.* or aspect"):
-        calibrate(views, "paper", fixed=frozenset({"focal"}))
+        calibrate(views, "paper", fixed={"focal": None})
+
+
+def test_what_is_held_at_a_value_stays_there_and_helps_the_rest():
+    rng = np.random.default_rng(18)
+    views = seen(BROWN, poses(rng, 6), rng)
+    held = calibrate(views, "brown_conrady", fixed={"fx_px": BROWN.fx_px, "coefficients.0": BROWN.coefficients[0]})
+    assert (held.camera.fx_px, held.camera.coefficients[0]) == (BROWN.fx_px, BROWN.coefficients[0])
+    assert held.parameters[0] == "fy_px" and held.camera.fy_px == pytest.approx(BROWN.fy_px, abs=0.2)
+    with pytest.raises(CalibrationError, match=r"fx_px is to be held, but not said at what; fx_px=VALUE"):
+        calibrate(views, "brown_conrady", fixed={"fx_px": None})
+    with pytest.raises(CalibrationError, match=r"fy_px can't be held at a value of its own with square pixels"):
+        calibrate(views, "brown_conrady", fixed={"fy_px": 700.0, "aspect": None})
+    # A view parallel to the image, which tells no focal length, tells the lens of a camera whose focal length is known.
+    paper = CAMERAS["paper"]
+    known = {name: getattr(paper, name) for name in ("fx_px", "cx_px", "cy_px")}
+    one = calibrate_single_view(seen(paper, [flat_pose(0.0, 0.0, 0.25)], rng)[0], fixed=known)
+    assert one.parameters == ("kappa_per_px2",)
+    assert abs(one.camera.kappa_per_px2 - paper.kappa_per_px2) < 4.0 * np.sqrt(one.covariance[0, 0])
 
 
 def test_terms_that_the_views_do_not_support_are_held_and_said():

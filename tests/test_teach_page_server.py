@@ -312,7 +312,7 @@ def test_images_of_more_bits_are_shown_as_pictures(rig: Rig, saving: Told):
 def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_path: Path):
     image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64)
     path = tmp_path / "rough.yaml"
-    desk = RoughDesk(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command")
+    desk = RoughDesk(Picture("a\nb: ü.png", image, None, "a.png"), path, "the next command", "a note")
     server = PageServer(desk)
     names = [
         f"{finger}_{point}_{side}"

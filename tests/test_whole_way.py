@@ -62,7 +62,7 @@ def calibrated(user: new_user.NewUser, driver: Any) -> Path:
         patch.chdir(user.folder)
         assert gripmon(f"calibrate intrinsics plate --target {new_user.TARGET} --model paper --out camera.yaml") == 0
         _rough_corners(driver)
-        standing = f"calibrate plane standing --target {new_user.TARGET} --camera camera.yaml --corners rough.yaml"
+        standing = "calibrate plane standing --target camera.yaml --camera camera.yaml --corners rough.yaml"
         assert gripmon(f"{standing} --infer --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml") == 0
     return user.folder
 

@@ -8,8 +8,9 @@ which is what the self-viewing method does; see :func:`calibrate_single_view`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -34,6 +35,9 @@ __all__ = [
     "model_of",
     "plate_pose",
 ]
+
+Fixed = Mapping[str, float | None]
+"""Parameters that aren't estimated, with the values that they are held at; None: where they start."""
 
 FEWEST_POINTS = 8
 """In a view; a plane's pose needs four."""
@@ -86,18 +90,19 @@ def calibrate(
     sightings: Sequence[Sighting],
     model: ModelName,
     *,
-    fixed: frozenset[str] = frozenset(),
+    fixed: Fixed = MappingProxyType({}),
     near: LensSettings | None = None,
 ) -> IntrinsicsResult:
-    """A camera from views of a plane, all of one size; parameters named in ``fixed`` keep their start (the principal
-    point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.  ``near``: a camera of this
-    model to start from, where one is known.
+    """A camera from views of a plane, all of one size; parameters named in ``fixed`` keep the value there, or with None
+    their start (the principal point the image's centre, coefficients 0), and ``"aspect"`` ties ``fy_px`` to ``fx_px``.
+    ``near``: a camera of this model to start from, where one is known.
 
     Raises :class:`CalibrationError`: images of different sizes, too few points, views that don't determine the camera,
-    no convergence, or a lens that can't be meant.
+    no convergence, a focal length to be held at no value, or a lens that can't be meant.
     """
     size = _one_size(sightings)
     lens_model = LensModel(model, *size)
+    _check_held(fixed)
     names, free, bundle, held = _supported(lens_model, sightings, fixed, near)
     camera = lens_model.settings(bundle.parameters)
     p = free.shape[1]
@@ -121,7 +126,7 @@ def calibrate_best(
     sightings: Sequence[Sighting],
     models: Sequence[ModelName],
     *,
-    fixed: frozenset[str] = frozenset(),
+    fixed: Fixed = MappingProxyType({}),
     step: Callable[[], None] = lambda: None,
 ) -> IntrinsicsResult:
     """The one of several models with the smallest information criterion (Schwarz, "Estimating the dimension of a
@@ -146,7 +151,7 @@ def calibrate_best(
 
 
 def calibrate_single_view(
-    sighting: Sighting, model: ModelName = "paper", *, fixed: frozenset[str] = frozenset()
+    sighting: Sighting, model: ModelName = "paper", *, fixed: Fixed = MappingProxyType({})
 ) -> IntrinsicsResult:
     """Focal length, lens and the plate's pose from one view of a plane, principal point at the image's centre and
     square pixels: what the self-viewing method's off-line step starts with (Tsai's single-view coplanar calibration).
@@ -156,10 +161,11 @@ def calibrate_single_view(
     it, focal length and distance are one unknown.  Raises :class:`CalibrationError` then.
     """
     names = parameter_names(model)
-    held = {"cx_px", "cy_px", "aspect"} | set(names[5:])  # one view can't tell more of a lens than one number
-    result = calibrate([sighting], model, fixed=fixed | held)
-    changes = _assumed(result, sighting, _free(model, fixed | held)[1])
-    parameters, pose = np.stack([c for c, _ in changes], axis=1), np.stack([c for _, c in changes], axis=1)
+    # One view can't tell more of a lens than one number.
+    fixed = {**dict.fromkeys(("cx_px", "cy_px", "aspect", *names[5:])), **fixed}
+    result = calibrate([sighting], model, fixed=fixed)
+    changes = _assumed(result, sighting, _free(model, frozenset(fixed))[1], fixed)
+    parameters, pose = (np.stack(each, axis=1) for each in zip(*changes, strict=True))
     index = [names.index(name) for name in result.parameters]
     result = replace(
         result,
@@ -171,14 +177,18 @@ def calibrate_single_view(
     return replace(result, warnings=doubts_of(result, [sighting]))
 
 
-def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array) -> list[tuple[Array, Array]]:
-    """What a standard deviation of each assumption changes: all parameters (k,) and the plate's pose (6,)."""
+def _assumed(result: IntrinsicsResult, sighting: Sighting, free: Array, fixed: Fixed) -> list[tuple[Array, Array]]:
+    """What a standard deviation of each assumption changes: all parameters (k,) and the plate's pose (6,); what was
+    given isn't assumed.
+    """
     lens_model = LensModel(result.model, *sighting.size_px)
     problem = BundleProblem(lens_model, [sighting], free)
     at, pose = lens_vector(result.camera), result.cam_T_plate[0]
     centre_px = ASSUMED_CENTRE * lens_model.width_px
     out: list[tuple[Array, Array]] = []
-    for k, change in ((2, centre_px), (3, centre_px), (1, ASSUMED_ASPECT * at[1])):
+    for name, k, change in (("cx_px", 2, centre_px), ("cy_px", 3, centre_px), ("aspect", 1, ASSUMED_ASPECT * at[1])):
+        if fixed.get(name) is not None:
+            continue
         moved = at.copy()
         moved[k] += change
         try:
@@ -195,7 +205,7 @@ def cross_validate(
     sightings: Sequence[Sighting],
     model: ModelName,
     *,
-    fixed: frozenset[str] = frozenset(),
+    fixed: Fixed = MappingProxyType({}),
     folds: int = 5,
     step: Callable[[], None] = lambda: None,
 ) -> float | None:
@@ -228,17 +238,18 @@ def cross_validate(
 
 
 def _supported(
-    lens_model: LensModel, sightings: Sequence[Sighting], fixed: frozenset[str], near: LensSettings | None
+    lens_model: LensModel, sightings: Sequence[Sighting], fixed: Fixed, near: LensSettings | None
 ) -> tuple[tuple[str, ...], Array, Bundle, tuple[str, ...]]:
     """The fit with as many of the lens's terms as give one that can be meant all over the image: where no point lies,
     the highest ones bend it at will.  Names of the free parameters, what they change, the fit, and what was held.
     """
     held: list[str] = []
-    for name in (*reversed(parameter_names(lens_model.name)[5:]), ""):
-        names, free = _free(lens_model.name, fixed | set(held))
+    lens = [name for name in parameter_names(lens_model.name)[5:] if name not in fixed]
+    for name in (*reversed(lens), ""):
+        names, free = _free(lens_model.name, frozenset((*fixed, *held)))
         problem = BundleProblem(lens_model, sightings, free)
         if near is None:
-            bundle = _solve(problem, lens_model, sightings)
+            bundle = _solve(problem, lens_model, sightings, fixed)
         else:
             start = lens_vector(near)
             start[[name in held for name in parameter_names(lens_model.name)]] = 0.0
@@ -255,11 +266,11 @@ def _supported(
     return names, free, bundle, (said,) if held else ()
 
 
-def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Sighting]) -> Bundle:
+def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Sighting], fixed: Fixed) -> Bundle:
     """From the best of several focal lengths: the closed forms for them fail with strong lenses and single views."""
     starts = []
     for share in FOCAL_STARTS.tolist():
-        parameters = lens_model.without_distortion(share * lens_model.width_px)
+        parameters = _start(lens_model, share * lens_model.width_px, fixed)
         try:
             poses = [plate_pose_start(lens_model, parameters, s) for s in sightings]
         except (CalibrationError, cv2.error):
@@ -291,6 +302,24 @@ def _solve(problem: BundleProblem, lens_model: LensModel, sightings: Sequence[Si
     if best is None:
         raise failure or CalibrationError(DEGENERATE)
     return best
+
+
+def _check_held(fixed: Fixed) -> None:
+    """Raise :class:`CalibrationError` for focal lengths that are to be held, but not at which value."""
+    if "aspect" in fixed and fixed.get("fy_px") is not None:
+        raise CalibrationError("fy_px can't be held at a value of its own with square pixels; fx_px, or without aspect")
+    for name in ("fx_px", "fy_px"):
+        if name in fixed and fixed[name] is None and not (name == "fy_px" and "aspect" in fixed):
+            raise CalibrationError(f"{name} is to be held, but not said at what; {name}=VALUE (px)")
+
+
+def _start(lens_model: LensModel, focal_px: float, fixed: Fixed) -> Array:
+    """Parameters (k,) to start from, those that are held at their values."""
+    values = {name: value for name, value in fixed.items() if value is not None}
+    out = lens_model.without_distortion(values.get("fx_px", values.get("fy_px", focal_px)))
+    for k, name in enumerate(parameter_names(lens_model.name)):
+        out[k] = values.get(name, out[k])
+    return out
 
 
 def _free(model: ModelName, fixed: frozenset[str]) -> tuple[tuple[str, ...], Array]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -14,8 +15,7 @@ from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.intrinsics import IntrinsicsResult
-    from gripmon.calibration.lens_models import ModelName
+    from gripmon.calibration.intrinsics import Fixed, IntrinsicsResult
     from gripmon.calibration.sighting import Sighting
     from gripmon.calibration.targets import Target
 
@@ -50,7 +50,7 @@ def add_parser(methods: Any) -> None:
         required=True,
         metavar="TARGET",
         help="chequerboard:COLUMNSxROWS:SQUARE (inner corners, m), charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] "
-        "(squares, m) or circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m)",
+        "(squares, m), circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), or FILE.yaml of a calibration with it",
     )
     parser.add_argument(
         "--model",
@@ -62,9 +62,9 @@ def add_parser(methods: Any) -> None:
         "--fix",
         action="append",
         default=[],
-        metavar="NAME",
-        help="hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0) or aspect (square pixels); "
-        "may be given several times",
+        metavar="NAME[=VALUE]",
+        help="hold a parameter, e.g. cx_px (at the image's centre), coefficients.2 (at 0), aspect (square pixels) or "
+        "fx_px=870.5 (there); may be given several times",
     )
     parser.add_argument("--out", required=True, metavar="FILE.yaml", help="file to write")
     parser.add_argument(
@@ -95,11 +95,11 @@ def run(arguments: argparse.Namespace) -> int:
     if picture:
         files.check_picture(picture, force=arguments.force)
     target = files.target_of(arguments.target)
-    _check_fixed(arguments)
+    fixed = _fixed(arguments)
     paths = files.image_paths(arguments.images)
     views = _looked_at(paths, target)
     try:
-        result = _calibrated(views.sightings, arguments)
+        result = _calibrated(views.sightings, arguments.model, fixed)
     except CalibrationError as error:
         raise common.CommandFailedError(f"calibrate intrinsics: {error}") from None
     result = replace(result, warnings=(*result.warnings, *_about_target(views.sightings, target)))
@@ -107,21 +107,44 @@ def run(arguments: argparse.Namespace) -> int:
     if picture:
         files.write_picture(draw_maps(result, views.sightings), picture)
     files.write_document(document, out)
-    print(json.dumps(_values(result, views, out), indent=2) if arguments.json else _summary(result, views, out))
+    print(json.dumps(_values(result, views, out), indent=2) if arguments.json else _summary(result, views, out, fixed))
     return common.EXIT_DONE
 
 
-def _check_fixed(arguments: argparse.Namespace) -> None:
+def _fixed(arguments: argparse.Namespace) -> Fixed:
+    """What is held, and at which value; what can't be ends the command with exit code 2."""
     from gripmon.calibration.lens_models import MODELS as ALL
     from gripmon.calibration.lens_models import parameter_names
 
     models = [m for m in ALL if arguments.model in (m, "auto") or (arguments.model is None and m != "fisheye")]
     known = list(dict.fromkeys(name for model in models for name in parameter_names(model)))
-    for name in arguments.fix:
+    fixed: dict[str, float | None] = {}
+    for text in arguments.fix:
+        name, equals, number = text.partition("=")
+        value = _number(number) if equals else None
+        fault = None
         if name not in (*known, "aspect"):
-            raise common.CommandFailedError(
-                f"--fix {name}: is no parameter of the model; {', '.join(known)} or aspect", common.EXIT_USAGE
-            )
+            fault = f"is no parameter of the model; {', '.join(known)} or aspect"
+        elif name in fixed:
+            fault = "is held already; each once"
+        elif equals and (name == "aspect" or value is None):
+            fault = "takes no value: pixels are square" if name == "aspect" else f"is no number; {name}=VALUE"
+        elif name in ("fx_px", "fy_px") and (value is None or value <= 0.0):
+            fault = f"at what isn't said; {name}=VALUE (px), above 0"
+        if fault is not None:
+            raise common.CommandFailedError(f"--fix {text}: {fault}", common.EXIT_USAGE)
+        fixed[name] = value
+    if "aspect" in fixed and "fy_px" in fixed:
+        raise common.CommandFailedError("--fix fy_px: is fx_px with aspect; one of them", common.EXIT_USAGE)
+    return fixed
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 def _looked_at(paths: list[Path], target: Target) -> _Views:
@@ -153,20 +176,19 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
     return views
 
 
-def _calibrated(sightings: list[Sighting], arguments: argparse.Namespace) -> IntrinsicsResult:
+def _calibrated(sightings: list[Sighting], asked: str | None, fixed: Fixed) -> IntrinsicsResult:
     from gripmon.calibration import intrinsics
     from gripmon.calibration.lens_models import MODELS as ALL
 
-    fixed = frozenset(arguments.fix)
+    model: Any = "paper" if len(sightings) == 1 and asked in (None, "auto") else asked or "brown_conrady"
     if len(sightings) == 1:
-        model: ModelName = "paper" if arguments.model in (None, "auto") else arguments.model
         return intrinsics.calibrate_single_view(sightings[0], model, fixed=fixed)
-    steps = (len(ALL) if arguments.model == "auto" else 1) + min(_FOLDS, len(sightings)) * (len(sightings) > 3)
+    steps = (len(ALL) if asked == "auto" else 1) + min(_FOLDS, len(sightings)) * (len(sightings) > 3)
     with common.progress_bar(steps, "fit") as step:
-        if arguments.model == "auto":
+        if asked == "auto":
             result = intrinsics.calibrate_best(sightings, ALL, fixed=fixed, step=step)
         else:
-            result = intrinsics.calibrate(sightings, arguments.model or "brown_conrady", fixed=fixed)
+            result = intrinsics.calibrate(sightings, model, fixed=fixed)
             step()
         crossed = intrinsics.cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
     return replace(result, cross_validated_rms_px=crossed)
@@ -242,7 +264,7 @@ def _values(result: IntrinsicsResult, views: _Views, out: Path) -> dict[str, Any
     }
 
 
-def _summary(result: IntrinsicsResult, views: _Views, out: Path) -> str:
+def _summary(result: IntrinsicsResult, views: _Views, out: Path, fixed: Fixed) -> str:
     sigmas = _sigmas(result)
     lines = [f"{'parameter':<15} {'value':>14} {'±':>11}"]
     for name, value in result.values.items():
@@ -258,9 +280,9 @@ def _summary(result: IntrinsicsResult, views: _Views, out: Path) -> str:
         fit += f", {result.cross_validated_rms_px:.3f} px in images that had no part in the fit"
     lines.append(fit)
     if len(views.sightings) == 1:
-        lines.append(
-            "from a single image: principal point at the image's centre, square pixels, one number of the lens"
-        )
+        given = any(fixed.get(name) is not None for name in ("cx_px", "cy_px"))
+        centre = "as held" if given else "at the image's centre"
+        lines.append(f"from a single image: principal point {centre}, square pixels, one number of the lens")
     if result.criterion is not None and len(result.criterion) > 1:
         least = min(result.criterion.values())
         lines.append("model            information criterion above the best")

@@ -72,13 +72,55 @@ def read_images(paths: Sequence[Path]) -> list[Image]:
 
 
 def target_of(text: str, option: str = "--target") -> Target:
-    """The target of a command line; a fault ends the command with exit code 2."""
+    """The target of a command line, or in the file that it names; a fault ends the command with exit code 2."""
     from gripmon.calibration.targets import parse_target
 
+    if is_target_file(text):
+        return _target_in(Path(text), option)
     try:
         return parse_target(text)
     except ValueError as error:
         raise common.CommandFailedError(f"{option}: {error}", common.EXIT_USAGE) from None
+
+
+def is_target_file(text: str) -> bool:
+    """Whether this names a file instead of describing a target."""
+    return text.lower().endswith((".yaml", ".yml"))
+
+
+def _target_in(path: Path, option: str) -> Target:
+    """Of a calibration that was made with it, or described by itself."""
+    from gripmon.calibration.targets import checked
+    from gripmon.config import ConfigError
+    from gripmon.config.yaml_file import read_yaml
+
+    right = "a file of gripmon calibrate intrinsics or plane, or one with the line target: circles:8x8:0.008:0.004"
+    try:
+        values = read_yaml(path)
+    except ConfigError as error:
+        raise common.CommandFailedError(f"{option} {error}", common.EXIT_USAGE) from None
+    text = values.get("target")
+    if text is None:
+        text = _target_of_command(values.get("provenance"))
+    described = values if text is None and "kind" in values else text
+    try:
+        if isinstance(described, dict):
+            return checked(described, str(path), right)
+    except ValueError as error:
+        raise common.CommandFailedError(f"{option}: {error}", common.EXIT_USAGE) from None
+    if not isinstance(text, str) or is_target_file(text):
+        raise common.CommandFailedError(f"{option} {path}: names no target; {right}", common.EXIT_USAGE)
+    return target_of(text, f"{option} {path}")
+
+
+def _target_of_command(provenance: object) -> str | None:
+    """What a file's provenance gives after ``--target``."""
+    command = provenance.get("command") if isinstance(provenance, dict) else None
+    try:
+        words = shlex.split(command) if isinstance(command, str) else []
+    except ValueError:
+        return None
+    return words[words.index("--target") + 1] if "--target" in words[:-1] else None
 
 
 def check_output(path: Path, *, force: bool, option: str = "--out") -> None:

@@ -15,6 +15,7 @@ from gripmon.calibration.documents import CalibratedGripper, HandEyeCalibration,
 from gripmon.calibration.plane import Coincidence
 from gripmon.calibration.plane_average import PlaneCalibration
 from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibration.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
 from gripmon.corners.taught import gripper_digest
@@ -161,7 +162,9 @@ def _lengths_line(result: PlaneCalibration) -> str:
 
 
 def _provenance(inputs: Inputs, arguments: argparse.Namespace) -> Provenance:
-    options: dict[str, Any] = {"--target": arguments.target, "--camera": arguments.camera, "--config": arguments.config}
+    # As itself where a file named it: the hand/eye calibration holds its target nowhere else.
+    target = name_of(inputs.target) if files.is_target_file(arguments.target) else arguments.target
+    options: dict[str, Any] = {"--target": target, "--camera": arguments.camera, "--config": arguments.config}
     options |= {"--gripper": arguments.gripper, "--infer": arguments.infer, "--jaw-opening": arguments.jaw_opening}
     if arguments.jaw_range is not None:
         options["--jaw-range"] = ":".join(f"{end:g}" for end in arguments.jaw_range)

@@ -39,7 +39,9 @@ def rough_desk(arguments: argparse.Namespace) -> RoughDesk:
     image, fault = read_image(path)
     if image is None:
         raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+    target = None
     if arguments.camera is not None:
+        target = _target_of(Path(arguments.camera))
         lens, _ = read_lens(Path(arguments.camera))
         height, width = image.shape[:2]
         if (width, height) != (lens.width_px, lens.height_px):
@@ -51,6 +53,30 @@ def rough_desk(arguments: argparse.Namespace) -> RoughDesk:
     folder = Path(arguments.out) if arguments.out else Path()
     common.make_directory(folder)
     follows = ["gripmon", "calibrate", "plane", str(path), "--camera", arguments.camera or "camera.yaml"]
-    follows += ["--target", "TARGET", "--infer", "--corners", str(folder / ROUGH)]
+    follows += [
+        "--target",
+        "TARGET" if target is None else arguments.camera,
+        "--infer",
+        "--corners",
+        str(folder / ROUGH),
+    ]
     follows += ["--gripper-out", str(folder / "gripper.yaml"), "--out", str(folder / "hand_eye.yaml")]
-    return RoughDesk(Picture(path.name, image, None, str(path)), folder / ROUGH, shlex.join(follows))
+    plate = (
+        "TARGET is the plate, such as circles:12x10:0.008:0.004"
+        if target is None
+        else f"the plate is taken to be the camera's target, {target}; of another one --target says what it is"
+    )
+    note = f"{plate}; with jaws that move also --jaw-range MIN:MAX (m)"
+    return RoughDesk(Picture(path.name, image, None, str(path)), folder / ROUGH, shlex.join(follows), note)
+
+
+def _target_of(path: Path) -> str | None:
+    """What a camera's file says it was calibrated with."""
+    from gripmon.config import ConfigError
+    from gripmon.config.yaml_file import read_yaml
+
+    try:
+        text = read_yaml(path).get("target")
+    except ConfigError:
+        return None  # reading the camera says what is wrong
+    return text if isinstance(text, str) else None

@@ -17,18 +17,18 @@ from gripmon.teachpage.desk import BadRequest, Picture, encoded
 from gripmon.teachpage.messages import PictureInfo, Place, Put, Reply, Saved, SaveOrder, State
 
 _NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)
-_NOTE = "TARGET is the plate, such as circles:12x10:0.008:0.004; with jaws that move also --jaw-range MIN:MAX (m)"
 _COLUMNS = {"left": 0.06, "right": 0.8}
 
 
 class RoughDesk:
     """As :class:`gripmon.teachpage.Desk`, without a gripper: one image, whose corners go to ``path``.
 
-    ``follows``: the command that reads that file; ``saved``: what was last written, None before.
+    ``follows``: the command that reads that file, ``note`` what is to be said of it; ``saved``: what was last written,
+    None before.
     """
 
-    def __init__(self, picture: Picture, path: Path, follows: str):
-        self._picture, self._path, self._follows = picture, path, follows
+    def __init__(self, picture: Picture, path: Path, follows: str, note: str):
+        self._picture, self._path, self._follows, self._note = picture, path, follows, note
         self._lock = threading.Lock()
         self.saved: Saved | None = None
 
@@ -91,7 +91,7 @@ class RoughDesk:
                 write_atomically(self._path, self._text(corners).encode())
             except OSError as error:
                 return Saved(refused=f"{self._path}: can't be written ({error.strerror or error})")
-            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(_NOTE,), next=self._follows)
+            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(self._note,), next=self._follows)
             return self.saved
 
     def _text(self, corners: Mapping[str, Place]) -> str:
