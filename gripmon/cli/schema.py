@@ -8,7 +8,7 @@ from typing import Any
 
 from gripmon.cli import common
 
-_NAMES = ("transform", "state", "alert", "reference", "jaw", "frame", "command", "reply", "error")
+_NAMES = ("transform", "state", "alert", "reference", "jaw", "frame", "pulse", "spot", "command", "reply", "error")
 
 _DESCRIPTION = """\
 Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames

@@ -20,10 +20,11 @@ from types import FrameType
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
-from gripmon.daemon.loop import EXIT_DONE, EXIT_FAILED, Daemon, StopRequest
+from gripmon.daemon.loop import Daemon
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
+from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
 from gripmon.records import Alert

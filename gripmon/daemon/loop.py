@@ -3,70 +3,35 @@
 from __future__ import annotations
 
 import dataclasses
-import gc
-import logging
-import math
 import time
-from collections.abc import Callable, Sequence
-from typing import ParamSpec, TypeVar
+from collections.abc import Sequence
 
 import msgspec
 
-from gripmon import __version__
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.watch import Watch
+from gripmon.daemon.supervised import Loop, StopRequest, in_short
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
 from gripmon.records import (
     Alert,
-    AlertEvent,
-    AlertKind,
-    AlertRecord,
-    Cause,
-    CommandError,
-    CommandFault,
-    CommandName,
+    Command,
+    CommandReply,
     Frame,
     FrameRecord,
     MonitorState,
-    OpenAlert,
-    RecordedCommand,
-    Severity,
-    State,
-    StateRecord,
     unmeasured_record,
 )
-from gripmon.sources import Source, Waiting
+from gripmon.sources import Source
 
-_log = logging.getLogger(__name__)
-_P = ParamSpec("_P")
-_T = TypeVar("_T")
-
-EXIT_DONE, EXIT_FAILED = 0, 3
 KEEP_LAST_EVERY_S = 60.0
 """How old the last transform that is kept may be; references and alerts are kept when they change."""
 
-_LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
-
-class StopRequest:
-    """Asks the loop to end; a signal handler or any thread may do so.  The first request counts."""
-
-    def __init__(self) -> None:
-        self.exit_code: int | None = None
-        self.requested_s: float | None = None
-
-    def request(self, exit_code: int) -> None:
-        if self.exit_code is None:
-            self.requested_s = time.monotonic()
-            self.exit_code = exit_code
-
-
-class Daemon:
+class Daemon(Loop):
     """Runs one monitor, in the thread that calls :meth:`run`."""
 
     def __init__(
@@ -88,85 +53,33 @@ class Daemon:
         reports: Reports | None = None,
         notices: Sequence[Alert] = (),
     ) -> None:
+        super().__init__(
+            source, publisher, recorder, settings, stop,
+            robot=robot, camera=camera, commands=commands, snapshots=snapshots, reports=reports, notices=notices,
+        )  # fmt: skip
         self._monitor = monitor
-        self._source = source
         self._publisher = publisher
         self._recorder = recorder
-        self._settings = settings
-        self._robot, self._camera = robot, camera
         self._estimates = estimates
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
         self._kept_revision: int | None = None
-        self._open_alerts: tuple[OpenAlert, ...] = ()  # the monitor's
-        self._commands = commands
-        self._snapshots = snapshots or Snapshots()
-        self._newest: Newest | None = None
-        self._reports = reports or Reports()
-        self._notices = notices
         self._reference, self._reference_due = monitor.reference, True
-        self._seq = -1
-        self._start_s = time.monotonic()
-        self._watch = Watch(settings, self._start_s)
-        self._said: StateRecord | None = None
-        self._next_state_s = self._start_s
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
-        self._stop = stop
-        self._source_broke = False
-        self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
-        self._said_faults: dict[str, str] = {}  # in the log
 
-    def run(self, duration_s: float | None = None) -> int:
-        """Handle frames until the source ends, the time is over, errors persist, or a stop is requested.
+    @property
+    def _in_force(self) -> tuple[str, int]:
+        return self._reference.reference_id, self._reference.revision
 
-        Returns the exit code.  A stop request takes effect after the frame in hand, or half a second at the latest.
-        """
-        _log.info(
-            "watching %s/%s against %s, revision %d",
-            self._robot, self._camera, self._reference.reference_id, self._reference.revision,
-        )  # fmt: skip
+    def _begin(self) -> None:
         self._deliver("state's keeping", self._keep_now)
         self._make_reference_known()
-        for notice in self._notices:
-            self._alert(notice, self._watch.state)
-        end_s = self._start_s + duration_s if duration_s is not None else math.inf
-        self._say_state(time.monotonic())
-        while self._stop.exit_code is None and time.monotonic() < end_s and self._next_item():
-            pass
-        watch = self._watch
-        exit_code = self._stop.exit_code if self._stop.exit_code is not None else self._code_at_the_end()
-        watch.stopped()
-        self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
-        self._say_state(time.monotonic())
-        _log.info(
-            "stopped after %d frames, %d refused, %d dropped", watch.frames, watch.frames_refused, self._source.dropped
-        )
-        return exit_code
 
-    def _next_item(self) -> bool:
-        """Wait for the source and handle what it gives; False if there is nothing more to do."""
-        self._obey()
-        try:
-            item = self._source.read()
-        except Exception as error:  # noqa: BLE001  said below, and the end of the loop
-            self._watch.message = f"the source failed: {_in_short(error)}"
-            _log.debug("%s", self._watch.message, exc_info=error)
-            self._alert(
-                Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, self._watch.message), self._watch.state
-            )
-            self._source_broke = True
-            return False
-        if item is None:
-            return False
-        if isinstance(item, Waiting):
-            for alert in self._watch.no_frame(item.reason, time.monotonic(), time.time_ns()):
-                self._alert(alert, self._watch.state)
-        else:
-            self._handle(item)
-        for alert in self._watch.recording(self._recorder.failure, time.monotonic(), time.time_ns()):
-            self._alert(alert, self._watch.state)
-        self._say_state(time.monotonic())
-        return not self._watch.gives_up
+    def _between(self) -> None:
+        """The frames bring all that there is."""
+
+    def _finish(self) -> None:
+        self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
 
     def _handle(self, frame: Frame) -> None:
         handed_over_ns = time.monotonic_ns()
@@ -199,7 +112,7 @@ class Daemon:
                 frame = dataclasses.replace(frame, jaw_opening_m=self._jaw.opening_m())
             record = self._monitor.process(frame)
         except Exception as error:  # noqa: BLE001  said and counted
-            failure = f"internal error: {_in_short(error)}"
+            failure = f"internal error: {in_short(error)}"
             self._log_once("monitor", f"frame {frame.seq}: ", failure, error)
             self._make_reference_known()
             return frame, unmeasured_record(frame, self._reference, failure), failure
@@ -207,33 +120,16 @@ class Daemon:
         self._make_reference_known()
         return frame, record, ""
 
-    def _obey(self) -> None:
-        """Carry out one command, if one waits: never so many that frames wait for them."""
-        asked = None if self._commands is None else self._commands.poll()
-        if asked is None:
-            return
-        command, answer = asked.command, None
-        stamp_ns = time.time_ns()
-        try:
-            answer = self._monitor.command(command, stamp_ns)
-            said = f"{'done' if answer.done else 'refused'}: {answer.text}"
-        except Exception as error:  # noqa: BLE001  said, to the asker, too
-            said = f"internal error: {_in_short(error)}"
-            _log.debug("command %s", command.name, exc_info=error)
-        _log.info("command %s%s%s: %s", command.name, " " * bool(command.argument), command.argument, said)
+    def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
+        return self._monitor.command(command, stamp_ns)
+
+    def _settle(self, answer: CommandReply | None) -> CommandReply | None:
+        """What has been answered as done must be so after a crash, too."""
         self._make_reference_known()
-        text = said if answer is None else answer.text
-        carried_out = answer is not None and answer.done
-        told = RecordedCommand(stamp_ns, self._seq, command.name, command.argument, carried_out, text)
-        self._deliver("command's recording", self._recorder.command, told)
-        # What has been answered as done must be so after a crash, too.
         self._deliver("state's keeping", self._keep_changes, at_once=True)
         if answer and answer.done and self._keeper.failure:
             answer = msgspec.structs.replace(answer, text=f"{answer.text}; but {self._keeper.failure}")
-        if answer and answer.done and command.name is CommandName.SNAPSHOT:
-            self._deliver("answer", self._snapshots.answer, asked, answer, self._newest)
-        else:
-            self._deliver("answer", asked.answer, answer or CommandError(CommandFault.INTERNAL, said))
+        return answer
 
     def _keep_now(self) -> None:
         self._kept_revision = self._monitor.state_revision
@@ -264,118 +160,10 @@ class Daemon:
         if self._reference_due:
             self._reference_due = not self._deliver("reference", self._publisher.reference, self._reference)
 
-    def _deliver(self, what: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> bool:
-        """Hand something to one receiver, whose failure is no other's; False, said and counted, if it failed."""
-        try:
-            put(*values, **named)
-        except Exception as error:  # noqa: BLE001  said here, counted at the end of the frame
-            self._faults[what] = f"{what} not delivered: {_in_short(error)}"
-            self._log_once(what, "", self._faults[what], error)
-            return False
-        self._said_faults.pop(what, None)
-        return True
-
-    def _log_once(self, what: str, where: str, text: str, error: Exception) -> None:
-        """Say a fault, but not again until it has changed or was over."""
-        if self._said_faults.get(what) != text:
-            self._said_faults[what] = text
-            _log.error("%s%s", where, text)
-            _log.debug("%s%s", where, what, exc_info=error)
-
-    def _alert(self, alert: Alert, state: State, stamp_ns: int | None = None, *, recorded: bool = False) -> None:
-        """Say it on the network and in the log.
-
-        ``stamp_ns`` is that of the frame that the alert belongs to, if there is one; ``recorded`` if the frame's record
-        carries it into the recording.
-        """
-        about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
-        _log.log(_LEVELS[alert.severity], "%s: %s", about, alert.text)
-        message = AlertRecord(
-            robot=self._robot,
-            camera=self._camera,
-            seq=self._seq,
-            stamp_ns=time.time_ns() if stamp_ns is None else stamp_ns,
-            state=state,
-            reference_id=self._reference.reference_id,
-            revision=self._reference.revision,
-            **msgspec.structs.asdict(alert),
-        )
-        self._deliver("alert", self._publisher.alert, message)
-        if not recorded:
-            self._deliver("alert's recording", self._recorder.alert, message)
-
-    def _say_state(self, now_s: float) -> None:
-        """Publish the state when it is due or has changed."""
-        watch, said, reports = self._watch, self._said, self._reports
-        faults = (watch.message, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
-        message = "; ".join(fault for fault in faults if fault)
-        now = (watch.state, watch.verdict, self._source.connected, message, self._reference.revision)
-        due = now_s >= self._next_state_s
-        if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
-            return
-        if said is None or (watch.state, watch.verdict) != (said.state, said.verdict):
-            _log.info("state %s, transform %s%s", watch.state, watch.verdict, f" ({message})" if message else "")
-        self._said = StateRecord(
-            robot=self._robot,
-            camera=self._camera,
-            state=watch.state,
-            verdict=watch.verdict,
-            stamp_ns=time.time_ns(),
-            seq=self._seq,
-            reference_id=self._reference.reference_id,
-            revision=self._reference.revision,
-            frames=watch.frames,
-            frames_refused=watch.frames_refused,
-            frames_dropped=self._source.dropped,
-            frames_per_s=watch.frames_per_s(now_s),
-            uptime_s=now_s - self._start_s,
-            camera_connected=self._source.connected,
-            recording_dropped=self._recorder.dropped,
-            message=message,
-            version=__version__,
-            tcp_shift_m=watch.tcp_shift_m,
-            sigma_m=watch.sigma_m,
-            open_alerts=watch.standing(self._open_alerts),
-            transforms_unsent=self._ask(reports.unsent, 0),
-            malformed=self._ask(reports.malformed, 0),
-        )
-        self._deliver("state", self._publisher.state, self._said)
-        self._deliver("state's recording", self._recorder.state, self._said)
-        if due:
-            self._next_state_s = now_s + self._settings.state_period_s
-            self._keep_house()
-
-    def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
-        """What somebody reports; one who fails at that is no reason to stop."""
-        try:
-            return report()
-        except Exception as error:  # noqa: BLE001  said
-            self._log_once("report", "", f"a report for the state message fails: {_in_short(error)}", error)
-            return otherwise
-
     def _keep_house(self) -> None:
-        """Once a state period, right after a frame, when there is time until the next."""
         self._estimates.flush()
         if (now_s := time.monotonic()) >= self._next_keeping_s:
             # The last transform alone: where to look first after a restart.
             self._next_keeping_s = now_s + KEEP_LAST_EVERY_S
             self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
-        if not gc.isenabled():
-            gc.collect()
-
-    def _code_at_the_end(self) -> int:
-        if self._source_broke:
-            return EXIT_FAILED
-        if self._watch.gives_up:
-            _log.error("giving up after internal errors in %d frames in a row", self._watch.errors_in_a_row)
-            return EXIT_FAILED
-        if self._watch.frames_usable == 0:
-            _log.error("no usable frame came")
-            return EXIT_FAILED
-        return EXIT_DONE
-
-
-def _in_short(error: Exception) -> str:
-    """One line for a person."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+        super()._keep_house()

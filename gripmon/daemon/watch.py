@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import NamedTuple
 
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.policy import AlertBook
@@ -23,6 +24,20 @@ from gripmon.records import (
 
 _RATE_OVER_FRAMES = 64
 _SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
+
+
+class Judged(NamedTuple):
+    """What is kept of a frame.  ``usable``: it told something; ``refused``: it could not be looked at; ``reason``: what
+    is wrong, if anything.  ``tcp_shift_m`` and ``sigma_m`` as in the state message.
+    """
+
+    state: State
+    verdict: Verdict
+    usable: bool
+    refused: bool = False
+    reason: str = ""
+    tcp_shift_m: tuple[float, float, float] | None = None
+    sigma_m: float | None = None
 
 
 class Watch:
@@ -45,22 +60,26 @@ class Watch:
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
-        self._record: FrameRecord | None = None
+        self._judged: Judged | None = None
 
     def frame(self, record: FrameRecord, now_s: float) -> list[Alert]:
         """A frame was judged; the alerts that are due beside the record's own."""
+        return self.judged(_of_record(record), now_s)
+
+    def judged(self, frame: Judged, now_s: float) -> list[Alert]:
+        """The same of any camera's frame."""
         alerts = self._end_of_silence(now_s)
         self.frames += 1
-        self.frames_usable += record.source is not Origin.HELD
+        self.frames_usable += frame.usable
         self._frame_times_s.append(now_s)
         self._last_frame_s = now_s
-        self.state, self.verdict = record.state, record.verdict
-        self._record = record
-        if is_refused(record):
+        self.state, self.verdict = frame.state, frame.verdict
+        self._judged = frame
+        if frame.refused:
             self.frames_refused += 1
-            self._keep_message(f"frames refused: {record.reason}")
+            self._keep_message(f"frames refused: {frame.reason}")
         else:
-            self._keep_message(record.reason or "")
+            self._keep_message(frame.reason)
         return alerts
 
     def no_frame(self, reason: str, now_s: float, stamp_ns: int) -> list[Alert]:
@@ -101,14 +120,12 @@ class Watch:
     @property
     def tcp_shift_m(self) -> tuple[float, float, float] | None:
         """Of the last transform, if it still counts: against the reference, along the camera's axes, m."""
-        record = self._record if self.verdict is not Verdict.UNKNOWN else None
-        return None if record is None or record.drift is None else record.drift.tcp_shift_m
+        return None if self._judged is None or self.verdict is Verdict.UNKNOWN else self._judged.tcp_shift_m
 
     @property
     def sigma_m(self) -> float | None:
         """Of the last transform, if it still counts: the TCP's largest standard deviation along a camera axis, m."""
-        record = self._record if self.verdict is not Verdict.UNKNOWN else None
-        return None if record is None or record.covariance is None else math.sqrt(max(record.covariance[:15:7]))
+        return None if self._judged is None or self.verdict is Verdict.UNKNOWN else self._judged.sigma_m
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
         """All that is raised and not cleared, the monitor's and what comes from here, the oldest first."""
@@ -144,6 +161,18 @@ class Watch:
 
 def _kind(message: str) -> str:
     return ":".join(message.split(":")[:2])
+
+
+def _of_record(record: FrameRecord) -> Judged:
+    return Judged(
+        record.state,
+        record.verdict,
+        usable=record.source is not Origin.HELD,
+        refused=is_refused(record),
+        reason=record.reason or "",
+        tcp_shift_m=None if record.drift is None else record.drift.tcp_shift_m,
+        sigma_m=None if record.covariance is None else math.sqrt(max(record.covariance[:15:7])),
+    )
 
 
 def is_refused(record: FrameRecord) -> bool:

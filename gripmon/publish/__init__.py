@@ -8,6 +8,8 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 ``reference``  on every new revision; late joiners get the last one
 ``alert``      when there is one; an advanced subscriber with history gets the last 32
 ``alive``      liveliness token, gone as soon as the process is
+``spot``       of a second camera in place of ``transform`` and ``reference``: what became of each pulse of the laser
+``pulse``      read, not written: the pulses, from the robot's program
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
 ``cmd/<name>`` queryable: what an operator tells the monitor, see :mod:`gripmon.publish.commands`
 
@@ -19,15 +21,28 @@ from __future__ import annotations
 
 from gripmon.publish.commands import PendingCommand, ZenohCommands
 from gripmon.publish.jaw import ZenohJaw
-from gripmon.publish.publisher import NullPublisher, Publisher, ZenohPublisher
-from gripmon.publish.several import Publishers
+from gripmon.publish.publisher import (
+    NullPublisher,
+    Publisher,
+    SpotPublisher,
+    StatePublisher,
+    ZenohPublisher,
+    ZenohSpotPublisher,
+)
+from gripmon.publish.pulse import ZenohPulses
+from gripmon.publish.several import Publishers, SpotPublishers
 
 __all__ = [
     "NullPublisher",
     "PendingCommand",
     "Publisher",
     "Publishers",
+    "SpotPublisher",
+    "SpotPublishers",
+    "StatePublisher",
     "ZenohCommands",
     "ZenohJaw",
     "ZenohPublisher",
+    "ZenohPulses",
+    "ZenohSpotPublisher",
 ]

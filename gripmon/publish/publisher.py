@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from typing import Protocol
 
 import zenoh
 
 from gripmon.publish.answers import Answers
-from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord, to_json
+from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
 from gripmon.wire import Keys, Link, check_name
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -17,14 +18,25 @@ _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no
 _HEARTBEAT_S = 1.0
 
 
-class Publisher(Protocol):
-    """Where the loop puts what it has to say.  No method waits for the network."""
+class StatePublisher(Protocol):
+    """Where every loop puts what it has to say.  No method waits for the network."""
 
-    def transform(self, record: FrameRecord) -> None: ...
     def state(self, record: StateRecord) -> None: ...
     def alert(self, record: AlertRecord) -> None: ...
-    def reference(self, record: ReferenceRecord) -> None: ...
     def close(self) -> None: ...
+
+
+class Publisher(StatePublisher, Protocol):
+    """Where the loop of a wrist camera puts what it has to say."""
+
+    def transform(self, record: FrameRecord) -> None: ...
+    def reference(self, record: ReferenceRecord) -> None: ...
+
+
+class SpotPublisher(StatePublisher, Protocol):
+    """Where the loop of a second camera puts what it has to say."""
+
+    def spot(self, record: SpotRecord) -> None: ...
 
 
 class NullPublisher:
@@ -34,15 +46,12 @@ class NullPublisher:
     def state(self, record: StateRecord) -> None: ...
     def alert(self, record: AlertRecord) -> None: ...
     def reference(self, record: ReferenceRecord) -> None: ...
+    def spot(self, record: SpotRecord) -> None: ...
     def close(self) -> None: ...
 
 
-class ZenohPublisher:
-    """Publishes one monitor's records over a link, which it closes in the end.
-
-    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
-    and the last few alerts are kept for its opening.
-    """
+class _ZenohStates:
+    """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
 
     def __init__(self, link: Link, robot: str, camera: str) -> None:
         """Raises ValueError for a name that can't be part of a key."""
@@ -51,10 +60,64 @@ class ZenohPublisher:
         self._link = link
         self._wire: _Wire | None = None
         self._lock = threading.Lock()  # guards the kept records below against the opening thread
-        self._state: StateRecord | None = None
-        self._reference: ReferenceRecord | None = None
-        self._alerts: deque[AlertRecord] = deque(maxlen=_ALERTS_KEPT)
+        self._last: dict[str, bytes] = {}  # by key, of what late joiners get
+        self._waiting: dict[str, deque[bytes]] = {}
         link.attach(self._adopt, self._leave)
+
+    def state(self, record: StateRecord) -> None:
+        """Send the state, and keep it for late joiners."""
+        self._put_last("state", to_json(record))
+
+    def alert(self, record: AlertRecord) -> None:
+        """Send an alert."""
+        self._put_each("alert", to_json(record))
+
+    def close(self) -> None:
+        """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
+        self._link.close()
+
+    def _declared(self, wire: _Wire) -> None:
+        """Declare what is the subclass's own."""
+
+    def _put_last(self, leaf: str, payload: bytes) -> None:
+        with self._lock:
+            self._last[leaf] = payload
+            if self._wire is not None:
+                self._wire.puts[leaf](payload)
+
+    def _put_each(self, leaf: str, payload: bytes) -> None:
+        with self._lock:
+            if self._wire is not None:
+                self._wire.puts[leaf](payload)
+            else:
+                self._waiting.setdefault(leaf, deque(maxlen=_ALERTS_KEPT)).append(payload)
+
+    def _adopt(self, session: zenoh.Session) -> None:
+        """Declare everything on a new session and send what was kept for it."""
+        wire = _Wire(session, self.keys)
+        self._declared(wire)
+        wire.appear()
+        with self._lock:
+            self._wire = wire
+            for leaf in sorted(self._last):  # a reference before the state that names it
+                wire.puts[leaf](self._last[leaf])
+            for leaf, payloads in self._waiting.items():
+                while payloads:
+                    wire.puts[leaf](payloads.popleft())
+
+    def _leave(self) -> None:
+        with self._lock:
+            wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.close()
+
+
+class ZenohPublisher(_ZenohStates):
+    """Publishes one monitor's records over a link, which it closes in the end.
+
+    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
+    and the last few alerts are kept for its opening.
+    """
 
     def transform(self, record: FrameRecord) -> None:
         """Send one frame's record."""
@@ -62,51 +125,29 @@ class ZenohPublisher:
         if wire is None:
             self.unsent += 1
         else:
-            wire.transform.put(to_json(record))
-
-    def state(self, record: StateRecord) -> None:
-        """Send the state, and keep it for late joiners."""
-        with self._lock:
-            self._state = record
-            if self._wire is not None:
-                self._wire.state.put(to_json(record))
+            wire.puts["transform"](to_json(record))
 
     def reference(self, record: ReferenceRecord) -> None:
         """Send the reference, and keep it for late joiners."""
-        with self._lock:
-            self._reference = record
-            if self._wire is not None:
-                self._wire.reference.put(to_json(record))
+        self._put_last("reference", to_json(record))
 
-    def alert(self, record: AlertRecord) -> None:
-        """Send an alert."""
-        with self._lock:
-            if self._wire is not None:
-                self._wire.alert.put(to_json(record))
-            else:
-                self._alerts.append(record)
+    def _declared(self, wire: _Wire) -> None:
+        wire.declare_newest("transform")
+        wire.declare_kept("reference")
 
-    def close(self) -> None:
-        """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
-        self._link.close()
 
-    def _adopt(self, session: zenoh.Session) -> None:
-        """Declare everything on a new session and send what was kept for it."""
-        wire = _Wire(session, self.keys)
-        with self._lock:
-            self._wire = wire
-            if self._reference is not None:
-                wire.reference.put(to_json(self._reference))
-            if self._state is not None:
-                wire.state.put(to_json(self._state))
-            while self._alerts:
-                wire.alert.put(to_json(self._alerts.popleft()))
+class ZenohSpotPublisher(_ZenohStates):
+    """Publishes a second camera's records over a link, which it closes in the end.
 
-    def _leave(self) -> None:
-        with self._lock:
-            wire, self._wire = self._wire, None
-        if wire is not None:
-            wire.close()
+    While the link is not open yet, the last state, spots and alerts, the last few, are kept for its opening.
+    """
+
+    def spot(self, record: SpotRecord) -> None:
+        """Send what became of a pulse, and keep the last one for late joiners."""
+        self._put_each("spot", to_json(record))
+
+    def _declared(self, wire: _Wire) -> None:
+        wire.declare_kept("spot", _ALERTS_KEPT)
 
 
 def _keeping_publisher(
@@ -160,26 +201,42 @@ class _LastValue:
 
 
 class _Wire:
-    """Everything declared on one open session."""
+    """Everything declared on one open session; ``puts`` by the last part of the key."""
 
     def __init__(self, session: zenoh.Session, keys: Keys) -> None:
-        # No cache here: a transform is worth nothing to who didn't ask for the last one.
-        transforms = session.declare_publisher(
-            keys["transform"],
+        self._session, self._keys = session, keys
+        self._answers = Answers("latest")
+        alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
+        self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
+        self.values: dict[str, _LastValue] = {}
+        self.declare_kept("state")
+        self._alive: zenoh.LivelinessToken | None = None
+
+    def declare_newest(self, leaf: str) -> None:
+        """A key of a stream, without a cache: a message of it is worth nothing to who didn't ask for the last one."""
+        publisher = self._session.declare_publisher(
+            self._keys[leaf],
             encoding=_JSON,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self._answers = Answers("latest")
-        self.transform = _LastValue(session, keys["transform"], transforms, self._answers)
-        self.alert = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
-        self.state, self.reference = (
-            _LastValue(session, key, _keeping_publisher(session, key, zenoh.Priority.DATA_HIGH, kept=1), self._answers)
-            for key in (keys["state"], keys["reference"])
-        )
-        self._alive = session.liveliness().declare_token(keys["alive"])
+        self._add(leaf, publisher)
+
+    def declare_kept(self, leaf: str, kept: int = 1) -> None:
+        """A key whose last ``kept`` messages are there for who comes late."""
+        publisher = _keeping_publisher(self._session, self._keys[leaf], zenoh.Priority.DATA_HIGH, kept)
+        self._add(leaf, publisher)
+
+    def appear(self) -> None:
+        """Show the liveliness token, when all is declared."""
+        self._alive = self._session.liveliness().declare_token(self._keys["alive"])
+
+    def _add(self, leaf: str, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher) -> None:
+        self.values[leaf] = _LastValue(self._session, self._keys[leaf], publisher, self._answers)
+        self.puts[leaf] = self.values[leaf].put
 
     def close(self) -> None:
-        self._alive.undeclare()
+        if self._alive is not None:
+            self._alive.undeclare()
         self._answers.close()

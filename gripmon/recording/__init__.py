@@ -8,11 +8,12 @@ slow disk ever hold the interpreter that the loop runs in.  The daemon itself ne
 from __future__ import annotations
 
 from gripmon.recording.feed import ProcessRecorder, open_recorder
-from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
+from gripmon.recording.recorder import EventRecorder, Notes, NullRecorder, Recorder, Trace
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
 
 __all__ = [
+    "EventRecorder",
     "Notes",
     "NullRecorder",
     "ProcessRecorder",

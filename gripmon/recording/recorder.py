@@ -20,8 +20,8 @@ Trace = Callable[[], MeasurementTrace | None]
 Notes = Callable[[], MonitorNotes]
 
 
-class Recorder(Protocol):
-    """Takes frames without ever blocking; what it could not take is counted.
+class EventRecorder(Protocol):
+    """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.
 
     ``dropped`` are frames that are not in the recording, ``failure`` says why nothing is being written, None when all
     is well.
@@ -32,14 +32,19 @@ class Recorder(Protocol):
     @property
     def failure(self) -> str | None: ...
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
-        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
-
     def alert(self, alert: AlertRecord) -> None: ...
-    def reference(self, reference: ReferenceRecord) -> None: ...
     def command(self, command: RecordedCommand) -> None: ...
     def state(self, state: StateRecord) -> None: ...
     def close(self, timeout_s: float = 2.0) -> None: ...
+
+
+class Recorder(EventRecorder, Protocol):
+    """The recording of a wrist camera."""
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        """``trace`` is called before this returns, and only where the picture is recorded; so is ``notes`` always."""
+
+    def reference(self, reference: ReferenceRecord) -> None: ...
 
 
 class NullRecorder:

@@ -37,6 +37,7 @@ from gripmon.records.frames import (
     unmeasured_record,
 )
 from gripmon.records.json_schema import json_schema, summary
+from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.notes import Limits, MonitorNotes
@@ -51,7 +52,9 @@ __all__ = [
     "AlertEvent",
     "AlertKind",
     "AlertRecord",
+    "ArmPose",
     "Array",
+    "CameraShift",
     "Cause",
     "CauseWeight",
     "Command",
@@ -72,6 +75,7 @@ __all__ = [
     "FrameRecord",
     "Image",
     "JawReading",
+    "LaserPulse",
     "Limits",
     "MeasurementTrace",
     "MessageRefused",
@@ -81,6 +85,7 @@ __all__ = [
     "Motion",
     "OpenAlert",
     "Origin",
+    "PulseFault",
     "RecordedCommand",
     "RecordedConfiguration",
     "RecordedFile",
@@ -91,6 +96,8 @@ __all__ = [
     "Smoothed",
     "Snapshot",
     "SnapshotImage",
+    "SpotGap",
+    "SpotRecord",
     "StandingAlert",
     "State",
     "StateRecord",

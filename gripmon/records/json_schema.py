@@ -9,12 +9,13 @@ from typing import Any
 import msgspec
 
 from gripmon.records.commands import CommandRequest
+from gripmon.records.laser import LaserPulse
 from gripmon.records.messages import FrameNote, JawReading
 from gripmon.records.schemas import MESSAGES
 from gripmon.records.values import OpenEnum
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_FROM_OTHERS = (JawReading, FrameNote, CommandRequest)
+_FROM_OTHERS = (JawReading, FrameNote, LaserPulse, CommandRequest)
 _SCHEMA_TEXT = "name and major version of this schema"
 _LATER_TEXT = "; later versions may have more names"
 

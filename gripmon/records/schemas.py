@@ -13,6 +13,7 @@ import msgspec
 
 from gripmon.records.commands import CommandError, CommandReply, CommandRequest
 from gripmon.records.frames import FrameRecord
+from gripmon.records.laser import LaserPulse, SpotRecord
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
 from gripmon.records.references import ReferenceRecord
 
@@ -25,6 +26,8 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "reference": ReferenceRecord,
     "jaw": JawReading,
     "frame": FrameNote,
+    "pulse": LaserPulse,
+    "spot": SpotRecord,
     "command": CommandRequest,
     "reply": CommandReply,
     "error": CommandError,
@@ -34,6 +37,7 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
     JawReading: 4096,
     FrameNote: 4096,
+    LaserPulse: 4096,
     CommandRequest: 4096,
     CommandReply: 64 << 20,
 }
