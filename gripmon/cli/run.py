@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, viewing
+from gripmon.cli import common, second_run, viewing
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -68,6 +68,11 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
+    second = second_run.load(arguments.config)
+    if second is not None:
+        _refuse_for_second(arguments)
+        out = None if arguments.out is None else common.make_directory(Path(arguments.out))
+        return second_run.run_second(second, out=out, duration_s=arguments.duration, verbose=arguments.verbose)
     config = common.load(arguments.config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
     return run_daemon(
@@ -79,6 +84,14 @@ def run(arguments: argparse.Namespace) -> int:
         fresh_state=arguments.fresh_state,
         view=arguments.view,
     )
+
+
+def _refuse_for_second(arguments: argparse.Namespace) -> None:
+    """Options that mean nothing for a second camera."""
+    for option, given in (("--fresh-state", arguments.fresh_state), ("--view", arguments.view is not None)):
+        if given:
+            text = f"run: {option} is for wrist cameras, {arguments.config} is a second camera's; leave it out"
+            raise common.CommandFailedError(text, common.EXIT_USAGE)
 
 
 def run_daemon(

@@ -18,6 +18,7 @@ from gripmon.config.checks import View, covariance_of, monitor_fault, predict_vi
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
 from gripmon.config.order import order_fault
+from gripmon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_second
 from gripmon.config.session import joined_or_fault
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
@@ -38,11 +39,15 @@ if TYPE_CHECKING:
 __all__ = [
     "Config",
     "ConfigError",
+    "SecondConfig",
     "Settings",
     "builtin_config",
     "check_network",
+    "check_second_network",
+    "is_second",
     "load_config",
     "load_scenario",
+    "load_second",
     "read_gripper",
 ]
 
@@ -120,7 +125,11 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
     ``with_taught=False`` leaves out the taught model, for those who teach anew.
     """
-    values, calibrated = with_sections(path, read_yaml(path))
+    values = read_yaml(path)
+    if SECTION in values:
+        right = "a wrist camera's configuration; gripmon run, check and replay take both"
+        raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
+    values, calibrated = with_sections(path, values)
     try:
         settings = to_settings(values, Settings)
     except SettingsError as error:
@@ -133,7 +142,7 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
     fault = (
         monitor_fault(settings.monitor)
         or order_fault(settings)
-        or network_fault(settings)
+        or network_fault(settings.source, settings.publish)
         or jaw_fault(settings, gripper)
         or _ros2_fault(settings)
         or view_fault(config.view(), gripper, camera)

@@ -17,6 +17,7 @@ from gripmon.sources import (
     VideoSettings,
     network_key,
 )
+from gripmon.wire import PublishSettings
 
 _NETWORK_JAWS = ("zenoh", "ros2_joint_state")
 
@@ -34,12 +35,11 @@ def jaw_fault(settings: Settings, gripper: Gripper) -> Fault | None:
     return _opening_fault(jaw, gripper) or _joint_fault(jaw)
 
 
-def network_fault(settings: Settings) -> Fault | None:
+def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | None:
     """Why a camera on the network can't be heard."""
-    source = settings.source
     if not isinstance(source, NetworkSettings):
         return None
-    if not settings.publish.enabled:
+    if not publish.enabled:
         return Fault("source.kind", "is zenoh, but publish.enabled is false", "publish.enabled: true")
     try:
         network_key(source, "")

@@ -7,12 +7,12 @@ from pathlib import Path
 from gripmon.camera import Camera
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
-from gripmon.metrics import package_fault
+from gripmon.metrics import MetricsSettings, package_fault
 from gripmon.ros2 import Ros2Missing, network_of
 from gripmon.ros2.types import typestore
-from gripmon.sources import NetworkSettings, SourceError
+from gripmon.sources import NetworkSettings, SourceError, SourceSettings
 from gripmon.sources.network import PayloadDecoder
-from gripmon.wire import Joining, PublishError, joining
+from gripmon.wire import Joining, PublishError, PublishSettings, joining
 
 
 def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Joining | Fault | None:
@@ -28,6 +28,21 @@ def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Join
     return _package_fault(settings, camera) or found
 
 
+def second_joined_or_fault(
+    source: SourceSettings, publish: PublishSettings, metrics: MetricsSettings, camera: Camera, directory: Path
+) -> Joining | Fault | None:
+    """The same for a second camera."""
+    if (missing := package_fault(metrics)) is not None:
+        return Fault(*missing)
+    if not publish.enabled:
+        return None
+    try:
+        found = joining(publish, directory)
+    except PublishError as error:
+        return _fault(str(error))
+    return _source_fault(source, camera) or found
+
+
 def _package_fault(settings: Settings, camera: Camera) -> Fault | None:
     """A package that is missing, at the key that asks for it."""
     for key, wanted in (
@@ -38,9 +53,13 @@ def _package_fault(settings: Settings, camera: Camera) -> Fault | None:
             _ = wanted and typestore()
         except Ros2Missing as error:
             return _fault(f"{key}: {error}")
-    if isinstance(settings.source, NetworkSettings):
+    return _source_fault(settings.source, camera)
+
+
+def _source_fault(source: SourceSettings, camera: Camera) -> Fault | None:
+    if isinstance(source, NetworkSettings):
         try:
-            PayloadDecoder(settings.source.format, (camera.width_px, camera.height_px))
+            PayloadDecoder(source.format, (camera.width_px, camera.height_px))
         except SourceError as error:
             return _fault(f"source.{error}")
     return None

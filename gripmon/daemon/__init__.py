@@ -17,16 +17,20 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import FrameType
+from typing import NamedTuple
 
 from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.loop import Daemon
-from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
+from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFeed, Reports
+from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
-from gripmon.publish import Publisher
-from gripmon.recording import Recorder
+from gripmon.publish import Publisher, SpotPublisher, StatePublisher
+from gripmon.pulses.told import Told
+from gripmon.pulses.watching import PulsedWatch
+from gripmon.recording import EventRecorder, Recorder, SpotRecorder
 from gripmon.records import Alert
 from gripmon.sources import Source
 
@@ -40,11 +44,14 @@ __all__ = [
     "EstimatesFile",
     "JawFeed",
     "MonitorLike",
+    "PulseFeed",
     "Reports",
+    "SecondCamera",
     "StateKeeper",
     "StopRequest",
     "log_to_stderr",
     "run",
+    "run_second",
     "sigterm_exits",
 ]
 
@@ -81,29 +88,86 @@ def run(
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
     """
-    stop = StopRequest()
-    with _signals(stop), contextlib.ExitStack() as closing:
-        # Whatever happens, all of these run, the last one first; a second signal no longer disturbs them.
-        if keeper is not None:
-            closing.callback(keeper.close)
-        closing.callback(publisher.close)
-        closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
-        closing.callback(source.close)
-        lines = closing.enter_context(contextlib.closing(EstimatesFile(estimates)))
-        snapshots = closing.enter_context(contextlib.closing(Snapshots()))
-        own = _faults(jaw, recorder, lines, keeper)
+    with _closing(source, publisher, recorder, settings, estimates, keeper) as opened:
+        own = _faults(jaw, recorder, opened.lines, keeper)
         reports = reports or Reports()
         daemon = Daemon(
-            monitor, source, publisher, recorder, settings, stop,
-            robot=robot, camera=camera, estimates=lines, jaw=jaw, keeper=keeper, commands=commands, snapshots=snapshots,
+            monitor, source, publisher, recorder, settings, opened.stop,
+            robot=robot, camera=camera, estimates=opened.lines, jaw=jaw, keeper=keeper, commands=commands,
+            snapshots=opened.snapshots, reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
+        )  # fmt: skip
+        with _steady_interpreter():
+            return daemon.run(duration_s)
+
+
+def run_second(
+    pulsed: PulsedWatch,
+    source: Source,
+    publisher: SpotPublisher,
+    recorder: SpotRecorder,
+    settings: DaemonSettings,
+    *,
+    robot: str,
+    camera: str,
+    lines: Path | None = None,
+    table: Sequence[Told] = (),
+    feed: PulseFeed | None = None,
+    no_spot_alert_after_s: float | None = None,
+    commands: CommandFeed | None = None,
+    reports: Reports | None = None,
+    notices: Sequence[Alert] = (),
+    duration_s: float | None = None,
+) -> int:
+    """The same for a second camera: see :class:`SecondCamera`.  ``lines`` is a file that gets one JSON line a pulse.
+
+    Returns the exit code: also 3 if there were pulses and none showed its spot.
+    """
+    with _closing(source, publisher, recorder, settings, lines) as opened:
+        own = _faults(None, recorder, opened.lines, None)
+        reports = reports or Reports()
+        daemon = SecondCamera(
+            pulsed, source, publisher, recorder, settings, opened.stop,
+            robot=robot, camera=camera, lines=opened.lines, table=table, feed=feed,
+            no_spot_alert_after_s=no_spot_alert_after_s, commands=commands, snapshots=opened.snapshots,
             reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
         )  # fmt: skip
         with _steady_interpreter():
             return daemon.run(duration_s)
 
 
+class _Opened(NamedTuple):
+    """What a loop has for as long as it runs."""
+
+    stop: StopRequest
+    lines: EstimatesFile
+    snapshots: Snapshots
+
+
+@contextlib.contextmanager
+def _closing(
+    source: Source,
+    publisher: StatePublisher,
+    recorder: EventRecorder,
+    settings: DaemonSettings,
+    lines: Path | None,
+    keeper: StateKeeper | None = None,
+) -> Iterator[_Opened]:
+    """Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that."""
+    stop = StopRequest()
+    with _signals(stop), contextlib.ExitStack() as closing:
+        # All of these run, the last one first.
+        if keeper is not None:
+            closing.callback(keeper.close)
+        closing.callback(publisher.close)
+        closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
+        closing.callback(source.close)
+        file = closing.enter_context(contextlib.closing(EstimatesFile(lines)))
+        snapshots = closing.enter_context(contextlib.closing(Snapshots()))
+        yield _Opened(stop, file, snapshots)
+
+
 def _faults(
-    jaw: JawFeed | None, recorder: Recorder, lines: EstimatesFile, keeper: StateKeeper | None
+    jaw: JawFeed | None, recorder: EventRecorder, lines: EstimatesFile, keeper: StateKeeper | None
 ) -> list[Callable[[], str | None]]:
     """Whom to ask what is wrong, in the order in which it is said."""
     faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]

@@ -1,4 +1,4 @@
-"""One JSON line a frame, in a file."""
+"""One JSON line a frame, or a pulse, in a file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import IO
 
-from gripmon.records import FrameRecord, to_json
+from gripmon.records import FrameRecord, SpotRecord, to_json
 
 _log = logging.getLogger(__name__)
 _BUFFER_BYTES = 1 << 16
@@ -28,7 +28,7 @@ class EstimatesFile:
             _set_aside(path)
         self._file: IO[bytes] | None = None if path is None else path.open("wb", buffering=_BUFFER_BYTES)
 
-    def write(self, record: FrameRecord) -> None:
+    def write(self, record: FrameRecord | SpotRecord) -> None:
         """Add a line; it is on disk after the next :meth:`flush`."""
         if self._file is not None:
             try:

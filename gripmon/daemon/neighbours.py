@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+from gripmon.pulses.told import Told
 from gripmon.records import (
     Command,
     CommandError,
@@ -46,6 +47,12 @@ class CommandFeed(Protocol):
     """Where commands come from, e.g. :class:`gripmon.publish.ZenohCommands`; ``poll`` doesn't wait."""
 
     def poll(self) -> Asked | None: ...
+
+
+class PulseFeed(Protocol):
+    """Where a laser's pulses come from, e.g. :class:`gripmon.publish.ZenohPulses`; ``poll`` doesn't wait."""
+
+    def poll(self) -> Told | None: ...
 
 
 class JawFeed(Protocol):

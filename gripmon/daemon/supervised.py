@@ -64,6 +64,9 @@ class StopRequest:
 class Loop(ABC):
     """Runs in the thread that calls :meth:`run`.  What is done with a frame, and what is judged, is the subclass's."""
 
+    verdict_of = "transform"
+    """What the verdict is about, in the log."""
+
     def __init__(
         self,
         source: Source,
@@ -251,7 +254,8 @@ class Loop(ABC):
         if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
             return
         if said is None or (watch.state, watch.verdict) != (said.state, said.verdict):
-            _log.info("state %s, transform %s%s", watch.state, watch.verdict, f" ({message})" if message else "")
+            said_more = f" ({message})" if message else ""
+            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, watch.verdict, said_more)
         self._said = StateRecord(
             robot=self._robot,
             camera=self._camera,

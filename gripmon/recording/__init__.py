@@ -8,7 +8,7 @@ slow disk ever hold the interpreter that the loop runs in.  The daemon itself ne
 from __future__ import annotations
 
 from gripmon.recording.feed import ProcessRecorder, open_recorder
-from gripmon.recording.recorder import EventRecorder, Notes, NullRecorder, Recorder, Trace
+from gripmon.recording.recorder import EventRecorder, Notes, NullRecorder, Recorder, SpotRecorder, Trace
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
 
@@ -19,6 +19,7 @@ __all__ = [
     "ProcessRecorder",
     "Recorder",
     "RecordingSettings",
+    "SpotRecorder",
     "Trace",
     "ViewSettings",
     "open_recorder",

@@ -9,10 +9,12 @@ from gripmon.records import (
     AlertRecord,
     Frame,
     FrameRecord,
+    Image,
     MeasurementTrace,
     MonitorNotes,
     RecordedCommand,
     ReferenceRecord,
+    SpotRecord,
     StateRecord,
 )
 
@@ -47,6 +49,13 @@ class Recorder(EventRecorder, Protocol):
     def reference(self, reference: ReferenceRecord) -> None: ...
 
 
+class SpotRecorder(EventRecorder, Protocol):
+    """The recording of a second camera."""
+
+    def spot(self, record: SpotRecord, image: Image | None) -> None:
+        """What became of a pulse, with the image in which its spot was looked for."""
+
+
 class NullRecorder:
     """Records nothing."""
 
@@ -54,6 +63,9 @@ class NullRecorder:
     failure: str | None = None
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        pass
+
+    def spot(self, record: SpotRecord, image: Image | None) -> None:
         pass
 
     def alert(self, alert: AlertRecord) -> None:

@@ -47,14 +47,16 @@ def open_source(
     relative_to: Path = Path(),
     *,
     scene: SimulatedScene | None = None,
+    size_px: tuple[int, int] | None = None,
     link: Link | None = None,
     keys: Keys | None = None,
 ) -> Source:
     """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
 
-    Only the simulator needs a whole ``scene``, and a camera on the network the size of the scene's camera, the session
-    and the monitor's keys.  The simulator's real-time camera starts another Python process by ``multiprocessing``, so
-    a script that opens one must keep its own start behind ``if __name__ == "__main__"``.
+    Only the simulator needs a whole ``scene``, and a camera on the network the session, the monitor's keys and the size
+    of the images: (width, height), by default that of the scene's camera.  The simulator's real-time camera starts
+    another Python process by ``multiprocessing``, so a script that opens one must keep its own start behind
+    ``if __name__ == "__main__"``.
 
     Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
     video, and a device of no known form.  A camera that is only absent at present is no error: the source waits for it.
@@ -71,9 +73,10 @@ def open_source(
         case LiveSettings():
             return LiveCamera(settings)
         case NetworkSettings():
-            if link is None or keys is None or scene is None:
+            if size_px is None and scene is not None:
+                size_px = scene.camera.width_px, scene.camera.height_px
+            if link is None or keys is None or size_px is None:
                 raise SourceError("kind: zenoh has no session here; publish.enabled: true, and gripmon run")
-            size_px = scene.camera.width_px, scene.camera.height_px
             return NetworkCamera(settings, link, keys["image"], size_px)
 
 

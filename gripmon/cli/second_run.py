@@ -1,0 +1,156 @@
+"""``gripmon run`` with the configuration of a second camera."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import SecondConfig
+    from gripmon.daemon import Reports
+    from gripmon.publish import SpotPublisher, ZenohCommands, ZenohPulses
+    from gripmon.recording import SpotRecorder
+    from gripmon.sources import Source
+    from gripmon.wire import Link
+
+_log = logging.getLogger(__name__)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Network:
+    """The session (None: nothing is published), what is said on it, and what is heard."""
+
+    link: Link | None
+    publisher: SpotPublisher
+    pulses: ZenohPulses | None
+    commands: ZenohCommands | None
+    reports: Reports
+
+
+def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
+    """The configuration if it is a second camera's, else None; a fault ends the command with exit code 2."""
+    from gripmon.config import ConfigError, is_second, load_second
+
+    try:
+        return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+
+
+def run_second(config: SecondConfig, *, out: Path | None, duration_s: float | None, verbose: bool) -> int:
+    """Open everything that the configuration names and run the daemon on it; returns the exit code."""
+    import cv2
+
+    from gripmon import daemon
+    from gripmon.cli.network import with_source
+
+    settings, laser = config.settings, config.settings.laser
+    lines = None if out is None else out / "spots.jsonl"
+    if lines is not None:
+        common.check_file(lines)
+    cv2.setNumThreads(1)
+    daemon.log_to_stderr(verbose=verbose)
+    with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
+        pulsed = config.pulsed_watch()
+        network = _open_network(config)
+        opened.callback(network.publisher.close)
+        publisher = _with_metrics(config, network.publisher)
+        opened.callback(publisher.close)
+        recorder = open_recorder(config, out)
+        opened.callback(recorder.close)
+        source = _open_source(config, network.link)
+        opened.pop_all()  # from here on the daemon closes them
+        return daemon.run_second(
+            pulsed,
+            source,
+            publisher,
+            recorder,
+            settings.daemon,
+            robot=settings.robot,
+            camera=settings.camera_name,
+            lines=lines,
+            table=config.pulses,
+            feed=network.pulses,
+            no_spot_alert_after_s=laser.no_spot_alert_after_s,
+            commands=network.commands,
+            reports=with_source(network.reports, source),
+            duration_s=duration_s,
+        )
+
+
+def _open_network(config: SecondConfig) -> _Network:
+    """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
+    from gripmon.config import ConfigError, check_second_network
+    from gripmon.daemon import Reports
+    from gripmon.publish import NullPublisher
+    from gripmon.wire import Link, PublishError
+
+    try:
+        check_second_network(config)
+        if not config.settings.publish.enabled:
+            return _Network(None, NullPublisher(), None, None, Reports())
+        link = Link(config.settings.publish, config.directory)
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    except PublishError as error:
+        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+    with contextlib.ExitStack() as failed:
+        failed.callback(link.close)  # a process must not end while its session is being opened
+        network = _on_link(config, link)
+        failed.pop_all()
+    return network
+
+
+def _on_link(config: SecondConfig, link: Link) -> _Network:
+    from gripmon.daemon import Reports
+    from gripmon.publish import ZenohCommands, ZenohPulses, ZenohSpotPublisher
+
+    settings = config.settings
+    publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name)
+    pulses = ZenohPulses(link, publisher.keys["pulse"]) if settings.laser.pulses is None else None
+    commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    heard = [each for each in (pulses, commands) if each is not None]
+    faults = [link.fault] if pulses is None else [link.fault, pulses.fault]
+    return _Network(
+        link, publisher, pulses, commands, Reports(faults, malformed=lambda: sum(h.malformed for h in heard))
+    )
+
+
+def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublisher:
+    """The publisher, and beside it the server for Prometheus where the configuration wants one."""
+    from gripmon.metrics import MetricsError, MetricsServer
+    from gripmon.publish import SpotPublishers
+
+    settings = config.settings
+    if not settings.metrics.enabled:
+        return publisher
+    try:
+        metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
+    except MetricsError as error:
+        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+    _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
+    return SpotPublishers(publisher, {"metrics": metrics})
+
+
+def _open_source(config: SecondConfig, link: Link | None) -> Source:
+    from gripmon.sources import SourceError, open_source
+    from gripmon.wire import Keys
+
+    settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
+    keys = Keys(settings.robot, settings.camera_name)
+    try:
+        return open_source(settings.source, config.directory, size_px=size_px, link=link, keys=keys)
+    except SourceError as error:
+        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
+
+
+def open_recorder(config: SecondConfig, out: Path | None) -> SpotRecorder:
+    """The recording that the configuration wants; ends the command with exit code 2 where it can't be made."""
+    from gripmon.recording import NullRecorder
+
+    return NullRecorder()

@@ -1,0 +1,195 @@
+"""The configuration of a second camera: a laser calibration that is watched, in place of a gripper and a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.calibration.laser.document import LaserCalibration
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.camera import Camera, make_camera
+from gripmon.config.errors import ConfigError
+from gripmon.config.inputs import network_fault, source_fault
+from gripmon.config.session import second_joined_or_fault
+from gripmon.config.settings import Name
+from gripmon.config.typed import Fault, SettingsError, to_settings
+from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon import DaemonSettings
+from gripmon.metrics import MetricsSettings
+from gripmon.pulses.settings import PulseSettings
+from gripmon.pulses.told import Told
+from gripmon.pulses.watching import PulsedWatch
+from gripmon.recording import RecordingSettings
+from gripmon.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
+from gripmon.sources.pulses import read_pulses
+from gripmon.spotwatch import SpotWatchSettings
+from gripmon.wire import Joining, PublishSettings
+
+SECTION = "laser"
+_OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state", "view")
+
+
+class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What is watched, and how."""
+
+    calibration: Annotated[
+        str, Meta(min_length=1, description="file of gripmon calibrate laser, its path relative to this file")
+    ]
+    pulses: (
+        Annotated[
+            str,
+            Meta(
+                min_length=1,
+                description="table of the pulses (CSV), relative to this file, for a folder or a video; a live camera's "
+                "come over the network",
+            ),
+        ]
+        | None
+    ) = None
+    no_spot_alert_after_s: (
+        Annotated[
+            float,
+            Meta(gt=0.0, description="an alert when no spot could be judged for so long; leave out: never (s)"),
+        ]
+        | None
+    ) = None
+    frames: PulseSettings = PulseSettings()
+    watch: SpotWatchSettings = SpotWatchSettings()
+
+
+class SecondSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A whole configuration file of a second camera."""
+
+    robot: Name
+    camera_name: Name
+    laser: LaserSettings
+    source: SourceSettings
+    publish: PublishSettings = PublishSettings()
+    recording: RecordingSettings = RecordingSettings()
+    metrics: MetricsSettings = MetricsSettings()
+    daemon: DaemonSettings = DaemonSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class SecondConfig:
+    """A configuration that holds together.  ``pulses`` are those of a table, empty where they come over the network."""
+
+    path: Path
+    settings: SecondSettings
+    calibration_path: Path
+    calibration: LaserCalibration
+    camera: Camera
+    pulses: tuple[Told, ...] = ()
+
+    @property
+    def directory(self) -> Path:
+        """Where relative paths in the file count from."""
+        return self.path.parent
+
+    def pulsed_watch(self) -> PulsedWatch:
+        """A watch that begins."""
+        laser = self.settings.laser
+        return PulsedWatch(self.calibration, laser.watch, laser.frames)
+
+
+def is_second(path: Path) -> bool:
+    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that is no YAML."""
+    return SECTION in read_yaml(path)
+
+
+def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
+    """Read and check a configuration file.  Raises :class:`ConfigError`.
+
+    ``check_source=False`` leaves out whether the source's files exist, and the pulses.
+    """
+    values = read_yaml(path)
+    _refuse_wrist(path, values)
+    try:
+        settings = to_settings(values, SecondSettings)
+    except SettingsError as error:
+        raise _error(path, error.fault) from None
+    calibration_path = path.parent / settings.laser.calibration
+    calibration = read_laser(path, calibration_path)
+    fault = _fault_between(settings) or network_fault(settings.source, settings.publish)
+    if fault is None and check_source:
+        fault = source_fault(settings.source, path.parent)
+    if fault is not None:
+        raise _error(path, fault)
+    config = SecondConfig(path, settings, calibration_path, calibration, make_camera(calibration.camera))
+    if settings.laser.pulses is None or not check_source:
+        return config
+    return replace(config, pulses=_pulses(path, settings.laser.pulses))
+
+
+def check_second_network(config: SecondConfig) -> Joining | None:
+    """As :func:`gripmon.config.check_network`.  Raises :class:`ConfigError`."""
+    settings = config.settings
+    found = second_joined_or_fault(settings.source, settings.publish, settings.metrics, config.camera, config.directory)
+    if isinstance(found, Fault):
+        raise _error(config.path, found)
+    return found
+
+
+def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
+    """The laser calibration that a configuration names.  Raises :class:`ConfigError`."""
+    if not calibration_path.is_file():
+        wrong = f"there is no file {calibration_path}"
+        right = "a file of gripmon calibrate laser, its path relative to this file"
+        raise ConfigError(path, "laser.calibration", wrong, right)
+    values = read_yaml(calibration_path)
+    tag = str(LaserCalibration.__struct_config__.tag)
+    if values.get("schema") != tag:
+        raise ConfigError(calibration_path, "schema", f"is {values.get('schema')!r}", tag)
+    try:
+        calibration = to_settings(values, LaserCalibration)
+        make_camera(calibration.camera)
+        # Everything that its numbers must have in common is checked where they are used.
+        PulsedWatch(calibration, SpotWatchSettings(), PulseSettings())
+    except SettingsError as error:
+        raise _error(calibration_path, error.fault) from None
+    except (CalibrationError, ValueError) as error:
+        raise ConfigError(calibration_path, "", str(error)) from None
+    return calibration
+
+
+def _pulses(path: Path, name: str) -> tuple[Told, ...]:
+    try:
+        return tuple(read_pulses(path.parent / name))
+    except SourceError as error:
+        wrong, _, right = str(error).rpartition("; ")
+        raise ConfigError(path, "laser.pulses", wrong, right) from None
+
+
+def _refuse_wrist(path: Path, values: dict[str, Any]) -> None:
+    """A second camera with keys of a wrist camera: which one is meant?"""
+    both = [key for key in _OF_A_WRIST if key in values]
+    if both:
+        right = f"{SECTION} for a second camera, or {both[0]} for a wrist camera; two cameras are two files"
+        raise ConfigError(path, both[0], f"stands beside {SECTION}", right)
+    if "camera" in values:
+        raise ConfigError(path, "camera", f"stands beside {SECTION}", "nothing: the laser calibration's is used")
+
+
+def _fault_between(settings: SecondSettings) -> Fault | None:
+    """Where frames come from, and how the pulses are told: both recorded, or both live."""
+    source, pulses = settings.source, settings.laser.pulses
+    if isinstance(source, SimulatedSettings):
+        return Fault("source.kind", "is simulator, which shows a gripper and no laser", "folder, video, live or zenoh")
+    recorded = isinstance(source, FolderSettings | VideoSettings)
+    if recorded and pulses is None:
+        return Fault("laser.pulses", "is missing", "a table of the recorded pulses: stamp_ns, until_ns, base_T_ee")
+    if not recorded and pulses is not None:
+        right = "leave it out: the robot's program tells each pulse on the key …/pulse"
+        return Fault("laser.pulses", "has no effect with a live camera", right)
+    if not recorded and not settings.publish.enabled:
+        right = "publish.enabled: true, for the pulses come over the network"
+        return Fault("publish.enabled", "is false, and the source is a live camera", right)
+    return None
+
+
+def _error(path: Path, fault: Fault) -> ConfigError:
+    return ConfigError(path, fault.key, fault.wrong, fault.right)

@@ -1,0 +1,243 @@
+"""The loop of a second camera: frames and a laser's pulses in, a judged spot a pulse out."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterable, Sequence
+
+import msgspec
+
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.neighbours import CommandFeed, PulseFeed, Reports
+from gripmon.daemon.settings import DaemonSettings
+from gripmon.daemon.snapshots import Newest, Snapshots
+from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest, in_short
+from gripmon.daemon.watch import Judged
+from gripmon.policy import AlertBook
+from gripmon.publish import SpotPublisher
+from gripmon.pulses.matching import Shown
+from gripmon.pulses.told import Told
+from gripmon.pulses.watching import Outcome, PulsedWatch
+from gripmon.recording import SpotRecorder
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Cause,
+    Command,
+    CommandName,
+    CommandReply,
+    Frame,
+    FrameRecord,
+    MonitorState,
+    Origin,
+    PulseFault,
+    Severity,
+    State,
+    Verdict,
+)
+from gripmon.sources import Source
+
+_log = logging.getLogger(__name__)
+_NO_SPOT = "no_spot"
+_NOT_HERE = (
+    "this is a second camera, which measures no reference of its own; to calibrate it anew: gripmon calibrate laser"
+)
+
+
+class SecondCamera(Loop):
+    """Watches one calibration, in the thread that calls :meth:`run`."""
+
+    verdict_of = "calibration"
+
+    def __init__(
+        self,
+        pulsed: PulsedWatch,
+        source: Source,
+        publisher: SpotPublisher,
+        recorder: SpotRecorder,
+        settings: DaemonSettings,
+        stop: StopRequest,
+        *,
+        robot: str,
+        camera: str,
+        lines: EstimatesFile,
+        table: Sequence[Told] = (),
+        feed: PulseFeed | None = None,
+        no_spot_alert_after_s: float | None = None,
+        commands: CommandFeed | None = None,
+        snapshots: Snapshots | None = None,
+        reports: Reports | None = None,
+        notices: Sequence[Alert] = (),
+    ) -> None:
+        """``table``: all pulses of recorded frames; ``feed``: where they come from otherwise.
+
+        ``no_spot_alert_after_s``: without a spot that is believed for so long there is an alert; None: never.
+        """
+        super().__init__(
+            source, publisher, recorder, settings, stop,
+            robot=robot, camera=camera, commands=commands, snapshots=snapshots, reports=reports, notices=notices,
+        )  # fmt: skip
+        self._pulsed = pulsed
+        self._publisher, self._recorder, self._lines = publisher, recorder, lines
+        self._table, self._feed = table, feed
+        self._no_spot_s = no_spot_alert_after_s
+        self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
+        self._believed_s = self._start_s
+        self._pulses = 0
+        self._failure = ""  # of the last pulse: of the code here, not of the camera
+        self._unused = "no pulse yet"
+
+    @property
+    def _in_force(self) -> tuple[str, int]:
+        return self._pulsed.reference_id, 0
+
+    def _begin(self) -> None:
+        for told in self._table:
+            self._judge(self._pulsed.tell(told))
+
+    def _between(self) -> None:
+        now_s = time.monotonic()
+        while self._feed is not None and (told := self._feed.poll()) is not None:
+            self._judge(self._pulsed.tell(told, now_s))
+        self._judge(self._pulsed.tick(now_s))
+        self._look_for_silence(now_s)
+        self._gather_alerts()
+
+    def _handle(self, frame: Frame) -> None:
+        self._seq = frame.seq
+        self._faults.clear()
+        failure, refused = "", ""
+        alerts: tuple[Alert, ...] = ()
+        shown: list[Shown] = []
+        try:
+            shown, alerts, refused = self._pulsed.frame(frame)
+        except Exception as error:  # noqa: BLE001  said and counted
+            failure = self._failed(f"frame {frame.seq}: ", error)
+        self._judge(shown)
+        failure = failure or self._failure
+        self._tell(alerts, self._pulsed.state, frame.stamp_ns)
+        self._gather_alerts()
+        judged = self._judged(refused, failure)
+        self._newest = Newest(frame, self._frame_record(frame, judged), time.monotonic())
+        for alert in self._watch.judged(judged, time.monotonic()):
+            self._alert(alert, judged.state, frame.stamp_ns)
+        if shown or failure or self._faults:
+            undelivered = "; ".join(self._faults.values())
+            for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
+                self._alert(alert, judged.state, frame.stamp_ns)
+
+    def _judged(self, refused: str, failure: str) -> Judged:
+        """How things stand with this frame."""
+        if failure:
+            return Judged(State.LOST, Verdict.UNKNOWN, usable=not refused, reason=failure)
+        gap = self._pulsed.displacement
+        return Judged(
+            self._pulsed.state,
+            self._pulsed.verdict,
+            usable=not refused,
+            refused=bool(refused),
+            reason=refused or self._unused,
+            tcp_shift_m=None if gap is None else gap.shift_m,
+            sigma_m=None if gap is None else gap.sigma_m,
+        )
+
+    def _judge(self, shown: Iterable[Shown]) -> None:
+        """Judge pulses that are complete, and pass on what became of each."""
+        for each in shown:
+            began_ns = time.monotonic_ns()
+            self._pulses += 1
+            try:
+                outcome, self._failure = self._pulsed.judge(each), ""
+            except Exception as error:  # noqa: BLE001  said and counted
+                self._failure = self._failed(f"pulse {each.pulse.number}: ", error)
+                outcome = self._pulsed.unjudged(each, PulseFault.INTERNAL, self._failure)
+            latency_ns = time.monotonic_ns() - began_ns
+            self._pass_on(Outcome(msgspec.structs.replace(outcome.record, latency_ns=latency_ns), outcome.image))
+
+    def _pass_on(self, outcome: Outcome) -> None:
+        record = outcome.record
+        self._deliver("spot", self._publisher.spot, record)
+        self._tell(record.alerts, record.state, record.stamp_ns, recorded=True)
+        if record.used:
+            self._believed_s, self._unused = time.monotonic(), ""
+        else:
+            self._unused = f"the last pulse is not used: {record.reason}"
+            _log.info("pulse %d is not used: %s", record.pulse, record.reason)
+        self._deliver("recording", self._recorder.spot, record, outcome.image)
+        self._deliver("lines", self._lines.write, record)
+
+    def _failed(self, where: str, error: Exception) -> str:
+        failure = f"internal error: {in_short(error)}"
+        self._log_once("judgement", where, failure, error)
+        return failure
+
+    def _tell(
+        self, alerts: Iterable[Alert], state: State, stamp_ns: int | None = None, *, recorded: bool = False
+    ) -> None:
+        for alert in alerts:
+            self._alert(alert, state, stamp_ns, recorded=recorded)
+
+    def _look_for_silence(self, now_s: float) -> None:
+        """A robot that forgot its laser: nothing would ever be noticed again."""
+        if self._no_spot_s is None or not self._source.live:
+            return
+        silence_s = now_s - self._believed_s
+        if silence_s < self._no_spot_s:
+            self._tell(self._alerts.absent(_NO_SPOT, "spots are seen again", now_s), self._pulsed.state)
+            return
+        text = f"no spot that could be judged for {silence_s:.0f} s: {self._unused or 'no pulse was told'}"
+        alert = Alert(AlertKind.STREAM, Cause.UNKNOWN, Severity.WARNING, text)
+        self._tell(self._alerts.present(_NO_SPOT, alert, now_s, time.time_ns()), self._pulsed.state)
+
+    def _gather_alerts(self) -> None:
+        self._open_alerts = (*self._pulsed.open_alerts, *self._alerts.open)
+
+    def _carry_out(self, command: Command, stamp_ns: int) -> CommandReply:
+        name, argument = command.name, command.argument
+        if name in (CommandName.STATE, CommandName.SNAPSHOT):
+            return self._reply(name, True, f"{self._pulsed.state}, {self._pulsed.reference_id} in force", whole=True)
+        if name is CommandName.ACKNOWLEDGE:
+            seen = (*self._pulsed.acknowledge(argument), *self._alerts.acknowledge(argument))
+            self._tell(seen, self._pulsed.state)
+            if not seen:
+                which = f"no open alert {argument}" if argument else "no open alert"
+                return self._reply(name, False, f"{which} that isn't acknowledged")
+            return self._reply(name, True, "acknowledged: " + ", ".join(alert.alert_id for alert in seen))
+        if name is CommandName.RESET:
+            self._tell(self._pulsed.reset(), self._pulsed.state)
+            return self._reply(name, True, f"{self._pulsed.reference_id} is believed again; what was seen is forgotten")
+        return self._reply(name, False, _NOT_HERE)
+
+    def _reply(self, name: CommandName, done: bool, text: str, *, whole: bool = False) -> CommandReply:
+        self._gather_alerts()
+        state = MonitorState((), alerts=self._open_alerts) if whole else None
+        return CommandReply(name, done, text, *self._in_force, state)
+
+    def _frame_record(self, frame: Frame, judged: Judged) -> FrameRecord:
+        """What a snapshot says of a frame."""
+        reference_id, revision = self._in_force
+        return FrameRecord(
+            seq=frame.seq, stamp_ns=frame.stamp_ns, verdict=judged.verdict, state=judged.state, source=Origin.HELD,
+            cam_T_grip=None, covariance=None, smoothed=None, drift=None, reference_id=reference_id, revision=revision,
+            rms_px=None, jaw_opening_m=None, corners=(), alerts=(),
+            reason=judged.reason or "a second camera has no cam_T_grip", name=frame.name,
+        )  # fmt: skip
+
+    def _finish(self) -> None:
+        self._judge(self._pulsed.finish())
+        self._gather_alerts()
+
+    def _keep_house(self) -> None:
+        self._lines.flush()
+        super()._keep_house()
+
+    def _code_at_the_end(self) -> int:
+        code = super()._code_at_the_end()
+        if code == EXIT_DONE:
+            self._judge(self._pulsed.finish())
+            if self._pulses and not self._pulsed.usable:
+                _log.error("no pulse showed its spot: %s", self._unused)
+                return EXIT_FAILED
+        return code
