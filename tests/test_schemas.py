@@ -7,6 +7,7 @@ import json
 import msgspec
 import pytest
 from loopback import alert_record, frame_record, reference_record, state_record
+from sample_messages import SAMPLES
 
 from gripmon.records import (
     MESSAGES,
@@ -36,6 +37,8 @@ ONE_OF_EACH = {
     "reference": reference_record(),
     "jaw": JawReading(5, 0.02),
     "frame": FrameNote(stamp_ns=5, jaw_opening_m=0.02, width=768, height=576, encoding="mono8", step=1024),
+    "pulse": SAMPLES["pulse"],
+    "spot": SAMPLES["spot"],
     "command": CommandRequest("plate-2"),
     "reply": CommandReply(CommandName.STATE, True, "well", "plate-2", 3, MonitorState((reference_record(),))),
     "error": CommandError(CommandFault.BUSY, "later"),

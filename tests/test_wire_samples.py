@@ -161,8 +161,16 @@ def test_the_page_says_how_each_key_is_sent(heard: dict[str, zenoh.Sample], leaf
 
 
 def test_the_sizes_on_the_page_are_those_of_the_code():
-    from gripmon.records import CommandReply, CommandRequest, FrameNote, FrameRecord, JawReading, largest_bytes
+    from gripmon.records import (
+        CommandReply,
+        CommandRequest,
+        FrameNote,
+        FrameRecord,
+        JawReading,
+        LaserPulse,
+        largest_bytes,
+    )
 
-    assert "larger than 1 MiB, a `jaw`, `frame` or `command` 4 KiB, a `reply` 64 MiB" in PAGE
+    assert "larger than 1 MiB, a `jaw`, `pulse`, `frame` or `command` 4 KiB, a `reply` 64 MiB" in PAGE
     assert largest_bytes(FrameRecord) == 1 << 20 and largest_bytes(CommandReply) == 64 << 20
-    assert {largest_bytes(message) for message in (JawReading, FrameNote, CommandRequest)} == {4 << 10}
+    assert {largest_bytes(message) for message in (JawReading, LaserPulse, FrameNote, CommandRequest)} == {4 << 10}

@@ -44,8 +44,8 @@ class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             str,
             Meta(
                 min_length=1,
-                description="table of the pulses (CSV), relative to this file, for a folder or a video; a live camera's "
-                "come over the network",
+                description="table of the pulses (CSV), relative to this file, for a folder or a video; others come "
+                "over the network",
             ),
         ]
         | None

@@ -1,0 +1,149 @@
+"""A second camera with a pulsed laser: calibrated by the command, its pulses rendered, the camera moved where asked."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import cv2
+import msgspec
+import numpy as np
+import yaml
+from laser_images import spot_image
+from laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
+from scipy.spatial.transform import Rotation
+
+from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibration.laser.setup import LaserSetup, spots_on_plane
+from gripmon.cli import main
+from gripmon.config.yaml_file import as_yaml
+from gripmon.geometry import perturb
+from gripmon.provenance import provenance_of
+from gripmon.records import Array, Image
+
+PREFIX = "gripmon/cell/second"
+MOVED = np.array([0.004, -0.003, 0.002, 0.004, 0.006, -0.003])
+"""A knock of the camera: perturbs ``cam_T_base`` (m, rad)."""
+
+FRAME_NS, PULSE_NS, PERIOD_NS = 40_000_000, 200_000_000, 400_000_000
+
+
+@dataclass(frozen=True)
+class Cell:
+    """``folder`` holds ``laser.yaml``, calibrated from other spots than ``data``, whose noise is 0.3 px."""
+
+    folder: Path
+    data: LaserData
+
+    def uv_px(self, pulse: int, moved: Array | None = None) -> Array:
+        """Where the spot of a pulse is, the camera moved or not."""
+        setup: LaserSetup = self.data.truth
+        if moved is not None:
+            setup = replace(setup, cam_T_base=perturb(setup.cam_T_base, moved), **_plane_seen(setup, moved))
+        spot = spots_on_plane(setup, self.data.base_T_ee[pulse][None])[0]
+        return self.data.camera.project(spot)[0]
+
+
+def _plane_seen(setup: LaserSetup, moved: Array) -> dict[str, object]:
+    """The plane stands still in the base: a camera that moved has it elsewhere."""
+    cam2_T_cam1 = perturb(setup.cam_T_base, moved) @ np.linalg.inv(setup.cam_T_base)
+    normal = cam2_T_cam1[:3, :3] @ setup.normal_cam
+    return {"normal_cam": normal, "distance_m": setup.distance_m + float(normal @ cam2_T_cam1[:3, 3])}
+
+
+@lru_cache(maxsize=1)
+def cell() -> Cell:
+    """The same for all tests of a process."""
+    folder = Path(mkdtemp(prefix="gripmon-cell-"))
+    rng = np.random.default_rng(4)
+    setup = paper_setup(rng)
+    known = sampled(setup, rng, orientations=9)
+    _write_camera(folder / "camera.yaml")
+    write_table(
+        folder / "spots.csv", known.base_T_ee, {"u_px": known.uv_px[:, 0] + rng.normal(0.0, 0.3, len(known.uv_px)),
+                                                "v_px": known.uv_px[:, 1] + rng.normal(0.0, 0.3, len(known.uv_px))}
+    )  # fmt: skip
+    arguments = [
+        str(folder / "spots.csv"),
+        "--camera",
+        str(folder / "camera.yaml"),
+        "--out",
+        str(folder / "laser.yaml"),
+    ]
+    assert main(["calibrate", "laser", *arguments]) == 0
+    data = sampled(setup, rng, orientations=4)
+    order = rng.permutation(len(data.base_T_ee))
+    return Cell(folder, replace(data, base_T_ee=data.base_T_ee[order], uv_px=data.uv_px[order]))
+
+
+def _write_camera(path: Path) -> None:
+    calibration = CameraCalibration(
+        camera=PAPER_LENS,
+        parameters=("fx_px", "fy_px", "cx_px", "cy_px"),
+        covariance=tuple(np.diag([0.01] * 4).ravel().tolist()),
+        residuals=CameraResiduals(rms_px=0.1, views=10, points=500, outliers=0),
+        target="chequerboard:9x6:0.025",
+        provenance=provenance_of("test"),
+    )
+    path.write_text(as_yaml(msgspec.to_builtins(calibration)))
+
+
+def write_table(path: Path, base_T_ee: Array, columns: dict[str, Array]) -> None:
+    """A table of poses with further columns before them."""
+    quaternions = Rotation.from_matrix(base_T_ee[:, :3, :3]).as_quat()
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*columns, "tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"])
+        for k, pose in enumerate(base_T_ee):
+            values = [column[k].item() for column in columns.values()]
+            writer.writerow([*values, *pose[:3, 3].tolist(), *quaternions[k].tolist()])
+
+
+def lit(uv_px: Array, rng: np.random.Generator) -> Image:
+    """A frame with the laser on."""
+    return spot_image(uv_px, rng, height=120.0, speckle=0.1)
+
+
+def dark(rng: np.random.Generator) -> Image:
+    """A frame with the laser off."""
+    return spot_image(np.zeros(2), rng, height=0.0)
+
+
+def write_folder(cell: Cell, folder: Path, pulses: int, moved_from: int | None = None, *, start_ns: int = 0) -> None:
+    """``images/`` with stamps and ``pulses.csv``: before each pulse a dark frame, within it three, of which the outer
+    ones lie in the margin.
+    """
+    images = folder / "images"
+    images.mkdir()
+    rng = np.random.default_rng(7)
+    rows = []
+    begins_ns = start_ns + PERIOD_NS * (1 + np.arange(pulses))
+    for k in range(pulses):
+        uv = cell.uv_px(k, MOVED if moved_from is not None and k >= moved_from else None)
+        for offset_ns, image in ((-100_000_000, dark(rng)), (100_000_000, lit(uv, rng)), (140_000_000, lit(uv, rng))):
+            name = f"{len(rows):04d}.png"
+            cv2.imwrite(str(images / name), image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            rows.append((name, int(begins_ns[k]) + offset_ns))
+    (images / "timestamps.csv").write_text("file,stamp_ns\n" + "".join(f"{n},{s}\n" for n, s in rows))
+    write_table(
+        folder / "pulses.csv", cell.data.base_T_ee[:pulses], {"stamp_ns": begins_ns, "until_ns": begins_ns + PULSE_NS}
+    )
+
+
+def write_config(cell: Cell, folder: Path, endpoint: str | None, **sections: object) -> Path:
+    """A configuration beside the frames; ``endpoint``: where it listens, None: nothing is published."""
+    values = {
+        "robot": "cell",
+        "camera_name": "second",
+        "laser": {"calibration": str(cell.folder / "laser.yaml"), "pulses": "pulses.csv"},
+        "source": {"kind": "folder", "path": "images"},
+        "publish": {"enabled": False} if endpoint is None else {"listen": [endpoint]},
+        "recording": {"enabled": False},
+        **sections,
+    }
+    path = folder / "second.yaml"
+    path.write_text(yaml.safe_dump({key: value for key, value in values.items() if value is not None}))
+    return path
