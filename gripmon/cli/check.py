@@ -5,18 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import socket
-from collections.abc import Sized
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
-from gripmon.cli import common, expected, margins, sweep
+from gripmon.cli import common, expected, margins, outside, second_check, second_run, sweep
 
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.config.checks import View
-    from gripmon.sources import LiveSettings
 
 _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and print what the calibration expects
@@ -24,6 +19,9 @@ to see: where the fingertip corners are in the image (px), which of them and whi
 visible, how far away the gripper is (mm), how exact one frame will be along each axis, what the
 view can't tell apart (an unknown jaw opening and the distance), whether its corners suffice to
 calibrate anew, how far camera and jaws may move until too little is in view.
+
+Of a second camera (a configuration with a section laser): its calibration and what is known of its
+errors, and where frames and pulses come from.
 
 With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
 anyone drills a hole."""
@@ -37,10 +35,6 @@ _EXAMPLES = """\
 exit codes: 0 sound; 2 a fault in the configuration, in a file of Zenoh's that it names, or a package
 that it needs is missing (one line says file, key, what is wrong, what would be right); 3 the
 configuration is sound, but its camera can't be reached now"""
-
-_PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
-_CONNECT_S = 2.0
-_DOES = {"listen": "listens on", "connect": "connects to"}
 
 
 def add_parser(commands: Any) -> None:
@@ -58,8 +52,11 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.sweep:
         return sweep.run(arguments)
     sweep.refuse_without_sweep(arguments)
+    second = second_run.load(arguments.config)
+    if second is not None:
+        return second_check.run(second, as_json=arguments.json)
     config = common.load(arguments.config)
-    report = {**expectation(config), "zenoh": _zenoh_values(config), "source": _source_report(config)}
+    report = {**expectation(config), "zenoh": outside.zenoh_values(config), "source": outside.source_report(config)}
     print(json.dumps(report, indent=2) if arguments.json else _as_text(report))
     return common.EXIT_FAILED if report["source"]["reachable"] is False else common.EXIT_DONE
 
@@ -67,7 +64,6 @@ def run(arguments: argparse.Namespace) -> int:
 def expectation(config: Config) -> dict[str, Any]:
     """What the calibration expects to see, as plain values for JSON: metres, radians, px."""
     settings, gripper, view = config.settings, config.gripper, config.view()
-    metrics = settings.metrics
     return {
         "config": str(config.path),
         "robot": settings.robot,
@@ -94,23 +90,8 @@ def expectation(config: Config) -> dict[str, Any]:
         ],
         "accuracy": expected.accuracy(config),
         "in_view": margins.in_view(config),
-        "keys": f"gripmon/{settings.robot}/{settings.camera_name}/" if settings.publish.enabled else None,
-        "recording": settings.recording.directory if settings.recording.enabled else None,
-        "metrics": f"http://{metrics.address}:{metrics.port}/metrics" if metrics.enabled else None,
+        **outside.values(config),
     }
-
-
-def _zenoh_values(config: Config) -> dict[str, Any] | None:
-    """How the monitor would join the network; what can't be ends the command."""
-    from gripmon.config import ConfigError, check_network
-
-    try:
-        found = check_network(config)
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
-    if found is None:
-        return None
-    return {**found._asdict(), "file": None if found.file is None else str(found.file)}
 
 
 def _camera_values(config: Config) -> dict[str, Any]:
@@ -181,74 +162,7 @@ def _corner_values(names: tuple[str, ...], view: View) -> list[dict[str, Any]]:
     ]
 
 
-def _source_report(config: Config) -> dict[str, Any]:
-    """Kind, whether frames can come from it now (None: can't be told without starting it), and a few words."""
-    from gripmon.sources import FolderSettings, LiveSettings, NetworkSettings, VideoSettings, network_key
-    from gripmon.wire import Keys
-
-    source = config.settings.source
-    kind = type(source).__struct_config__.tag
-    if isinstance(source, FolderSettings | VideoSettings):
-        return {"kind": kind, "reachable": True, "detail": _first_frame(config)}
-    if isinstance(source, LiveSettings):
-        reachable, detail = _live_reachable(source)
-        return {"kind": kind, "reachable": reachable, "detail": detail}
-    if isinstance(source, NetworkSettings):
-        key = network_key(source, Keys(config.settings.robot, config.settings.camera_name)["image"])
-        return {
-            "kind": kind,
-            "reachable": None,
-            "detail": f"frames on {key}: can't be told without joining the network",
-        }
-    return {"kind": kind, "reachable": True, "detail": "made by this program"}
-
-
-def _first_frame(config: Config) -> str:
-    """Describe the first frame of recorded input; one that doesn't fit the camera ends the command."""
-    from gripmon.records import Frame
-    from gripmon.sources import SourceError, open_source
-
-    try:
-        source = open_source(config.settings.source, config.directory)
-    except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
-    frame = source.read()
-    source.close()
-    if not isinstance(frame, Frame) or frame.image is None:
-        raise common.CommandFailedError(
-            f"{config.path}: source.path: its first frame can't be read; a readable image", common.EXIT_FAILED
-        )
-    height_px, width_px = frame.image.shape[:2]
-    if (width_px, height_px) != (config.camera.width_px, config.camera.height_px):
-        raise common.CommandFailedError(
-            f"{config.path}: camera.width_px: {config.camera.width_px} x {config.camera.height_px} px; {frame.name} "
-            f"is {width_px} x {height_px}; the calibration that belongs to these images",
-            common.EXIT_USAGE,
-        )
-    count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
-    return f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
-
-
-def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
-    device = source.device
-    if isinstance(device, int) or device.isdecimal():
-        device = f"/dev/video{device}"
-    if device.startswith("/dev/"):
-        exists = Path(device).exists()
-        return exists, device if exists else f"{device} is not there now; run keeps trying"
-    address = urlsplit(device)
-    if address.scheme in _PORTS and address.hostname:
-        where = (address.hostname, address.port or _PORTS[address.scheme])
-        try:
-            with socket.create_connection(where, timeout=_CONNECT_S):
-                return True, f"{where[0]}:{where[1]} answers"
-        except OSError as error:
-            return False, f"{where[0]}:{where[1]} does not answer ({error.strerror or error}); run keeps trying"
-    return None, f"{device}: can't be told without starting it"
-
-
 def _as_text(report: dict[str, Any]) -> str:
-    source = report["source"]
     edges = [edge["id"] for edge in report["edges"] if edge["visible"]]
     seen = sum(corner["visible"] for corner in report["corners"])
     sections = {
@@ -259,27 +173,13 @@ def _as_text(report: dict[str, Any]) -> str:
         "edges": f"{len(edges)} of {len(report['edges'])} visible: {', '.join(edges)}",
         "corners": f"{seen} of {len(report['corners'])} visible:",
     }
-    outside = {
-        "source": f"{source['kind']}: {'NOT REACHABLE: ' if source['reachable'] is False else ''}{source['detail']}",
-        "Zenoh": _zenoh_line(report["keys"], report["zenoh"]),
-        "recording": report["recording"] or "off",
-        "metrics": report["metrics"] or "off",
-    }
     lines = [f"{report['config']}: sound"]
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
     lines += [_corner_line(corner) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
     lines += margins.in_view_lines(report["in_view"])
-    lines += [f"{name:<10} {text}" for name, text in outside.items()]
+    lines += outside.lines(report)
     return "\n".join(lines)
-
-
-def _zenoh_line(keys: str | None, session: dict[str, Any] | None) -> str:
-    if session is None:
-        return "off"
-    parts = [f"{keys}, {session['mode']}"]
-    parts += [f"{does} {', '.join(session[key])}" for key, does in _DOES.items() if session[key]]
-    return ", ".join(parts) + (f" (by {session['file']})" if session["file"] else "")
 
 
 def _camera_line(camera: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 import msgspec
 
-from gripmon.config import Config, load_config
+from gripmon.config import Config, SecondConfig, load_config
 from gripmon.config.errors import ConfigError
 from gripmon.config.yaml_file import as_yaml
 from gripmon.records import MonitorState, RecordedConfiguration, RecordedFile
@@ -41,6 +41,22 @@ def to_recorded(config: Config, start: MonitorState | None = None) -> RecordedCo
         values[role] = name
     files[config.path.name] = RecordedFile.of(as_yaml(values).encode())
     return RecordedConfiguration(config.path.name, files, start)
+
+
+def second_to_recorded(config: SecondConfig) -> RecordedConfiguration:
+    """The same of a second camera, with its laser calibration.  Raises OSError for a file that is there no more."""
+    values: dict[str, Any] = msgspec.to_builtins(config.settings)
+    values = {key: value for key, value in values.items() if key not in _LEFT_OUT}
+    name = config.calibration_path.name
+    name = name if name != config.path.name else f"laser-{name}"
+    values["source"] = _NO_SOURCE
+    values["laser"] = {key: value for key, value in values["laser"].items() if value is not None}
+    values["laser"] |= {"calibration": name, "pulses": "pulses-of-this-recording.csv"}
+    files = {
+        name: RecordedFile.of(config.calibration_path.read_bytes()),
+        config.path.name: RecordedFile.of(as_yaml(values).encode()),
+    }
+    return RecordedConfiguration(config.path.name, files)
 
 
 def from_recorded(recorded: RecordedConfiguration, folder: Path) -> Config:
