@@ -7,9 +7,9 @@ import pytest
 from laser_scenes import PAPER_LENS, paper_setup, sampled
 from scipy.stats import f as fisher_f
 
-from gripmon.calibration.laser import common_plane
+from gripmon.calibration.laser import common_plane, refinement
 from gripmon.calibration.laser.calibrating import Spots, calibrate
-from gripmon.calibration.laser.refinement import refine
+from gripmon.calibration.laser.refinement import FALSE_OUTLIERS, refine
 from gripmon.calibration.laser.setup import (
     PARAMETERS,
     LaserSetup,
@@ -171,3 +171,35 @@ def test_parameters_have_as_many_names_as_the_covariance_has_rows():
     found = refine(SpotProblem(data.camera, data.base_T_ee, uv), data.truth)
     assert found.covariance.shape == (len(PARAMETERS), len(PARAMETERS))
     assert found.camera == PAPER_LENS
+
+
+def test_a_spot_is_left_out_where_the_fit_to_all_others_says_so():
+    data, uv_px = noisy(22, orientations=3)
+    index, count = 7, len(uv_px)
+    others = np.arange(count) != index
+    alone = refine(SpotProblem(data.camera, data.base_T_ee[others], uv_px[others]), data.truth)
+    assert alone.used.all()
+    one = SpotProblem(data.camera, data.base_T_ee[[index]], uv_px[[index]])
+    row, miss = (part[0] for part in one.linearised(one.start(alone.setup)))
+    spread = alone.scale**2 * np.eye(2) + row @ alone.covariance @ row.T
+    decisions = []
+    for share in np.linspace(-1.0, 1.0, 9):  # from where the fit has it, by up to six standard deviations
+        off = spread @ np.linalg.solve(np.linalg.cholesky(spread).T, [6.0 * share, 0.0])
+        probability = fisher_f.sf(off @ np.linalg.solve(spread, off) / 2.0, 2, alone.degrees_of_freedom)
+        moved = uv_px.copy()
+        moved[index] += off - miss
+        found = refine(SpotProblem(data.camera, data.base_T_ee, moved), data.truth)
+        assert found.used[others].all()
+        if not 0.5 < probability / (FALSE_OUTLIERS / count) < 2.0:
+            assert found.used[index] == (probability > FALSE_OUTLIERS / count), share
+            decisions.append(found.used[index])
+    assert True in decisions and False in decisions
+
+
+def test_no_more_good_spots_are_left_out_than_is_said(monkeypatch):
+    monkeypatch.setattr(refinement, "FALSE_OUTLIERS", 0.1)
+    left = 0
+    for seed in range(60):
+        data, uv_px = noisy(seed, orientations=3)
+        left += int((~refine(SpotProblem(data.camera, data.base_T_ee, uv_px), data.truth).used).sum())
+    assert 1 <= left <= 13  # 6 are expected; one size and one scale for all left out three times as many
