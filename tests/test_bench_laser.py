@@ -45,10 +45,40 @@ def test_the_summary_is_honest_about_failures_and_bounds():
     assert with_failure["errors"]["refined"] == found["errors"]["refined"]
 
 
+def test_the_refined_one_alone_sees_the_same_data():
+    alone, all_of_them = (paper_trial(np.random.default_rng(4), 4, 0.5, refined_only=only) for only in (True, False))
+    assert list(alone.errors) == ["refined"]
+    assert alone.errors["refined"] == all_of_them.errors["refined"]
+    assert alone.bound == all_of_them.bound
+
+
+def test_intervals_of_the_figures_shrink_with_trials_and_hold_them():
+    rng = np.random.default_rng(6)
+    # Errors of exactly the bound: squared over bound is chi square of three degrees over three.
+    trials = [
+        Trial(
+            {"refined": (0.01, 0.01)}, squared=tuple(rng.chisquare(3, 2) / 3.0), bound=(1.0, 1.0),
+            covered=bool(rng.uniform() < 0.95), seconds=(0.03, 0.02), wall_s=0.06,
+        )
+        for _ in range(800)
+    ]  # fmt: skip
+    few, many = laser.summary(trials[:50]), laser.summary(trials)
+    for found in (few, many):
+        assert abs(found["over_bound"]["rotation"] - 1.0) < 3.0 * found["over_bound_sigma"]["rotation"]
+        low, high = found["coverage_interval"]
+        assert low < 0.95 < high
+    # The root's delta method: sd of chi square of three over three is sqrt(2 / 3), half of that through the root.
+    assert many["over_bound_sigma"]["rotation"] == pytest.approx(0.5 * np.sqrt(2.0 / 3.0 / 800), rel=0.15)
+    assert few["over_bound_sigma"]["rotation"] > 2.5 * many["over_bound_sigma"]["rotation"]
+    assert many["seconds"]["wall_99"] == pytest.approx(0.06)
+
+
 @pytest.fixture(scope="module")
 def results():
     return laser.measure(
-        laser.Plan(trials=2, real_trials=2, noises_px=(0.0, 0.5), orientations=(6,), wrong_shares=(0.0, 0.2))
+        laser.Plan(
+            trials=2, honesty_trials=3, real_trials=2, noises_px=(0.0, 0.5), orientations=(6,), wrong_shares=(0.0, 0.2)
+        )
     )
 
 
@@ -69,4 +99,14 @@ def test_a_figure_that_is_not_reached_is_said(results):
     worse["noise"][1]["errors"]["refined"]["translation"]["mean"] = 0.02
     verdict = {what: met for what, _, met in laser_report.verdicts(worse)}
     assert not verdict["refined under 1 % below 1 px"]
+    for key, value, what in (
+        ("coverage", 0.91, "coverage of the 95 % region 92 to 98 %"),
+        ("over_bound", {"translation": 1.0, "rotation": 1.11}, "refined RMSE within 1.1 of the bound"),
+    ):
+        one = copy.deepcopy(results)  # a single point that misses is enough
+        for row in one["honesty"]:
+            row["coverage"], row["over_bound"] = 0.95, {"translation": 1.0, "rotation": 1.0}
+        assert {w: met for w, _, met in laser_report.verdicts(one)}[what]
+        one["honesty"][1][key] = value
+        assert not {w: met for w, _, met in laser_report.verdicts(one)}[what]
     assert "NOT MET  refined under 1 % below 1 px: worst 2.00 %" in laser_report.as_text(worse)
