@@ -55,9 +55,10 @@ class LaserSetup:
 def basis(direction: Array) -> tuple[Array, Array]:
     """Two unit vectors (3,) that stand on a unit vector and on each other, right-handed with it; steady around it."""
     helper = np.eye(3)[int(np.argmin(np.abs(direction)))]
-    a = np.cross(direction, helper)
+    turn = skew(direction)  # by this, as np.cross of single vectors costs many times more
+    a = turn @ helper
     a /= np.linalg.norm(a)
-    return a, np.cross(direction, a)
+    return a, turn @ a
 
 
 def origin_axes(direction_ee: Array) -> tuple[int, int]:
