@@ -4,6 +4,9 @@ ring-down, vibration, creep and outliers against simulated truth.
 
 from __future__ import annotations
 
+import copy
+from functools import lru_cache
+
 import numpy as np
 import pytest
 from box_models import random_rotation
@@ -240,15 +243,21 @@ def test_what_quiet_time_taught_survives_forgetting():
     np.testing.assert_array_equal(average.learnt.walk, walk)
 
 
-def settled(covariance, seed=11, count=1800):
-    average = PoseAverage(SETTINGS)
+@lru_cache(maxsize=64)
+def kept_settled(seed, count):
+    covariance, average = spread(), PoseAverage(SETTINGS)
     run(correlated(np.random.default_rng(seed), covariance, count, 8.0, 0.5), covariance, average)
     return average
 
 
+def settled(seed=11, count=1800):
+    """An average after so many frames of covariance :func:`spread`; the caller's own."""
+    return copy.deepcopy(kept_settled(seed, count))
+
+
 def test_a_single_outlier_leaves_the_average_where_it_was_and_is_claimed_as_doubt():
     covariance = spread()
-    average = settled(covariance)
+    average = settled()
     before_T, before = average.cam_T_grip, average.claimed_covariance
     out = np.array([0.001, 0, 0, 0, 0, 0])
     average.add(moved(before_T, out), covariance)
@@ -265,7 +274,7 @@ def test_a_single_outlier_leaves_the_average_where_it_was_and_is_claimed_as_doub
 @pytest.mark.parametrize("axis", range(6))
 def test_a_jump_starts_the_average_anew_with_its_second_frame_from_both(axis: int):
     covariance = spread()
-    average = settled(covariance)
+    average = settled()
     jump = np.zeros(6)
     jump[axis] = 60.0 * np.sqrt(covariance[axis, axis])
     apart = np.linalg.cholesky(covariance)[:, axis]
@@ -276,7 +285,7 @@ def test_a_jump_starts_the_average_anew_with_its_second_frame_from_both(axis: in
 
 def test_two_outliers_that_contradict_each_other_are_not_averaged():
     covariance = spread()
-    average = settled(covariance)
+    average = settled()
     jump = np.array([0.001, 0, 0, 0, 0, 0])
     average.add(moved(TRUE, jump), covariance)
     average.add(moved(TRUE, -jump), covariance)
@@ -289,7 +298,7 @@ def test_after_a_step_that_others_noticed_the_average_is_that_of_the_frames_sinc
     step = 1.5 * np.linalg.cholesky(covariance)[:, 1]
     sizes = []
     for seed in range(30):
-        average = settled(covariance, seed, 240)
+        average = settled(seed, 240)
         run(step + noise(np.random.default_rng(500 + seed), covariance, count), covariance, average)
         average.step(count)
         miss = difference(TRUE, average.cam_T_grip) - step
@@ -316,7 +325,7 @@ def test_after_a_step_the_average_is_no_worse_than_the_frames(size_m: float, rin
     covariance = spread()
     truth, smoothed, raw, nees = bump(size_m, ring), [], [], []
     for seed in range(40):
-        average = settled(covariance, seed, 240)
+        average = settled(seed, 240)
         errors = correlated(np.random.default_rng(1000 + seed), covariance, 60, 8.0, 0.5)
         out, claimed = run(truth + errors, covariance, average)
         smoothed.append(out - truth)
@@ -337,7 +346,7 @@ def test_in_creep_the_average_does_not_fall_behind(speed_m_per_s: float):
     truth = np.outer(np.arange(600) * PERIOD_S, np.array([0.0, 1.0, 0.0, 8.0, 0.0, 0.0]) * speed_m_per_s)
     smoothed, raw, nees = [], [], []
     for seed in range(8):
-        average = settled(covariance, seed)
+        average = settled(seed)
         errors = correlated(np.random.default_rng(2000 + seed), covariance, 600, 8.0, 0.5)
         out, claimed = run(truth + errors, covariance, average, quiet=False)
         smoothed.append(out - truth)

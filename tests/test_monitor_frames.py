@@ -1,0 +1,59 @@
+"""What the monitor makes of single frames: rotations, what a frame brings, its trace, its time."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+from meters import moved
+from scipy.spatial.transform import Rotation
+from simulated import nominal_cam_T_grip
+from watched import frames_of, new_monitor, replaced
+
+from gripmon.records import AlertKind, Cause, Verdict, to_json
+
+
+def test_rotations_are_x_y_z_w_and_take_gripper_coordinates_to_the_camera():
+    frames, truths = frames_of("static")
+    turned = moved(nominal_cam_T_grip(), np.array([0.0, 0.0, 0.0, 0.004, -0.003, 0.005]))
+    record = new_monitor(cam_T_grip=turned).process(frames[0])
+    true = Rotation.from_matrix(truths[0].cam_T_grip[:3, :3]).as_quat()
+    told = np.array(record.cam_T_grip.rotation_xyzw)
+    assert abs(true[0]) > 0.2 and abs(true[3]) > 0.9, "a tilt about x: neither order nor direction can hide"
+    np.testing.assert_allclose(told * np.sign(told[3]), true * np.sign(true[3]), atol=2e-3)
+    np.testing.assert_allclose(record.cam_T_grip.translation_m, truths[0].cam_T_grip[:3, 3], atol=3e-4)
+
+
+def test_what_the_frame_brings_is_in_the_record():
+    frames, _ = frames_of("static")
+    record = new_monitor().process(frames[3])
+    assert (record.seq, record.stamp_ns, record.name) == (frames[3].seq, frames[3].stamp_ns, frames[3].name)
+    assert record.jaw_opening_m == pytest.approx(0.034, abs=1e-4)
+    assert record.latency_ns == 0 and record.reason is None
+
+
+def test_the_trace_belongs_to_the_newest_frame():
+    frames, truths = frames_of("static")
+    monitor = new_monitor()
+    assert monitor.trace() is None
+    monitor.process(frames[0])
+    trace = monitor.trace()
+    visible = truths[0].visible
+    np.testing.assert_allclose(trace.predicted_corners_uv_px[visible], truths[0].corner_uv_px[visible], atol=0.5)
+
+
+def test_time_is_the_frames_own_and_never_runs_backwards():
+    """Equal and earlier stamps count as no time: nothing raises and the average doesn't widen.  That the clock was set
+    back is said.
+    """
+    frames, _ = frames_of("static")
+    early, late = new_monitor(), new_monitor()
+    for frame in frames[:10]:
+        early.process(frame)
+        late.process(frame)
+    same = msgspec.structs.replace(early.process(replaced(frames[10], stamp_ns=frames[9].stamp_ns)), stamp_ns=0)
+    earlier = msgspec.structs.replace(late.process(replaced(frames[10], stamp_ns=frames[2].stamp_ns)), stamp_ns=0)
+    [alert] = earlier.alerts
+    assert (alert.kind, alert.cause, earlier.verdict) == (AlertKind.STREAM, Cause.CLOCK, Verdict.SUSPECT)
+    assert (same.alerts, same.verdict) == ((), Verdict.VALID)
+    assert to_json(same) == to_json(msgspec.structs.replace(earlier, alerts=(), verdict=Verdict.VALID))
