@@ -11,6 +11,7 @@ import hypothesis
 import pytest
 import zenoh
 from commanded import Loop, reply_to
+from long_files import LONGEST
 from loopback import free_endpoint, plain_session
 from published import Published
 
@@ -22,6 +23,15 @@ hypothesis.settings.load_profile("unhurried")
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Workers take file after file in this order."""
+    for name in LONGEST:
+        if not (Path(__file__).parent / f"{name}.py").exists():
+            raise pytest.UsageError(f"tests/long_files.py: there is no tests/{name}.py")
+    rank = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,55 @@
+"""The files whose tests take longest, to be begun first: a long one that is begun last keeps one worker busy alone.
+
+By the time that they take alone on a machine with two cores, from a minute down to some ten seconds; how exact the
+order is matters little.  ``tools/test --durations 100`` shows what has become long.
+"""
+
+from __future__ import annotations
+
+LONGEST = (
+    "test_sequential",
+    "test_cli",
+    "test_view",
+    "test_killed",
+    "test_laser_refinement",
+    "test_plane",
+    "test_simulated_sources",
+    "test_restart",
+    "test_whole_way",
+    "test_bench_wire",
+    "test_network_camera",
+    "test_smoothing",
+    "test_simulator_pictures",
+    "test_monitor",
+    "test_fleet_load",
+    "test_sweep",
+    "test_replay_commands",
+    "test_replay_recording",
+    "test_teach_page",
+    "test_teach_command",
+    "test_causes_images",
+    "test_demo",
+    "test_plane_average",
+    "test_calibrate_command",
+    "test_calibrate_models",
+    "test_calibrate_intrinsics",
+    "test_bench_accuracy",
+    "test_check_network",
+    "test_recording_faults",
+    "test_watch_command",
+    "test_search",
+    "test_bench",
+    "test_run_on_the_network",
+    "test_daemon_processes",
+    "test_bench_record",
+    "test_bench_smoothing",
+    "test_bench_frames",
+    "test_bench_accuracy_peers",
+    "test_ros2_processes",
+    "test_rendered",
+    "test_sampling",
+    "test_servo_loop",
+    "test_report_command",
+    "test_calibrate_plane",
+    "test_bad_frames",
+)
