@@ -16,7 +16,7 @@ function shown(name) {
   const put = corners.current.get(name);
   const seen = reply?.corners.find((corner) => corner.name === name);
   const found = reply && !reply.refused;
-  if (put?.hand) {
+  if (put?.hand && !state.corners_only) {
     const away = found && seen.uv_px ? Math.hypot(put.at[0] - seen.uv_px[0], put.at[1] - seen.uv_px[1]) : null;
     return { name, at: put.at, state: "hand", away };
   }
@@ -41,9 +41,11 @@ function show() {
 
 function tell() {
   if (state.corners_only) {
-    const inner = state.corners.filter((name) => name.includes("_inner_") && !corners.current.has(name)).length;
-    const todo = inner ? `${inner} of the 4 inner corners to go` : "the inner corners are there";
-    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${todo}. Nothing snaps or is foretold without a gripper file.`, inner ? "" : "good");
+    const inner = state.corners.filter((name) => name.includes("_inner_")), has = (name) => corners.current.has(name);
+    const todo = inner.filter((name) => !has(name)).length;
+    const alone = inner.filter((name) => has(name) && !["outer", "end", "rise"].some((other) => has(name.replace("inner", other))));
+    const wants = todo ? `${todo} of the 4 inner corners to go` : alone.length ? `${alone.join(", ")} still without` : "all are there";
+    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${wants}. Nothing snaps without a gripper file.`, todo || alone.length ? "" : "good");
   }
   const missing = state.needed - corners.current.size;
   if (!corners.current.size && missing > 0) {

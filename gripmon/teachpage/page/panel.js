@@ -31,7 +31,10 @@ export function begin(state) {
   }
   $("#folder").textContent = `\u200e${state.folder}`; // cut at its beginning, but read from left to right
   $("#folder").title = state.folder;
+  document.body.classList.toggle("rough", state.corners_only);
+  $("#names-drawn").toggleAttribute("hidden", !state.corners_only); // SVG has no property for it
   if (state.corners_only) {
+    $("#help-snap").hidden = $("#help-snap").nextElementSibling.hidden = true;
     for (const kind of ["config", "taught"]) $(`#save-${kind}`).parentElement.hidden = true;
     for (const part of ["#save-corners", "#corners thead", "#expected", "#legend"]) $(part).hidden = true;
     saved(null, false, state);

@@ -1,7 +1,7 @@
 // The image with zoom and pan, and what is drawn over it.  Pixel centres lie at whole coordinates.
 
 const SVG = "http://www.w3.org/2000/svg";
-const ENLARGED = 10, SIGMAS = 3, LARGEST = 64, LOUPE = 8;
+const ENLARGED = 10, SIGMAS = 3, LARGEST = 64, CLOSE = 5, LOUPE = 8;
 
 function make(tag, attributes = {}, parent = null) {
   const node = document.createElementNS(SVG, tag);
@@ -56,9 +56,13 @@ export class Stage {
   toStage([u, v]) { return [(u + 0.5) * this.scale + this.shift[0], (v + 0.5) * this.scale + this.shift[1]]; }
   toImage([x, y]) { return [(x - this.shift[0]) / this.scale - 0.5, (y - this.shift[1]) / this.scale - 0.5]; }
 
+  #whole() {
+    return Math.max(Math.min(this.root.clientWidth / this.size[0], this.root.clientHeight / this.size[1]), 1e-3);
+  }
+
   fit() {
     const { clientWidth: width, clientHeight: height } = this.root;
-    this.scale = Math.max(Math.min(width / this.size[0], height / this.size[1]), 1e-3);
+    this.scale = this.#whole();
     this.shift = [(width - this.scale * this.size[0]) / 2, (height - this.scale * this.size[1]) / 2];
     this.fitted = true;
     this.draw();
@@ -66,16 +70,16 @@ export class Stage {
 
   zoom(factor, about = [this.root.clientWidth / 2, this.root.clientHeight / 2]) {
     const before = this.toImage(about);
-    const least = 0.5 * Math.min(this.root.clientWidth / this.size[0], this.root.clientHeight / this.size[1]);
-    this.scale = Math.min(Math.max(this.scale * factor, least), LARGEST);
+    this.scale = Math.min(Math.max(this.scale * factor, 0.5 * this.#whole()), LARGEST);
     const after = this.toStage(before);
     this.shift = [this.shift[0] + about[0] - after[0], this.shift[1] + about[1] - after[1]];
     this.fitted = false;
     this.draw();
   }
 
-  centre(at, scale = Math.max(this.scale, 6)) {
-    this.scale = scale;
+  // Enlarged by what the image has to be shrunk or stretched by to be seen whole: a corner keeps its surroundings.
+  centre(at) {
+    this.scale = Math.min(Math.max(this.scale, CLOSE * this.#whole()), LARGEST);
     this.shift = [0, 0];
     const [x, y] = this.toStage(at);
     this.shift = [this.root.clientWidth / 2 - x, this.root.clientHeight / 2 - y];
