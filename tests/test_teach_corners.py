@@ -21,6 +21,7 @@ from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
 from gripmon.geometry import from_record, perturb, perturbation_between, to_record
+from gripmon.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import expect
 from gripmon.provenance import Provenance
@@ -84,12 +85,28 @@ def test_rough_corners_snap_to_the_true_ones(rig: Rig, bench: Bench, opening_m: 
         assert found.snapped.jaw_opening_m == pytest.approx(OPENING_M, abs=5.0 * (found.snapped.jaw_sigma_m or 0.0))
 
 
+def test_an_opening_that_nobody_reports_may_be_far_from_the_nominal_one(rig: Rig, tmp_path: Path):
+    """The same gripper, described with its jaws wide open."""
+    model = yaml.safe_load((rig.folder / "gripper.yaml").read_text())
+    model["jaw"]["nominal_m"] = 0.058
+    for name, at in zip(rig.gripper.point_ids, rig.gripper.points_grip_m(0.058).tolist(), strict=True):
+        model["points"][name]["xyz_m"] = at
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(model))
+    bench = Bench(rig.camera, load_gripper(tmp_path / "gripper.yaml"), MonitorSettings(), None)
+    snapped = bench.look(rig.image, put(rig.rough(*INNER)), (), None).snapped
+    assert snapped.refused is None and sum(corner.uv_px is not None for corner in snapped.corners) == 6
+    assert snapped.jaw_opening_m == pytest.approx(OPENING_M, abs=5.0 * (snapped.jaw_sigma_m or 0.0))
+
+
 def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
     good = rig.rough(*INNER)
     few = bench.look(rig.image, put({"L_in_near": good["L_in_near"]}), (), OPENING_M)
     assert few.snapped.refused == "put 3 more corners on the fingertips" and few.reference is None
     swapped = {**good, "L_in_near": good["R_in_near"], "R_in_near": good["L_in_near"]}
     assert "where the others put it" in str(bench.look(rig.image, put(swapped), (), OPENING_M).snapped.refused)
+    other = {name: good[f"{'R' if name[0] == 'L' else 'L'}{name[1:]}"] for name in good}
+    exchanged = bench.look(rig.image, put(other), (), OPENING_M)
+    assert "the fingers, or near and far, have each other's names" in str(exchanged.snapped.refused)
     empty = np.full_like(rig.image, 120)
     assert "no fingers are seen" in str(bench.look(empty, put(good), (), OPENING_M).snapped.refused)
     away = {name: [u, v - 150.0] for name, (u, v) in good.items()}

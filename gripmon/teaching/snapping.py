@@ -31,9 +31,14 @@ FARTHEST_SIGMAS = 6.0
 MISFIT_SIGMAS = (4.0, 12.0)
 """A corner so far from where all together put it is named where nothing is found; so far, it has another one's name."""
 
+CLEARLY = 1.25
+"""So much more has to agree with mirrored corners before they are said to be meant."""
+
 _SPREAD = 24  # poses about what the corners say
 _KEPT = (6, 3)  # of them, that are followed to the next finer zoom
 _USUAL_SHARE = 0.6
+_OPENINGS, _TOLD = 9, 4.0  # jaw openings tried, where nobody reports it; by so much another cost (χ²) tells one
+_ALIKE = 0.25  # of the smallest distance between two corners
 _NARROW = Patience(when_doubtful=False, when_lost=False)
 
 REASONS = {
@@ -97,21 +102,24 @@ class Snapper:
         ``put_px`` (name: (2,)) the corners put by hand; ``jaw_opening_m`` None where nobody reports it; ``known``: the
         prior is a calibration, so that no corner need be put.  Never raises for what the image shows or doesn't.
         """
-        start_m = self.gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+        start_m = self._opening(put_px, prior) if jaw_opening_m is None else jaw_opening_m
         placed = place(self.camera, self.gripper, start_m, put_px, prior)
         if not known and len(put_px) < FEWEST_PUT:
             left = FEWEST_PUT - len(put_px)
-            return self._rough(placed[0], jaw_opening_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
+            return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
         if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
-            return self._rough(placed[0], jaw_opening_m, misfit)
+            return self._rough(placed[0], start_m, misfit)
         found = self._found(image, placed, start_m, jaw_opening_m is not None)
+        if not known and self._mirrored_fits(image, put_px, start_m, jaw_opening_m is not None, prior, found):
+            why = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
+            return self._rough(placed[0], start_m, why)
         if found is None or not found.trusted:
             why = self._misfit(placed[0], MISFIT_SIGMAS[0]) or "no fingers are seen here; corners nearer to the tips"
-            return self._rough(placed[0], jaw_opening_m, why)
+            return self._rough(placed[0], start_m, why)
         away_px = self._away_px(found, put_px)
         if away_px > FARTHEST_SIGMAS * rough_sigma_px(self.camera):
             why = f"the edges found lie {away_px:.0f} px from your corners; corners nearer to the fingertips"
-            return self._rough(placed[0], jaw_opening_m, why)
+            return self._rough(placed[0], start_m, why)
         return self._measured(found, jaw_opening_m)
 
     def _found(
@@ -132,6 +140,38 @@ class Snapper:
             if best.consensus.share >= SURE_SHARE:
                 break
         return best
+
+    def _opening(self, put_px: Mapping[str, Array], prior: Prior) -> float:
+        """The jaw opening that the corners put by hand fit best, where they tell it from the nominal one."""
+        gripper = self.gripper
+        if not gripper.has_jaw or len(put_px) < FEWEST_PUT:
+            return gripper.jaw_nominal_m
+        tried = [gripper.jaw_nominal_m, *np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, _OPENINGS).tolist()]
+        costs = [place(self.camera, gripper, opening_m, put_px, prior)[0].cost for opening_m in tried]
+        best = int(np.argmin(costs))
+        return tried[best] if costs[best] < costs[0] - _TOLD else tried[0]
+
+    def _mirrored_fits(
+        self,
+        image: Image,
+        put_px: Mapping[str, Array],
+        opening_m: float,
+        reported: bool,
+        prior: Prior,
+        found: Measurement | None,
+    ) -> bool:
+        """Whether clearly more agrees with the corners of both fingers exchanged: four corners in a plane also have a
+        pose that sees them from behind.
+        """
+        worth = 0.0 if found is None else _worth(found)
+        twins = _twins(self.gripper, opening_m)
+        if worth >= SURE_SHARE or twins is None:
+            return False
+        placed = place(self.camera, self.gripper, opening_m, {twins[name]: at for name, at in put_px.items()}, prior)
+        if self._misfit(placed[0], MISFIT_SIGMAS[0]) is not None:
+            return False
+        other = self._found(image, placed, opening_m, reported)
+        return other is not None and other.trusted and _worth(other) > CLEARLY * worth
 
     def _measure(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, reported: bool) -> Measurement:
         meter = _Meter(self.camera, self.gripper, self._settings, self._jaw_sigma_m)
@@ -157,14 +197,15 @@ class Snapper:
         uv_px = self.camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
 
-    def _rough(self, placed: Placed, jaw_opening_m: float | None, why: str) -> Snapped:
+    def _rough(self, placed: Placed, opening_m: float, why: str) -> Snapped:
         pose = placed.cam_T_grip
         corners = tuple(
             SnappedCorner(name, at, None, None, None, None, REASONS[CornerFault.NO_FIT])
-            for name, at in self._corners_px(pose, jaw_opening_m).items()
+            for name, at in self._corners_px(pose, opening_m).items()
         )
-        outlines = outlines_px(self.camera, self.gripper, pose, jaw_opening_m)
-        return Snapped(pose, corners, outlines, np.zeros((0, 2)), 0.0, jaw_opening_m, None, why, None)
+        known_m = opening_m if self.gripper.has_jaw else None
+        outlines = outlines_px(self.camera, self.gripper, pose, opening_m)
+        return Snapped(pose, corners, outlines, np.zeros((0, 2)), 0.0, known_m, None, why, None)
 
     def _measured(self, found: Measurement, jaw_opening_m: float | None) -> Snapped:
         gripper = self.gripper
@@ -203,6 +244,18 @@ class Snapper:
         covariance_px = lens @ corners.covariance_xy[index] @ lens.T
         sigma_px = float(corners.sigma_px[index])
         return SnappedCorner(name, model_px, corners.uv_px[index], covariance_px, sigma_px, inliers, None)
+
+
+def _twins(gripper: Gripper, jaw_opening_m: float | None) -> dict[str, str] | None:
+    """Each corner's counterpart on the other finger; None where the fingers aren't each other's mirror image."""
+    at = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
+    apart = np.linalg.norm(at[:, None] * [-1.0, 1.0, 1.0] - at, axis=2)
+    nearest = apart.argmin(axis=1)
+    between = np.linalg.norm(at[:, None] - at, axis=2) + np.where(np.eye(len(at)), np.inf, 0.0)
+    if apart.min(axis=1).max() > _ALIKE * between.min() or (nearest[nearest] != np.arange(len(at))).any():
+        return None
+    names = gripper.corner_ids
+    return {name: names[twin] for name, twin in zip(names, nearest.tolist(), strict=True)}
 
 
 def outlines_px(
