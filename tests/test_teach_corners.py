@@ -294,6 +294,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
     bad = rough_file(rig, tmp_path / "nose.yaml", nose=[1.0, 2.0])
     (tmp_path / "flat.yaml").write_text("corners: {L_in_near: [1.0]}\n")
     rough = rough_file(rig, tmp_path / "rough.yaml")
+    (two := tmp_path / "two.yaml").write_text("corners: {L_in_near: [1.0, 2.0], L_in_far: [1.0, 20.0]}\n")
     given: list[object] = ["--camera", camera, "--gripper", gripper, "--out", tmp_path / "out"]
     page: list[object] = ["--page", *given]
     for arguments, said in (
@@ -312,6 +313,8 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "height_px"),
         ([*page], "no image; image files, or --page --live DEVICE"),
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
+        ([image, *page, "--live-wait", "3"], "--live-wait: goes with --live"),
+        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, or --reference FILE"),
         ([image, *page, "--corners", rough], "--page and --corners"),
         ([image, *page, "--config", camera], "--config has camera, gripper and reference already"),
         ([image, *page, "--jaw-opening", "0.2"], "jaw opening 0.2 m; the gripper's 0 to 0.06 m"),

@@ -285,11 +285,13 @@ def test_a_camera_of_another_size_or_none_is_said(rig: Rig, saving: Told):
     try:
         with pytest.raises(BadRequest, match="64x48 pixels; 768x576"):
             desk.live()
+        for_s, why = desk.dark()
+        assert for_s > 0.0 and "64x48 pixels" in why
         camera.answer = Frame(1, 1, rig.image, 0.034, "live")
         deadline = time.monotonic() + DEADLINE_S
         while not (data := shown(desk)):
             assert time.monotonic() < deadline
-        assert data.startswith(b"\xff\xd8")
+        assert data.startswith(b"\xff\xd8") and desk.dark() == (0.0, "")
         assert [one.name for one in desk.take()] == ["live-000.png"]
         assert desk.still(0).startswith(b"\x89PNG")
     finally:

@@ -87,6 +87,10 @@ def _add_corner_options(parser: argparse.ArgumentParser) -> None:
     page.add_argument("--page", action="store_true", help="teach on a local web page")
     page.add_argument("--corners", metavar="FILE", help="without a page: rough corners, `corners: {name: [u, v], …}`")
     page.add_argument("--live", metavar="DEVICE", help="with --page: a camera instead of images, as in source.device")
+    page.add_argument(
+        "--live-wait", type=common.positive_number, metavar="S",
+        help="give up when this camera has shown nothing for so long (s); default: never, the page says what is wrong",
+    )  # fmt: skip
     page.add_argument("--camera", metavar="FILE", help="without --config: the camera's calibration")
     page.add_argument("--gripper", metavar="FILE", help="without --config: the gripper file")
     page.add_argument("--reference", metavar="FILE", help="without --config: calibration of hand and eye, if there is")
@@ -152,7 +156,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise common.CommandFailedError(
             "teach: --config is missing; a configuration, or --page with --camera and --gripper", common.EXIT_USAGE
         )
-    for option in ("camera", "gripper", "reference", "robot", "camera_name"):
+    for option in ("camera", "gripper", "reference", "robot", "camera_name", "live_wait"):
         if getattr(arguments, option) is not None:
             name = option.replace("_", "-")
             raise common.CommandFailedError(f"teach: --{name} goes with --page or --corners", common.EXIT_USAGE)

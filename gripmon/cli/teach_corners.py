@@ -44,6 +44,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
         refuse("--page and --corners are two ways of the same; one of them")
     if arguments.live is not None and (arguments.images or not arguments.page):
         refuse("--live goes with --page, without images; image files otherwise")
+    if arguments.live_wait is not None and arguments.live is None:
+        refuse("--live-wait: goes with --live")
     if not arguments.images and arguments.live is None:
         refuse("no image; image files, or --page --live DEVICE")
     if arguments.corners is not None and len(arguments.images) > 1:
@@ -100,8 +102,10 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
         print("its address is the key to it: keep it to yourself; Ctrl-C, or Done on the page, ends it", flush=True)
         if not arguments.no_browser and _has_display():
             webbrowser.open(server.url)
-        while not server.done.wait(_LOOK_S):
-            pass  # an interrupt that another thread has caught is heard of here
+        while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
+            dark_s, why = desk.dark()
+            if arguments.live_wait is not None and dark_s > arguments.live_wait:
+                raise common.CommandFailedError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
     finally:
         server.close()
         desk.close()
@@ -118,10 +122,17 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
 
     from gripmon.cli.teach_inputs import read_rough
     from gripmon.cli.teach_saving import FileSaving
+    from gripmon.teaching.snapping import FEWEST_PUT
     from gripmon.teachpage import SavingRefused
     from gripmon.teachpage.messages import Put, SaveOrder
 
     rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
+    if inputs.bench.reference is None and len(rough) < FEWEST_PUT:
+        raise common.CommandFailedError(
+            f"{arguments.corners}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, or --reference FILE "
+            "(of gripmon calibrate plane)",
+            common.EXIT_USAGE,
+        )
     picture = inputs.pictures[0]
     corners = {name: np.array(at) for name, at in rough.items()}
     found = inputs.bench.look(picture.image, corners, (), picture.jaw_opening_m)

@@ -7,6 +7,7 @@ taken from a live camera belong to all of them.
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -87,6 +88,7 @@ class Desk:
         self._pictures = list(pictures)
         self._newest: Picture | None = None
         self._why_dark: str | None = None
+        self._seen_s = time.monotonic()
         self._lock = threading.Lock()  # one reckons at a time: OpenCV and NumPy would only hinder each other
         self._arrived = threading.Condition()
         self._ended = False
@@ -166,6 +168,13 @@ class Desk:
         """The live image as JPEG.  Raises :class:`BadRequest`."""
         return encoded(self._picture(None).image, ".jpg")
 
+    def dark(self) -> tuple[float, str]:
+        """For how long the live camera has shown nothing that can be used (s), and why; 0 without one."""
+        with self._arrived:
+            if self._live is None or self._newest is not None:
+                return 0.0, ""
+            return time.monotonic() - self._seen_s, self._why_dark or "the camera has sent nothing yet"
+
     def _found(self, put: Put, picture: Picture) -> Found:
         gripper = self._bench.gripper
         fault = rough_fault(put.corners, gripper)
@@ -201,7 +210,11 @@ class Desk:
     def _read(self) -> None:
         assert self._live is not None
         while not self._ended:
-            frame = self._live.read()
+            try:
+                frame = self._live.read()
+            except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
+                frame = Waiting(f"{self._labels.live}: {error}; gripmon teach anew")
+                self._ended = True
             if frame is None:
                 break
             with self._arrived:
@@ -211,6 +224,8 @@ class Desk:
                     self._why_dark = frame.reason
                 else:
                     self._newest = self._usable(frame)
+                if self._newest is not None:
+                    self._seen_s = time.monotonic()
                 self._arrived.notify_all()
 
     def _usable(self, frame: Frame) -> Picture | None:

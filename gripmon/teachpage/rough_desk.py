@@ -35,6 +35,10 @@ class RoughDesk:
     def close(self) -> None:
         """Nothing is held."""
 
+    def dark(self) -> tuple[float, str]:
+        """There is no camera that could show nothing."""
+        return 0.0, ""
+
     def state(self) -> State:
         height_px, width_px = self._picture.image.shape[:2]
         return State(
