@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
+
+from gripmon.records import Array
 
 
 class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -34,12 +38,29 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     limit_m: Annotated[
         float, Meta(gt=0.0, le=1.0, description="shift of the spots from which a motion is an error (m)")
     ] = 5e-3
-    lost_pulses: Annotated[
-        int, Meta(ge=2, le=1000, description="pulses in a row without the spot after which it is lost")
-    ] = 4
+    lost_pulses: (
+        Annotated[
+            int,
+            Meta(ge=2, le=1000, description="pulses in a row without the spot after which it is lost"),
+        ]
+        | None
+    ) = None
+    """Absent: as many as wrong spots make rarer than false alarms may be."""
     confirm_pulses: Annotated[
         int, Meta(ge=1, le=1000, description="good pulses after a start, or after lost ones, until it counts as valid")
     ] = 2
     update_alert_s: Annotated[
         float, Meta(ge=0.0, le=3600.0, description="an open alert that changes is updated so often at most (s)")
     ] = 2.0
+
+    @property
+    def pulses_until_lost(self) -> int:
+        """Pulses in a row."""
+        if self.lost_pulses is not None:
+            return self.lost_pulses
+        return max(math.ceil(math.log(1e-3 * self.false_alarms_per_1000_pulses) / math.log(self.wrong_spots)), 2)
+
+    @property
+    def arm_covariance(self) -> Array:
+        """(6, 6) of a pose that the arm reports, position then rotation."""
+        return np.diag(np.square([self.arm_noise_m] * 3 + [self.arm_noise_rad] * 3))
