@@ -70,9 +70,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
     second = second_run.load(arguments.config)
     if second is not None:
-        _refuse_for_second(arguments)
+        if arguments.fresh_state:
+            text = f"run: --fresh-state is for wrist cameras, {arguments.config} is a second camera's; leave it out"
+            raise common.CommandFailedError(text, common.EXIT_USAGE)
         out = None if arguments.out is None else common.make_directory(Path(arguments.out))
-        return second_run.run_second(second, out=out, duration_s=arguments.duration, verbose=arguments.verbose)
+        return second_run.run_second(
+            second, out=out, duration_s=arguments.duration, verbose=arguments.verbose, view=arguments.view
+        )
     config = common.load(arguments.config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
     return run_daemon(
@@ -84,14 +88,6 @@ def run(arguments: argparse.Namespace) -> int:
         fresh_state=arguments.fresh_state,
         view=arguments.view,
     )
-
-
-def _refuse_for_second(arguments: argparse.Namespace) -> None:
-    """Options that mean nothing for a second camera."""
-    for option, given in (("--fresh-state", arguments.fresh_state), ("--view", arguments.view is not None)):
-        if given:
-            text = f"run: {option} is for wrist cameras, {arguments.config} is a second camera's; leave it out"
-            raise common.CommandFailedError(text, common.EXIT_USAGE)
 
 
 def run_daemon(

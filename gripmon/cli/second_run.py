@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli import common
+from gripmon.cli.viewing import LiveView
 
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from gripmon.wire import Link
 
 _log = logging.getLogger(__name__)
+_PATIENCE_S = 30.0  # recorded frames outrun any camera: they wait for the recording rather than be dropped
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,7 +44,9 @@ def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
         raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
 
 
-def run_second(config: SecondConfig, *, out: Path | None, duration_s: float | None, verbose: bool) -> int:
+def run_second(
+    config: SecondConfig, *, out: Path | None, duration_s: float | None, verbose: bool, view: str | None = None
+) -> int:
     """Open everything that the configuration names and run the daemon on it; returns the exit code."""
     import cv2
 
@@ -55,14 +59,17 @@ def run_second(config: SecondConfig, *, out: Path | None, duration_s: float | No
         common.check_file(lines)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
-    with daemon.sigterm_exits(), contextlib.ExitStack() as opened:
+    live = None if view is None else LiveView(settings.view, view, str(config.path))
+    with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()
         network = _open_network(config)
         opened.callback(network.publisher.close)
         publisher = _with_metrics(config, network.publisher)
         opened.callback(publisher.close)
-        recorder = open_recorder(config, out)
+        recorder = _open_recorder(config, out, live)
         opened.callback(recorder.close)
+        if live is not None:
+            live.open(viewed)
         source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run_second(
@@ -149,8 +156,35 @@ def _open_source(config: SecondConfig, link: Link | None) -> Source:
         raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 
 
-def open_recorder(config: SecondConfig, out: Path | None) -> SpotRecorder:
+def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None) -> SpotRecorder:
     """The recording that the configuration wants; ends the command with exit code 2 where it can't be made."""
-    from gripmon.recording import NullRecorder
+    from gripmon.config.recorded import second_to_recorded
+    from gripmon.recording import open_spot_recorder
+    from gripmon.sources import FolderSettings, VideoSettings
 
-    return NullRecorder()
+    settings = config.settings
+    try:
+        configuration = second_to_recorded(config)
+    except OSError as error:
+        text = f"{config.path}: {error.filename}: can't be read any more ({error.strerror})"
+        raise common.CommandFailedError(text, common.EXIT_USAGE) from None
+    recorded = isinstance(settings.source, FolderSettings | VideoSettings)
+    try:
+        return open_spot_recorder(
+            settings.recording,
+            robot=settings.robot,
+            camera_name=settings.camera_name,
+            calibration=config.calibration,
+            directory=out,
+            patience_s=_PATIENCE_S if recorded else 0.0,
+            configuration=configuration,
+            view=None if live is None else live.settings,
+        )
+    except OSError as error:
+        if out is not None:
+            raise common.not_writable(out, error) from None
+        raise common.CommandFailedError(
+            f"{config.path}: recording.directory: {settings.recording.directory} can't be made ({error.strerror}); "
+            "a folder that may be written",
+            common.EXIT_USAGE,
+        ) from None

@@ -23,14 +23,14 @@ from gripmon.metrics import MetricsSettings
 from gripmon.pulses.settings import PulseSettings
 from gripmon.pulses.told import Told
 from gripmon.pulses.watching import PulsedWatch
-from gripmon.recording import RecordingSettings
+from gripmon.recording import RecordingSettings, ViewSettings
 from gripmon.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
 from gripmon.sources.pulses import read_pulses
 from gripmon.spotwatch import SpotWatchSettings
 from gripmon.wire import Joining, PublishSettings
 
 SECTION = "laser"
-_OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state", "view")
+_OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")
 
 
 class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -70,6 +70,7 @@ class SecondSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     source: SourceSettings
     publish: PublishSettings = PublishSettings()
     recording: RecordingSettings = RecordingSettings()
+    view: ViewSettings = ViewSettings()
     metrics: MetricsSettings = MetricsSettings()
     daemon: DaemonSettings = DaemonSettings()
 

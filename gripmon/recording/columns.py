@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from gripmon.recording.wire import TraceNote
-from gripmon.records import FrameRecord, Limits
+from gripmon.records import FrameRecord, Limits, SpotRecord
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +37,17 @@ class Row:
     limits: Limits | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class SpotRow:
+    """A pulse of a second camera's laser."""
+
+    record: SpotRecord
+    picture: Picture | None
+
+
+AnyRow = Row | SpotRow
+
+
 class Sender:
     """Sends columns with both timelines."""
 
@@ -55,14 +66,14 @@ class Sender:
             indexes.insert(0, rr.TimeColumn("capture_time", timestamp=times))
         self.stream.send_columns(path, indexes, columns)
 
-    def frames(self, path: str, rows: Sequence[Row], columns: rr.ComponentColumnList) -> None:
+    def frames(self, path: str, rows: Sequence[AnyRow], columns: rr.ComponentColumnList) -> None:
         self.columns(path, [r.record.stamp_ns for r in rows], [r.record.seq for r in rows], columns)
 
-    def scalars(self, path: str, rows: Sequence[Row], values: Sequence[Sequence[float]]) -> None:
+    def scalars(self, path: str, rows: Sequence[AnyRow], values: Sequence[Sequence[float]]) -> None:
         """Several curves; a row without values leaves a gap in them."""
         flat = np.array([v for some in values for v in some], dtype=np.float64)
         self.frames(path, rows, rr.Scalars.columns(scalars=flat).partition([len(some) for some in values]))
 
-    def curve(self, path: str, rows: Sequence[Row], values: Sequence[float | None]) -> None:
+    def curve(self, path: str, rows: Sequence[AnyRow], values: Sequence[float | None]) -> None:
         """One curve; None leaves a gap in it."""
         self.scalars(path, rows, [() if value is None else (value,) for value in values])

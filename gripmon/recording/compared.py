@@ -67,7 +67,7 @@ class ComparedRecorder:
         _name_both(stream)
         self._rows: list[Row] = []
         self._rows_then: list[Row] = []
-        self._events = Events(references=[scene.reference])
+        self._events = Events.at_first(scene.reference)
         self._events_then = Events(commands=list(source.commands))
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:

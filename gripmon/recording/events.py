@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import rerun as rr
 
 from gripmon.recording import palette
-from gripmon.recording.columns import Row, Sender
+from gripmon.recording.columns import AnyRow, Sender
 from gripmon.recording.wire import Events
 from gripmon.records import (
     Alert,
@@ -53,7 +53,7 @@ class EventWriter:
         """Say state and verdict again with the next frame, changed or not."""
         self._state = self._verdict = ""
 
-    def write(self, rows: Sequence[Row], events: Events, more: Sequence[Line]) -> None:
+    def write(self, rows: Sequence[AnyRow], events: Events, more: Sequence[Line]) -> None:
         """``more`` are lines for the log that others have."""
         if rows:
             self._newest_stamp_ns = rows[-1].record.stamp_ns
@@ -85,7 +85,7 @@ class EventWriter:
         whole = rr.AnyValues.columns(json=[to_json(message).decode() for message in messages])
         self._send.columns(path, stamps_ns, [message.seq for message in messages], whole)
 
-    def _status(self, rows: Sequence[Row]) -> list[Line]:
+    def _status(self, rows: Sequence[AnyRow]) -> list[Line]:
         """State and verdict where they change, and what happened as text."""
         lines = []
         for row in rows:

@@ -13,14 +13,25 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
+from gripmon.calibration.laser.document import LaserCalibration
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.health import Health
 from gripmon.recording.process import WorkerProcess
-from gripmon.recording.recorder import Notes, NullRecorder, Recorder, Trace
+from gripmon.recording.recorder import Notes, NullRecorder, Recorder, SpotRecorder, Trace
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
-from gripmon.recording.wire import EncodedBatch, Events, FrameNote, ImageNote, ImageRing, Scene, make_scene, pack_trace
+from gripmon.recording.wire import (
+    EncodedBatch,
+    Events,
+    FrameNote,
+    ImageNote,
+    ImageRing,
+    Scene,
+    make_scene,
+    make_spot_scene,
+    pack_trace,
+)
 from gripmon.records import (
     AlertRecord,
     Frame,
@@ -31,6 +42,7 @@ from gripmon.records import (
     RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
+    SpotRecord,
     State,
     StateRecord,
     Verdict,
@@ -53,7 +65,7 @@ Truth = Callable[[int], Vector | None]
 class _Waiting(NamedTuple):
     """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert."""
 
-    record: FrameRecord
+    record: FrameRecord | SpotRecord
     counted: bool
     image: Image | None
     trace: MeasurementTrace | None
@@ -101,6 +113,29 @@ def open_recorder(
     scene = make_scene(settings, where, name, robot, camera_name, camera, gripper, reference, has_truth, configuration)
     scene = msgspec.structs.replace(scene, view=view)
     return ProcessRecorder(scene, truth_tcp_m, patience_s)
+
+
+def open_spot_recorder(
+    settings: RecordingSettings,
+    *,
+    robot: str,
+    camera_name: str,
+    calibration: LaserCalibration,
+    directory: Path | None = None,
+    patience_s: float = 0.0,
+    configuration: RecordedConfiguration | None = None,
+    view: ViewSettings | None = None,
+) -> SpotRecorder:
+    """The same for a second camera: every pulse with its image."""
+    if not settings.enabled and view is None:
+        return NullRecorder()
+    folder = Path(settings.directory) if directory is None else directory
+    if settings.enabled:
+        folder.mkdir(parents=True, exist_ok=True)
+    name = f"{robot}-{camera_name}-{datetime.datetime.now(datetime.UTC):%Y%m%dT%H%M%SZ}"
+    every = msgspec.structs.replace(settings, image_every=1)
+    scene = make_spot_scene(every, str(folder.resolve()), name, robot, camera_name, calibration, configuration)
+    return ProcessRecorder(msgspec.structs.replace(scene, view=view), None, patience_s)
 
 
 class ProcessRecorder:
@@ -187,7 +222,11 @@ class ProcessRecorder:
         worker = self._worker
         return None if worker is None else worker.pid
 
-    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+    def spot(self, record: SpotRecord, image: Image | None) -> None:
+        """Record a pulse of a second camera's laser, from the loop's thread."""
+        self.offer(Frame(record.seq, record.stamp_ns, image), record, lambda: None)
+
+    def offer(self, frame: Frame, record: FrameRecord | SpotRecord, trace: Trace, notes: Notes | None = None) -> None:
         """Record a frame, from the loop's thread; its image and trace only as often as configured, and at events."""
         if self._patience_s > 0.0:
             self._wait_for_room()

@@ -15,13 +15,13 @@ from typing import Any
 import rerun as rr
 
 from gripmon.recording.budget import DiskBudget, claim, space_missing
-from gripmon.recording.columns import Row
+from gripmon.recording.columns import AnyRow
 from gripmon.recording.layout import layout_file
 from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
 from gripmon.recording.repair import repair
 from gripmon.recording.ring import Moments
-from gripmon.recording.rows import RowWriter
 from gripmon.recording.wire import Events, Scene
+from gripmon.recording.writers import Writer, make_writer
 from gripmon.records import AlertRecord
 
 APPLICATION_ID = "gripmon"
@@ -49,7 +49,7 @@ class _File:
     frames: int = 0
     whole_bytes: int = 0
 
-    def cover(self, rows: Sequence[Row]) -> None:
+    def cover(self, rows: Sequence[AnyRow]) -> None:
         stamps_ns = [row.record.stamp_ns for row in rows]
         known_ns = [stamp_ns for stamp_ns in (self.first_ns, self.last_ns) if stamp_ns is not None]
         if stamps_ns:
@@ -82,9 +82,9 @@ class FileSeries:
         self._ended: deque[_File] = deque(maxlen=_SPANS_KEPT)
         self._file: _File | None = None
         self._stream: rr.RecordingStream | None = None
-        self._writer: RowWriter | None = None
-        self._rows: list[Row] = []
-        self._late: list[Row] = []
+        self._writer: Writer | None = None
+        self._rows: list[AnyRow] = []
+        self._late: list[AnyRow] = []
         self._events = Events()
         self._newest_reference = scene.reference
         self._unflushed = 0
@@ -105,10 +105,10 @@ class FileSeries:
     def frames_waiting(self) -> int:
         return len(self._rows)
 
-    def add_frames(self, rows: Sequence[Row]) -> None:
+    def add_frames(self, rows: Sequence[AnyRow]) -> None:
         self._rows += rows
 
-    def add_pictures(self, rows: Sequence[Row]) -> None:
+    def add_pictures(self, rows: Sequence[AnyRow]) -> None:
         """Pictures of frames that were added before without them."""
         self._late += rows
 
@@ -250,7 +250,7 @@ class FileSeries:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
             stream.log_file_from_contents("layout.rbl", self._layout)
-            writer = RowWriter(stream, self._scene, number)
+            writer = make_writer(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
             del stream
@@ -260,7 +260,7 @@ class FileSeries:
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
         if self._newest_reference not in self._events.references:
-            self._events = Events(references=[self._newest_reference]) + self._events
+            self._events = Events.at_first(self._newest_reference) + self._events
         self._stream, self._writer = stream, writer
         self._file = _File(path, claim(path), time.monotonic())
         self.failure = None

@@ -40,10 +40,7 @@ def write(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
     normal = turn @ setup.normal_cam
     middle = np.median(spots[seen], axis=0)
     side = max(1.3 * float(np.linalg.norm(spots[seen] - middle, axis=1).max()), 0.01)
-    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
-    first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
-    corners = middle + side * np.array([first + second, first - second, -first - second, -first + second])
+    corners = plane_corners(normal, middle, side)
     log("base/plane", rr.Mesh3D(vertex_positions=corners, triangle_indices=[[0, 1, 2], [0, 2, 3]],
                                 albedo_factor=_PLANE))  # fmt: skip
     log("base/camera", rr.Transform3D(translation=centre, mat3x3=turn))
@@ -56,3 +53,12 @@ def write(path: Path, refined: Refined, base_T_ee: Array, uv_px: Array) -> None:
     log("base/camera/image/residuals", rr.LineStrips2D(lines, colors=_LEFT_OUT))
     recording.flush()
     recording.disconnect()
+
+
+def plane_corners(normal: Array, middle: Array, side: float) -> Array:
+    """Corners (4, 3) of a square on a plane, ``side`` is half of its own, m."""
+    first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    out: Array = middle + side * np.array([first + second, first - second, -first - second, -first + second])
+    return out

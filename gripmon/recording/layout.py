@@ -9,6 +9,7 @@ import rerun.blueprint as rrb
 
 from gripmon.recording import palette
 from gripmon.recording.overlay import IMAGE
+from gripmon.recording.spot_layout import spot_blueprint
 from gripmon.recording.wire import Scene
 
 _EYE = (0.66, -0.36, -0.03)  # beside and above, so that camera and gripper are both in sight
@@ -31,6 +32,11 @@ def layout_file(scene: Scene, application_id: str) -> bytes:
 
 
 def make_blueprint(scene: Scene) -> rrb.Blueprint:
+    """What opens with a recording of either kind of camera."""
+    return _wrist_blueprint(scene) if scene.laser is None else spot_blueprint(scene)
+
+
+def _wrist_blueprint(scene: Scene) -> rrb.Blueprint:
     """Left the image with its overlay and the events; right the rig in space, then what is judged: the TCP's drift
     against its limits, the drift test's statistic against its threshold, and what followed, the states.
     """
@@ -81,7 +87,7 @@ def _events() -> rrb.TextLogView:
 
 def rig_view(scene: Scene) -> rrb.Spatial3DView:
     """Camera and gripper in space."""
-    tcp_m = np.array(scene.reference.cam_T_grip.translation_m)
+    tcp_m = scene.tcp_m
     distance_m = float(np.linalg.norm(tcp_m))
     target_m = _LOOK_AT * tcp_m
     eye = rrb.EyeControls3D(

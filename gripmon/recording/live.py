@@ -13,12 +13,12 @@ from collections.abc import Sequence
 
 import rerun as rr
 
-from gripmon.recording.columns import Row
+from gripmon.recording.columns import AnyRow
 from gripmon.recording.files import APPLICATION_ID
 from gripmon.recording.layout import make_blueprint
-from gripmon.recording.rows import RowWriter
 from gripmon.recording.view import LOOPBACK, ViewSettings
 from gripmon.recording.wire import Events, Scene
+from gripmon.recording.writers import Writer, make_writer
 
 _FLUSH_TIMEOUT_S = 1.0
 _REPEAT_S = 60.0  # what only changes say is said again, for viewers that join when it has been dropped
@@ -33,25 +33,25 @@ class LiveStream:
     def __init__(self, scene: Scene, settings: ViewSettings):
         self._scene, self._settings = scene, settings
         self._lock = threading.Condition()  # guards what follows
-        self._rows: list[Row] = []
-        self._late: list[Row] = []
-        self._events = Events(references=[scene.reference])
+        self._rows: list[AnyRow] = []
+        self._late: list[AnyRow] = []
+        self._events = Events.at_first(scene.reference)
         self._due = self._ending = False
         # Of the thread alone.
         self._newest_reference = scene.reference
         self._stream: rr.RecordingStream | None = None
-        self._writer: RowWriter | None = None
+        self._writer: Writer | None = None
         self._repeat_at = self._retry_at = 0.0
         self._stalled = False
         self.failure: str | None = None
         self._thread = threading.Thread(target=self._run, name="live view", daemon=True)
         self._thread.start()
 
-    def add_frames(self, rows: Sequence[Row]) -> None:
+    def add_frames(self, rows: Sequence[AnyRow]) -> None:
         with self._lock:
             self._rows = self._bounded(self._rows + list(rows))
 
-    def add_pictures(self, rows: Sequence[Row]) -> None:
+    def add_pictures(self, rows: Sequence[AnyRow]) -> None:
         """Pictures of frames that were added before without them."""
         with self._lock:
             self._late = self._bounded(self._late + list(rows))
@@ -60,7 +60,7 @@ class LiveStream:
         with self._lock:
             self._events += events
 
-    def _bounded(self, rows: list[Row]) -> list[Row]:
+    def _bounded(self, rows: list[AnyRow]) -> list[AnyRow]:
         """The newest of them, as many as may wait."""
         left_bytes, kept = _WAITING_SHARE * self._settings.memory_limit_bytes, 0
         for row in reversed(rows[-_MOST_ROWS:]):
@@ -99,7 +99,7 @@ class LiveStream:
             self._stream.disconnect()
         self._stream = self._writer = None
 
-    def _send(self, rows: list[Row], late: list[Row], events: Events) -> None:
+    def _send(self, rows: list[AnyRow], late: list[AnyRow], events: Events) -> None:
         """Begin, or begin again, where that is due; nothing more goes to a server that a viewer holds up."""
         now_s = time.monotonic()
         if self._writer is None and now_s < self._retry_at:
@@ -111,7 +111,7 @@ class LiveStream:
                     self._repeat_at = now_s + _REPEAT_S
                     writer.repeat()
                     if self._newest_reference not in events.references:
-                        events = Events(references=[self._newest_reference]) + events
+                        events = Events.at_first(self._newest_reference) + events
                 writer.write(rows, events)
                 writer.write_pictures(late)
             self._flush(stream)
@@ -137,14 +137,14 @@ class LiveStream:
         if was_stalled and not self._stalled:
             self._repeat_at = 0.0  # changes may have been among what was not shown
 
-    def _begun(self) -> tuple[rr.RecordingStream, RowWriter]:
+    def _begun(self) -> tuple[rr.RecordingStream, Writer]:
         if self._stream is None or self._writer is None:
             limit = f"{self._settings.memory_limit_bytes}B"
             stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
             stream.set_sinks(rr.GrpcServerSink(LOOPBACK, self._settings.port, server_memory_limit=limit))
             stream.send_recording_name(f"{self._scene.name} (live)")
             stream.send_blueprint(make_blueprint(self._scene), make_active=True, make_default=True)
-            self._stream, self._writer = stream, RowWriter(stream, self._scene, 0)
+            self._stream, self._writer = stream, make_writer(stream, self._scene, 0)
             self._repeat_at = 0.0
         return self._stream, self._writer
 
@@ -159,10 +159,10 @@ class NoFiles:
     def __init__(self) -> None:
         self.frames_written = 0
 
-    def add_frames(self, rows: Sequence[Row]) -> None:
+    def add_frames(self, rows: Sequence[AnyRow]) -> None:
         self.frames_written += len(rows)
 
-    def add_pictures(self, rows: Sequence[Row]) -> None:
+    def add_pictures(self, rows: Sequence[AnyRow]) -> None:
         pass
 
     def add_events(self, events: Events) -> None:

@@ -33,7 +33,7 @@ class RigWriter:
         self._edges = np.array(scene.edges, dtype=np.intp).reshape(-1, 2)
         self._triangles, self._face_points = _triangulate(scene.faces)
         self._drawn: tuple[float, Verdict] | None = None
-        distance_m = float(np.linalg.norm(scene.reference.cam_T_grip.translation_m))
+        distance_m = float(np.linalg.norm(scene.tcp_m))
         send.static("rig", rr.ViewCoordinates.RDF)
         send.static(
             "rig/camera",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 
-from gripmon.recording.columns import Row
+from gripmon.recording.columns import AnyRow
 from gripmon.records import Alert, AlertEvent, AlertKind, AlertRecord, Severity
 
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
@@ -59,13 +59,13 @@ class PictureRing:
 
     def __init__(self, span_ns: int, limit_bytes: int) -> None:
         self._span_ns, self._limit_bytes = span_ns, limit_bytes
-        self._rows: deque[Row] = deque()
+        self._rows: deque[AnyRow] = deque()
         self.bytes = 0
 
     def __len__(self) -> int:
         return len(self._rows)
 
-    def push(self, row: Row) -> None:
+    def push(self, row: AnyRow) -> None:
         rows, stamp_ns = self._rows, row.record.stamp_ns
         if rows and stamp_ns < rows[-1].record.stamp_ns:
             rows.clear()  # a clock that was set back: how old the others are, nobody knows
@@ -75,10 +75,10 @@ class PictureRing:
         while rows and (self.bytes > self._limit_bytes or stamp_ns - rows[0].record.stamp_ns > self._span_ns):
             self.bytes -= _size(rows.popleft())
 
-    def take(self, moments: Moments) -> list[Row]:
+    def take(self, moments: Moments) -> list[AnyRow]:
         """Remove and return what lies around the moments, in order."""
-        taken: list[Row] = []
-        rest: deque[Row] = deque()
+        taken: list[AnyRow] = []
+        rest: deque[AnyRow] = deque()
         for row in self._rows:
             (taken if moments.near(row.record.stamp_ns) else rest).append(row)
         self._rows = rest
@@ -86,5 +86,5 @@ class PictureRing:
         return taken
 
 
-def _size(row: Row) -> int:
+def _size(row: AnyRow) -> int:
     return 0 if row.picture is None else len(row.picture.blob)

@@ -47,7 +47,7 @@ class RowWriter:
         self._rig = RigWriter(self._send, scene)
         self._references: list[ReferenceRecord] = []
         self._log_static(scene)
-        self._log_origin(scene, file_number)
+        log_origin(self._send, scene, file_number)
 
     def write(self, rows: Sequence[Row], events: Events) -> None:
         """Send everything that was gathered since the last call.
@@ -91,27 +91,28 @@ class RowWriter:
     def _log_static(self, scene: Scene) -> None:
         self._send.static("about", rr.TextDocument(_about(scene), media_type="text/markdown"))
 
-    def _log_origin(self, scene: Scene, file_number: int) -> None:
-        """What this file is, and what the monitor ran with: each file stands alone."""
-        meta = Meta(
-            name=scene.name,
-            recording_id=scene.recording_id,
-            robot=scene.robot,
-            camera=scene.camera,
-            gripper=scene.gripper,
-            version=scene.version,
-            file_number=file_number,
-            started_ns=time.time_ns(),
-            image_policy=image_policy(scene.settings),
-            has_truth=scene.has_truth,
-        )
-        self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
-        if scene.configuration is not None:
-            self._send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
-
     def _records(self, rows: Sequence[Row]) -> None:
         lines = [to_json(row.record).decode() for row in rows]
         self._send.frames("record", rows, rr.AnyValues.columns(json=lines))
+
+
+def log_origin(send: Sender, scene: Scene, file_number: int) -> None:
+    """What this file is, and what the monitor ran with: each file stands alone."""
+    meta = Meta(
+        name=scene.name,
+        recording_id=scene.recording_id,
+        robot=scene.robot,
+        camera=scene.camera,
+        gripper=scene.gripper,
+        version=scene.version,
+        file_number=file_number,
+        started_ns=time.time_ns(),
+        image_policy=image_policy(scene.settings),
+        has_truth=scene.has_truth,
+    )
+    send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
+    if scene.configuration is not None:
+        send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
 
 
 def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:

@@ -11,18 +11,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibration.laser.document import LaserCalibration
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
 from gripmon.records import (
     AlertRecord,
+    Array,
     FrameRecord,
     Limits,
     MeasurementTrace,
     RecordedCommand,
     RecordedConfiguration,
     ReferenceRecord,
+    SpotRecord,
     StateRecord,
 )
 
@@ -56,11 +59,18 @@ class Scene(msgspec.Struct, frozen=True):
     jaw_nominal_m: float
     jaw_openings_m: tuple[float, ...]
     points_m: list[list[tuple[float, float, float]]]
-    reference: ReferenceRecord
+    reference: ReferenceRecord | None  # of a wrist camera
     has_truth: bool
     version: str
     configuration: RecordedConfiguration | None
     view: ViewSettings | None = None  # for whom it is served live, too
+    laser: LaserCalibration | None = None  # of a second camera
+
+    @property
+    def tcp_m(self) -> Array:
+        """Where the reference has the TCP of a wrist camera's gripper, camera frame."""
+        assert self.reference is not None, "a wrist camera's"
+        return np.array(self.reference.cam_T_grip.translation_m)
 
 
 class ImageNote(msgspec.Struct, frozen=True, array_like=True):
@@ -87,7 +97,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     :class:`gripmon.records.MonitorNotes`.
     """
 
-    record: FrameRecord
+    record: FrameRecord | SpotRecord
     image: ImageNote | None
     trace: TraceNote | None
     truth_tcp_m: tuple[float, float, float] | None
@@ -104,6 +114,11 @@ class Events(msgspec.Struct, frozen=True, array_like=True):
     references: list[ReferenceRecord] = []
     commands: list[RecordedCommand] = []
     states: list[StateRecord] = []
+
+    @staticmethod
+    def at_first(reference: ReferenceRecord | None) -> Events:
+        """What a file begins with: the reference in force, if there is one."""
+        return Events(references=[] if reference is None else [reference])
 
     def __bool__(self) -> bool:
         return bool(self.alerts or self.references or self.commands or self.states)
@@ -183,6 +198,46 @@ def make_scene(
         has_truth=has_truth,
         version=__version__,
         configuration=configuration,
+    )
+
+
+def make_spot_scene(
+    settings: RecordingSettings,
+    directory: str,
+    name: str,
+    robot: str,
+    camera_name: str,
+    calibration: LaserCalibration,
+    configuration: RecordedConfiguration | None = None,
+) -> Scene:
+    """The same of a second camera; there is no gripper."""
+    from gripmon import __version__
+
+    lens = calibration.camera
+    return Scene(
+        name=name,
+        recording_id=f"{name}-{uuid.uuid4()}",
+        directory=directory,
+        settings=settings,
+        robot=robot,
+        camera=camera_name,
+        gripper="",
+        width_px=lens.width_px,
+        height_px=lens.height_px,
+        focal_px=(lens.fx_px, lens.fy_px),
+        centre_px=(lens.cx_px, lens.cy_px),
+        lens=msgspec.json.encode(lens).decode(),
+        corner_ids=(),
+        edges=(),
+        faces=(),
+        jaw_nominal_m=0.0,
+        jaw_openings_m=(),
+        points_m=[],
+        reference=None,
+        has_truth=False,
+        version=__version__,
+        configuration=configuration,
+        laser=calibration,
     )
 
 

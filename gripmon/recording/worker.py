@@ -13,14 +13,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.recording.columns import Picture, Row
+from gripmon.recording.columns import AnyRow, Picture, Row, SpotRow
 from gripmon.recording.files import FileSeries
 from gripmon.recording.live import LiveStream, NoFiles
 from gripmon.recording.pins import pinned_by
 from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
-from gripmon.records import Alert, AlertRecord, Limits
+from gripmon.records import Alert, AlertRecord, FrameRecord, Limits
 
 _NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0
@@ -126,9 +126,13 @@ class RecordingLoop:
             self._images_done += 1
             self._report()  # its slot is free
         self._limits = note.limits or self._limits
-        row = Row(
-            record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
-        )
+        row: AnyRow
+        if isinstance(record, FrameRecord):
+            row = Row(
+                record, picture, note.trace, note.truth_tcp_m, note.jaw_reported_m, note.statistic_share, self._limits
+            )
+        else:
+            row = SpotRow(record, picture)
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
