@@ -229,6 +229,25 @@ def test_fresh_images_confirm_a_calibration_and_contradict_a_moved_camera(
     assert np.allclose(values["position_m"], -shift[:3], atol=4e-4) and values["position_p_value"] < 0.001
 
 
+def test_images_of_another_pose_are_left_out_unless_they_are_half(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    moved = perturb(TRUE, np.array([1.5e-3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    for seed in (3, 4):
+        view = simulator(plain_scenario(sensor=Sensor()), seed=seed, cam_T_grip=moved)
+        cv2.imwrite(str(tmp_path / f"other{seed}.png"), view.render(0))
+    same = (made / "hand_eye.yaml", made / "free1.png", made / "free2.png")
+    last = ("--config", made / "config.yaml")
+    code, out, said = gripmon(capsys, "verify", *same, tmp_path / "other3.png", *last)
+    assert code == 0 and "other3.png: contradicts the other images" in out, (out, said)
+    code, out, said = gripmon(capsys, "verify", *same, tmp_path / "other3.png", tmp_path / "other4.png", *last)
+    assert code == 3 and not out and "only 2 of 4 images agree" in said and said.count("\n") == 1
+    code, out, said = gripmon(capsys, "verify", *same[:2], tmp_path / "other3.png", *last)
+    assert code == 3 and not out and "no two of 2 images agree" in said
+    code, out, _ = gripmon(capsys, "verify", *same[:2], *last)
+    assert code == 0 and "free1.png alone: nothing confirms" in out
+
+
 BAD: list[tuple[tuple[object, ...], str]] = [
     (("export", "camera.yaml", "--format", "urdf"), "camera.yaml: is a camera calibration, which has no hand/eye"),
     (("export", "hand_eye.yaml", "--format", "ros"), "hand_eye.yaml: camera.model: ros has no lens like this"),

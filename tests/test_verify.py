@@ -9,7 +9,13 @@ from scipy.stats import chi2, kstest, ncx2
 
 from gripmon.calibration.lens_models import LensModel, parameter_names
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.calibration.verify import CalibratedCamera, compare_cameras, compare_hand_eye, mean_of_one_scene
+from gripmon.calibration.verify import (
+    CalibratedCamera,
+    agreeing,
+    compare_cameras,
+    compare_hand_eye,
+    mean_of_one_scene,
+)
 from gripmon.camera import FisheyeLens, PaperLens, make_camera
 from gripmon.geometry import perturb
 from gripmon.interchange.fitting import fit_brown_conrady
@@ -95,6 +101,19 @@ def test_images_of_one_scene_average_without_growing_certain():
     away = compare_hand_eye(NOMINAL, A, mean, B)
     assert np.all(np.abs(np.concatenate([away.position_m, away.rotation_rad])) < 4.0 * SIGMAS / 20.0)
     assert np.allclose(spread, A)
+
+
+def test_measurements_that_contradict_the_others_are_told_apart():
+    """Ten that scatter as they say about one pose, and wrong ones that are each somewhere else."""
+    rng = np.random.default_rng(8)
+    true = [perturb(NOMINAL, np.linalg.cholesky(A) @ rng.standard_normal(6)) for _ in range(10)]
+    wrong = [perturb(NOMINAL, 30.0 * k * SIGMAS * rng.choice([-1.0, 1.0], 6)) for k in range(1, 8)]
+    order = rng.permutation(17)
+    agree = agreeing([(true + wrong)[k] for k in order], [A] * 17)
+    assert (agree == (order < 10)).all()
+    assert agreeing([NOMINAL], [A]).tolist() == [True]
+    # A wrong one that is as uncertain as it is wrong contradicts nobody.
+    assert agreeing([NOMINAL, NOMINAL, perturb(NOMINAL, 30.0 * SIGMAS)], [A, A, 900.0 * A]).all()
 
 
 BROWN = LensModel("brown_conrady", 640, 480)

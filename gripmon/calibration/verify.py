@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from gripmon.calibration.intrinsics import lens_vector, model_of
@@ -19,6 +20,8 @@ from gripmon.camera import Camera, LensSettings, make_camera
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array
 
+CHANCE = 1e-3
+"""Of two measurements of one pose being called different ones."""
 NEGLIGIBLE_PX = 1e-3
 """Two cameras that are as near as this don't differ, however certain they are."""
 _GRID = 25
@@ -93,6 +96,24 @@ def mean_of_one_scene(cam_T_grip: Sequence[Array], covariances: Sequence[Array])
     for _ in range(3):
         mean = perturb(mean, np.mean([perturbation_between(mean, T) for T in cam_T_grip], axis=0))
     return mean, np.mean(covariances, axis=0)
+
+
+def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArray[np.bool_]:
+    """The largest set (n,) of measurements of one pose that all agree with one of them, two by two: as far apart as
+    equal ones are in all but :data:`CHANCE` of the cases.
+    """
+    count = len(cam_T_grip)
+    apart = np.zeros((count, count))
+    for i in range(count):
+        for j in range(i):
+            xi = perturbation_between(cam_T_grip[i], cam_T_grip[j])
+            apart[i, j] = apart[j, i] = _chi2(xi, np.asarray(covariances[i]) + np.asarray(covariances[j]))
+    agree = apart < chi2.isf(CHANCE, 6)
+    # Of equally many the set that lies closer together.
+    spread = np.where(agree, apart, 0.0).sum(axis=1)
+    best = np.lexsort((spread, -agree.sum(axis=1)))[0]
+    out: NDArray[np.bool_] = agree[best]
+    return out
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,8 @@ DEFAULT_LEVEL = 0.01
 _DESCRIPTION = """\
 Compare two hand/eye calibrations (difference at the TCP, mm and degrees along the camera's axes), two
 cameras (by what they do: the largest difference in the image), or a hand/eye calibration with fresh
-images of the gripper: on the calibration plate (--target), or anywhere, measured as the monitor does.
+images of the gripper: on the calibration plate (--target), or anywhere, measured as the monitor does;
+then three or more before different backgrounds, since one that contradicts the others is left out.
 Each may also be a configuration, a monitor's state file (its reference in force) or estimates.jsonl
 (the last valid one).  How much of a difference is chance follows from both covariances; what they
 share, such as the camera, makes differences look less significant than they are."""
@@ -194,16 +195,20 @@ def _hand_eye_lines(found: HandEyeDifference, shift_mm: float, turn_deg: float) 
         cells = "".join(f"{v:+9.4f} ± {s:<7.4f}" for v, s in zip(values.tolist(), sigmas.tolist(), strict=True))
         lines.append(f"{name:<28}{cells}".rstrip())
     lines.append(
-        f"together {shift_mm:.4f} mm at the TCP (probability {found.position_p:.2g}), {turn_deg:.4f} degrees "
-        f"(probability {found.rotation_p:.2g})"
+        f"together {shift_mm:.4f} mm at the TCP ({_chance(found.position_p)}), {turn_deg:.4f} degrees "
+        f"({_chance(found.rotation_p)})"
     )
-    lines.append(f"chi-square {found.chi2:.2f} of 6 degrees of freedom: probability {found.p_value:.2g} by chance")
+    lines.append(f"chi-square {found.chi2:.2f} of 6 degrees of freedom: {_chance(found.p_value)} by chance")
     return lines
 
 
-def _verdict(same: bool, within: bool, level: float) -> str:
+def _chance(probability: float) -> str:
+    return "probability below 1e-9" if probability < 1e-9 else f"probability {probability:.2g}"
+
+
+def _verdict(same: bool, within: bool, level: float, *, given: bool = True) -> str:
     if same and within:
-        return "same: within the tolerance"
+        return "same: within the tolerance" if given else "same: the difference is negligible"
     return f"same (not told apart at a level of {level:g})" if same else f"different (at a level of {level:g})"
 
 
@@ -242,7 +247,7 @@ def _cameras(first: Calibrated, second: Calibrated, arguments: argparse.Namespac
         "within_tolerance": within if arguments.tolerance_px is not None else None,
     }
     lines = _camera_lines(found)
-    verdict = _verdict(same, within, arguments.level)
+    verdict = _verdict(same, within, arguments.level, given=arguments.tolerance_px is not None)
     if not same and found.p_value is None:
         verdict = "different: beyond the tolerance"
     return {"values": values, "lines": lines, "same": same, "verdict": verdict}
@@ -257,7 +262,7 @@ def _camera_lines(found: CameraDifference) -> list[str]:
         f"a hand/eye calibration absorbs a turn by ({degrees}) degrees: {found.largest_turned_px:.3f} px are left",
     ]
     if found.p_value is not None:
-        lines.append(f"probability {found.p_value:.2g} by chance")
+        lines.append(f"{_chance(found.p_value)} by chance")
     if found.compared < 1.0:
         lines.append(f"compared where both lenses map the image: {100.0 * found.compared:.0f} %")
     return lines

@@ -131,17 +131,54 @@ def _tracked(
     images: list[tuple[Path, Image]],
     warnings: list[str],
 ) -> tuple[Array, Array]:
-    """By the monitor's own measurement, beginning at the calibration; images that it can't measure are left out."""
+    """By the monitor's own measurement.  Images that it can't measure, or that contradict the others, are left out;
+    where they are half of them or more, the command ends with exit code 3.
+    """
     import numpy as np
 
-    from gripmon.calibration.verify import mean_of_one_scene
+    from gripmon.calibration.verify import agreeing, mean_of_one_scene
     from gripmon.geometry import from_record
+
+    assert first.cam_T_grip is not None
+    expected, covariance = from_record(first.cam_T_grip), np.reshape(first.covariance, (6, 6))
+    # Where the camera has moved, an image that begins at the calibration may end at a wrong place.  So once more, from
+    # where most of them end.
+    for _ in range(2):
+        found, reasons = _each_measured(config, opening_m, images, expected, covariance)
+        if not found:
+            raise common.CommandFailedError(f"no image can be measured; {reasons[0]}")
+        transforms, covariances = [one[1] for one in found], [one[2] for one in found]
+        agree = agreeing(transforms, covariances)
+        chosen = np.flatnonzero(agree)
+        expected, covariance = mean_of_one_scene([transforms[k] for k in chosen], [covariances[k] for k in chosen])
+    if 2 * len(chosen) <= len(found) and len(found) > 1:
+        share = f"only {len(chosen)}" if len(chosen) > 1 else "no two"
+        raise common.CommandFailedError(
+            f"{share} of {len(found)} images agree on where the gripper is; images of one pose, in which the "
+            "background doesn't hide its edges"
+        )
+    if len(found) == 1:
+        warnings.append(f"{found[0][0]} alone: nothing confirms what it shows; three images or more are better")
+    warnings += [f"left out: {reason}" for reason in reasons]
+    warnings += [
+        f"left out: {one[0]}: contradicts the other images" for one, kept in zip(found, agree, strict=True) if not kept
+    ]
+    return expected, covariance
+
+
+def _each_measured(
+    config: Config, opening_m: float | None, images: list[tuple[Path, Image]], expected: Array, covariance: Array
+) -> tuple[list[tuple[Path, Array, Array]], list[str]]:
+    """``cam_T_grip`` and covariance of every image that shows the gripper about where it is ``expected``; why not."""
+    import numpy as np
+
+    from gripmon.geometry import from_record, to_record
     from gripmon.monitor import Monitor
     from gripmon.records import Frame, Origin, ReferenceRecord
 
-    assert first.cam_T_grip is not None
-    reference = ReferenceRecord("verify", 0, 0, "configuration", first.cam_T_grip, first.covariance)
-    transforms, covariances, reasons = [], [], []
+    flat = tuple(covariance.ravel().tolist())
+    reference = ReferenceRecord("verify", 0, 0, "configuration", to_record(expected), flat)
+    found, reasons = [], []
     for number, (path, image) in enumerate(images):
         # Each image by itself: what a monitor learns from the last one is for a camera that stands still meanwhile.
         monitor = Monitor(config.camera, config.gripper, config.settings.monitor, reference, config.taught_edges)
@@ -149,9 +186,5 @@ def _tracked(
         if record.cam_T_grip is None or record.covariance is None or record.source is Origin.HELD:
             reasons.append(f"{path}: {record.reason or 'the gripper is not seen'}")
             continue
-        transforms.append(from_record(record.cam_T_grip))
-        covariances.append(np.reshape(record.covariance, (6, 6)))
-    if not transforms:
-        raise common.CommandFailedError(f"no image can be measured; {reasons[0]}")
-    warnings += [f"left out: {reason}" for reason in reasons]
-    return mean_of_one_scene(transforms, covariances)
+        found.append((path, from_record(record.cam_T_grip), np.reshape(record.covariance, (6, 6))))
+    return found, reasons
