@@ -260,6 +260,39 @@ def test_bad_tables_end_with_one_line_and_nothing_is_written(name, tmp_path, cam
     assert not (tmp_path / "laser.yaml").exists()
 
 
+def test_several_tables_count_each_sample_once_and_say_which_is_left_out(tmp_path, camera, capsys):
+    data, uv = scene()
+    uv[33] += [-30.0, 30.0]
+    rows = rows_of(data, uv)
+    first, second = write_csv(tmp_path / "first.csv", rows[:30]), write_csv(tmp_path / "second.csv", rows[30:])
+    assert calibrate(first, second, "--camera", camera, "--out", tmp_path / "laser.yaml") == 0
+    assert "left out: second.csv, line 5" in capsys.readouterr().out
+    copy = write_csv(tmp_path / "copy.csv", rows[10:12])
+    assert calibrate(first, second, copy, "--camera", camera, "--out", tmp_path / "no.yaml") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and "copy.csv: copy.csv, line 2" not in said
+    assert "copy.csv: line 2: is the same sample as" in said and "first.csv: line 12; each sample once" in said
+    assert not (tmp_path / "no.yaml").exists()
+
+
+def test_a_table_of_another_separator_is_named(tmp_path, camera, capsys):
+    table = write_csv(tmp_path / "spots.csv", rows_of(*scene()))
+    for sign, name in ((";", "semicolons"), ("\t", "tabs")):
+        other = tmp_path / "other.csv"
+        other.write_text(table.read_text().replace(",", sign))
+        assert calibrate(other, "--camera", camera, "--out", tmp_path / "no.yaml") == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1 and f"other.csv: columns are separated by {name}; commas" in said
+
+
+def test_a_reach_in_millimetres_is_refused(tmp_path, camera, capsys):
+    table = write_csv(tmp_path / "spots.csv", rows_of(*scene()))
+    plan = ("--plan", tmp_path / "next.csv", "--reach", "850")
+    with pytest.raises(SystemExit) as stopped:
+        calibrate(table, "--camera", camera, "--out", tmp_path / "no.yaml", *plan)
+    assert stopped.value.code == 2 and "850 m is no arm's reach (millimetres?)" in capsys.readouterr().err
+
+
 def out_of_step(data, uv):
     return data.base_T_ee, np.roll(uv, 1, axis=0)
 

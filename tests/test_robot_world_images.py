@@ -55,7 +55,13 @@ def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
         assert (np.abs(error) < 6.0 * sigmas + 1e-4).all()
         assert np.abs(error).max() < 3e-3
     assert len(written["provenance"]["inputs"]) == 8
-    cv2.imwrite(str(tmp_path / "3.png"), np.full((480, 640), 128, np.uint8))
-    assert main([*command, "--target", TARGET, "--out", str(tmp_path / "no.yaml")]) == 3
-    assert "3.png" in capsys.readouterr().err
-    assert not (tmp_path / "no.yaml").exists()
+    for k in range(6):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((480, 640), 128, np.uint8))
+        again = [*command, "--target", TARGET, "--out", str(tmp_path / f"without{k}.yaml")]
+        if k == 0:
+            assert main(again) == 0
+            assert "0.png: " in capsys.readouterr().err
+            assert yaml.safe_load((tmp_path / "without0.yaml").read_text())["residuals"]["poses"] == 5
+    assert main(again) == 3
+    assert "none of 6 images shows the target" in capsys.readouterr().err
+    assert not (tmp_path / "without5.yaml").exists()

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise
     from gripmon.records import Array
 
+LONGEST_ARM_M = 20.0
 _DESCRIPTION = """\
 Calibrate a fixed camera against an arm with a laser pointer on its end-effector: the spot falls on a
 plane that the camera sees; the hand need not be in view.  DATA are tables (.csv, .yaml, .json) with a
@@ -62,7 +63,7 @@ def add_parser(methods: Any) -> None:
     )
     parser.add_argument("--plan", metavar="FILE.csv", help="also write which poses would help the most next; --reach")
     parser.add_argument("--poses", type=_count, default=10, metavar="N", help="how many are planned (default 10)")
-    parser.add_argument("--reach", type=common.positive_number, metavar="M", help="how far the arm reaches (m)")
+    parser.add_argument("--reach", type=_reach, metavar="M", help="how far the arm reaches (m)")
     parser.add_argument("--force", action="store_true", help="replace files that are there")
 
 
@@ -70,6 +71,13 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) <= 200:
         raise argparse.ArgumentTypeError(f"'{text}' is no number of poses; 1 to 200")
     return int(text)
+
+
+def _reach(text: str) -> float:
+    value = common.positive_number(text)
+    if value > LONGEST_ARM_M:
+        raise argparse.ArgumentTypeError(f"{text} m is no arm's reach (millimetres?); metres, e.g. 0.85")
+    return value
 
 
 def _arm_noise(text: str) -> tuple[float, float]:

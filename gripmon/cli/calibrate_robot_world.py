@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,30 +84,41 @@ def _poses(arguments: argparse.Namespace) -> _Poses:
     from gripmon.calibration.laser.samples import check_scale, pose_of
     from gripmon.cli.laser_tables import rows_of
 
-    arm, target, covariances, names = [], [], [], []
+    arm: list[Array] = []
+    target, covariances, names = [], [], []
     inputs = [Path(name) for name in arguments.data]
     seer = _Seer(arguments)
     for path in list(inputs):
         rows, places = rows_of(path)
         with common.progress_bar(len(rows), "pose") as step:
             for row, place in zip(rows, places, strict=True):
+                step()
                 try:
-                    arm.append(pose_of(row, place))
+                    hand = pose_of(row, place)
                     own = {key.removeprefix("cam_"): value for key, value in row.items() if key.startswith("cam_")}
-                    if not own:
-                        seen, covariance = seer.see(path, row, place)
-                        covariances.append(covariance)
-                    target.append(pose_of(own, f"{place}, cam_") if own else seen)
+                    if own:
+                        target.append(pose_of(own, f"{place}, cam_"))
+                    else:
+                        seen = seer.see(path, row, place)
+                        if seen is None:
+                            continue
+                        target.append(seen[0])
+                        covariances.append(seen[1])
                 except ValueError as error:
                     raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+                arm.append(hand)
                 names.append(f"{path.name}, {place}")
-                step()
+    for line in seer.unseen:
+        print(line, file=sys.stderr)
+    if not arm:
+        raise common.CommandFailedError(f"calibrate robot-world: none of {len(seer.unseen)} images shows the target")
     if covariances and len(covariances) < len(arm):
         raise common.CommandFailedError(
             f"{inputs[0]}: some rows have cam_ columns, others images; one or the other", common.EXIT_USAGE
         )
     try:
         check_scale(np.stack(arm))
+        _check_once(arm, target, names)
     except ValueError as error:
         raise common.CommandFailedError(f"{inputs[0]}: {error}", common.EXIT_USAGE) from None
     poses = _Poses(np.stack(arm), np.stack(target), np.stack(covariances) if covariances else None)
@@ -114,17 +126,30 @@ def _poses(arguments: argparse.Namespace) -> _Poses:
     return poses
 
 
+def _check_once(arm: list[Array], target: list[Array], names: list[str]) -> None:
+    """The same pose twice would make every uncertainty too small."""
+    import numpy as np
+
+    seen: dict[tuple[float, ...], str] = {}
+    for hand, plate, name in zip(arm, target, names, strict=True):
+        key = tuple(np.round(np.concatenate([hand.ravel(), plate.ravel()]), 9).tolist())
+        first = seen.setdefault(key, name)
+        if first is not name:
+            raise ValueError(f"{name}: is the same pose as {first}; each pose once")
+
+
 class _Seer:
-    """Finds the target in images."""
+    """Finds the target in images; ``unseen`` says where it doesn't, and why."""
 
     def __init__(self, arguments: argparse.Namespace):
         self.files: list[Path] = []
+        self.unseen: list[str] = []
         self._arguments = arguments
         self._camera: Any = None
         self._target: Any = None
 
-    def see(self, table: Path, row: Row, place: str) -> tuple[Array, Array]:
-        """``cam_T_target`` and its covariance; what is wrong ends the command."""
+    def see(self, table: Path, row: Row, place: str) -> tuple[Array, Array] | None:
+        """``cam_T_target`` and its covariance, None if the image doesn't show it; what is wrong ends the command."""
         from gripmon.calibration.detection import detect
         from gripmon.calibration.intrinsics import plate_pose
         from gripmon.calibration.sighting import CalibrationError, NotFound
@@ -146,11 +171,13 @@ class _Seer:
             )
         sight = detect(image, self._target, str(path))
         if isinstance(sight, NotFound):
-            raise common.CommandFailedError(f"{path}: {sight.reason}; images that show the target")
+            self.unseen.append(f"{path}: {sight.reason}")
+            return None
         try:
             pose, covariance, _ = plate_pose(self._camera, sight)
         except CalibrationError as error:
-            raise common.CommandFailedError(f"{path}: {error}") from None
+            self.unseen.append(f"{path}: {error}")
+            return None
         return pose, covariance
 
     def _prepare(self) -> None:

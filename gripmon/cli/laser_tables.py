@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,9 @@ _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
 
 
 def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
-    """All samples, and the file that each comes from; what is wrong ends the command with exit code 2."""
+    """All samples, and the file that each comes from; what is wrong ends the command with exit code 2.  Of several
+    tables each sample's name says which.
+    """
     from gripmon.calibration.laser.samples import from_rows, joined
 
     parts, origins = [], []
@@ -28,9 +31,32 @@ def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
             raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
         origins += [path] * len(rows)
     try:
-        return joined(parts, [str(path) for path in paths]), origins
+        samples = joined(parts, [str(path) for path in paths])
     except ValueError as error:
         raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    if len(paths) > 1:
+        _check_once(samples, origins)
+        samples = replace(
+            samples, names=tuple(f"{o.name}, {name}" for o, name in zip(origins, samples.names, strict=True))
+        )
+    return samples, origins
+
+
+def _check_once(samples: Samples, origins: list[Path]) -> None:
+    """Within a table this is known already."""
+    import numpy as np
+
+    seen: dict[tuple[Any, ...], int] = {}
+    for k, (uv, pose, image) in enumerate(zip(samples.uv_px, samples.base_T_ee, samples.images, strict=True)):
+        file = None if image is None else str(origins[k].parent / image)
+        spot = () if np.isnan(uv).any() else tuple(uv.tolist())
+        first = seen.setdefault((file, *spot, *np.round(pose, 9).ravel().tolist()), k)
+        if first != k:
+            raise common.CommandFailedError(
+                f"{origins[k]}: {samples.names[k]}: is the same sample as {origins[first]}: {samples.names[first]}; "
+                "each sample once",
+                common.EXIT_USAGE,
+            )
 
 
 def rows_of(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
@@ -54,6 +80,13 @@ def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
     reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
     rows: list[dict[str, Any]] = []
     places = []
+    header = reader.fieldnames or []
+    separator = next((sign for sign in ";\t" if len(header) == 1 and sign in header[0]), None)
+    if separator is not None:
+        shown = {";": "semicolons", "\t": "tabs"}[separator]
+        raise common.CommandFailedError(
+            f"{path}: columns are separated by {shown}; commas, and points in numbers", common.EXIT_USAGE
+        )
     for row in reader:
         if None in row or None in row.values():
             count = len(reader.fieldnames or ())
@@ -166,8 +199,9 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
                 others[k] = np.array([spot.uv_px for spot in found[1:]]).reshape(-1, 2)
             elif not (-0.5 <= uv_px[k, 0] <= size_px[0] - 0.5 and -0.5 <= uv_px[k, 1] <= size_px[1] - 0.5):
                 u, v = uv_px[k]
+                place = name.removeprefix(f"{origins[k].name}, ")
                 raise common.CommandFailedError(
-                    f"{origins[k]}: {name}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
+                    f"{origins[k]}: {place}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
                     f"{size_px[0]} x {size_px[1]} px; spots of this camera",
                     common.EXIT_USAGE,
                 )
