@@ -310,9 +310,31 @@ def nonsense(data, uv):
     return data.base_T_ee, np.random.default_rng(1).uniform([0.0, 0.0], [640.0, 480.0], uv.shape)
 
 
+def inverted(data, uv):
+    return np.stack([invert(pose) for pose in data.base_T_ee]), uv
+
+
+def with_rotations(data, rotations):
+    poses = data.base_T_ee.copy()
+    poses[:, :3, :3] = rotations
+    return poses
+
+
+def w_first(data, uv):
+    quaternions = Rotation.from_matrix(data.base_T_ee[:, :3, :3]).as_quat()
+    return with_rotations(data, Rotation.from_quat(np.roll(quaternions, 1, axis=1)).as_matrix()), uv
+
+
+def turned_back(data, uv):
+    return with_rotations(data, data.base_T_ee[:, :3, :3].transpose(0, 2, 1)), uv
+
+
 @pytest.mark.parametrize(
     ("change", "text"),
     [
+        (inverted, "the poses are ee_T_base: inverted, the spots fit"),
+        (w_first, "the quaternions have w first: read so, the spots fit"),
+        (turned_back, "the rotations are the other way round"),
         (out_of_step, "poses and images are out of step: spots fit the poses 1 row(s)"),
         (one_orientation, "1 orientation(s) with at least"),
         (on_a_line, "all spots lie on one line in the image"),
@@ -331,6 +353,19 @@ def test_data_that_cannot_be_calibrated_from_end_with_why_and_nothing_is_written
     said = capsys.readouterr().err.strip().splitlines()
     assert len(said) == 1 and text in said[0]
     assert not (tmp_path / "laser.yaml").exists()
+
+
+def test_an_orientation_that_contradicts_the_others_is_named_in_output_and_file(tmp_path, camera, capsys):
+    data, uv = scene(orientations=7)
+    uv = uv.copy()
+    uv[10:20] += 25.0  # e.g. all on a box that stands on the plane
+    table = write_csv(tmp_path / "spots.csv", rows_of(data, uv))
+    assert calibrate(table, "--camera", camera, "--out", tmp_path / "laser.yaml") == 0
+    line = "an orientation contradicts the others: 10 of its 10 spots left out, spots 11 to 20"
+    assert line in capsys.readouterr().out
+    written = yaml.safe_load((tmp_path / "laser.yaml").read_text())
+    assert any(line in warning for warning in written["warnings"])
+    assert_near(written, data.truth)
 
 
 def test_files_that_are_none(tmp_path, camera, capsys):

@@ -8,7 +8,7 @@ from laser_scenes import PAPER_LENS, paper_setup, sampled
 from scipy.stats import f as fisher_f
 
 from gripmon.calibration.laser import common_plane, refinement
-from gripmon.calibration.laser.calibrating import Spots, calibrate
+from gripmon.calibration.laser.calibrating import Spots, calibrate, contradictions
 from gripmon.calibration.laser.refinement import FALSE_OUTLIERS, refine
 from gripmon.calibration.laser.setup import (
     PARAMETERS,
@@ -203,3 +203,29 @@ def test_no_more_good_spots_are_left_out_than_is_said(monkeypatch):
         data, uv_px = noisy(seed, orientations=3)
         left += int((~refine(SpotProblem(data.camera, data.base_T_ee, uv_px), data.truth).used).sum())
     assert 1 <= left <= 13  # 6 are expected; one size and one scale for all left out three times as many
+
+
+@pytest.mark.parametrize(
+    ("lost", "orientations", "outcome"),
+    [
+        ({1: 8}, 3, "1 of 3 orientations contradict the others (8 of its 10 spots left out, spots 11 to 20)"),
+        ({0: 10, 2: 6, 5: 7}, 6, "3 of 6 orientations contradict the others (10 of its 10 spots left out, spots 1 to"),
+        ({4: 7}, 7, ("an orientation contradicts the others: 7 of its 10 spots left out, spots 41 to 50;",)),
+        (dict.fromkeys(range(7), 4), 7, ()),
+    ],
+)
+def test_an_orientation_that_is_left_out_is_a_contradiction_and_scattered_wrong_spots_are_none(
+    lost, orientations, outcome
+):
+    groups = np.split(np.arange(10 * orientations), orientations)
+    used = np.ones(10 * orientations, dtype=bool)
+    for k, count in lost.items():
+        used[groups[k][:count]] = False
+    if isinstance(outcome, str):
+        with pytest.raises(CalibrationError) as error:
+            contradictions(used, groups)
+        assert str(error.value).startswith(outcome)
+    else:
+        lines = contradictions(used, groups)
+        assert len(lines) == len(outcome)
+        assert all(line.startswith(start) for line, start in zip(lines, outcome, strict=True))

@@ -223,7 +223,7 @@ def _document(
     if other:
         notes = (*notes, f"not the brightest place but another one is the spot in: {', '.join(other)}")
     orientations = len(groups_of(samples.groups, samples.base_T_ee))
-    return document(result.refined, samples.names, orientations, notes, provenance)
+    return document(result.refined, samples.names, orientations, (*notes, *result.warnings), provenance)
 
 
 def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:

@@ -105,7 +105,9 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
         while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
             dark_s, why = desk.dark()
             if arguments.live_wait is not None and dark_s > arguments.live_wait:
-                raise common.CommandFailedError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
+                raise common.CommandFailedError(
+                    f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s"
+                )
     finally:
         server.close()
         desk.close()

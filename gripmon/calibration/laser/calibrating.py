@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibration.laser import common_plane
-from gripmon.calibration.laser.closed_form import orientation_groups
+from gripmon.calibration.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups
+from gripmon.calibration.laser.misreading import SUSPECT_PX, check_reading
 from gripmon.calibration.laser.refinement import Refined, refine
 from gripmon.calibration.laser.setup import LaserSetup
 from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
@@ -22,12 +23,17 @@ LEAST_AGREEING = 0.5
 """Part of the spots that has to agree: with fewer, another set-up might explain as many."""
 MOST_TURN_RAD = 0.02
 """Of samples that are said to be of one orientation: more than an arm's noise."""
-SUSPECT_PX = 3.0
-"""Noise of spots from which it is asked whether poses and images are out of step."""
+LARGEST_NOISE_SHARE = 0.01
+"""The spots' noise over the image's width beyond which they aren't explained at all."""
+LEAST_OF_ORIENTATION = 0.5
+"""Part of an orientation's spots that has to agree: scattered wrong spots leave more, so that the orientation itself
+contradicts the others.
+"""
+MOST_CONTRADICTING = 1.0 / 3.0
+"""Part of the orientations that may contradict the rest: beyond it nobody knows which are right."""
 LEAST_NOISE_PX = 0.02
 """Of spots, however much an arm's noise explains."""
 _NOISE_ROUNDS = 8
-_OFFSETS = (1, -1, 2, -2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +48,14 @@ class Spots:
 @dataclass(frozen=True, slots=True)
 class LaserResult:
     """The closed form's ``start``, what it was ``refined`` to, and which ``candidate`` was taken of each sample
-    (n,): 0 is the brightest.
+    (n,): 0 is the brightest.  ``warnings`` name orientations that contradict the rest.
     """
 
     start: LaserSetup
     refined: Refined
     uv_px: Array
     candidate: NDArray[np.intp]
+    warnings: tuple[str, ...] = ()
 
 
 def groups_of(labels: Sequence[str] | None, base_T_ee: Array) -> list[NDArray[np.intp]]:
@@ -91,19 +98,52 @@ def calibrate(
         found = _refined(camera, base_T_ee, spots, start, lens, pose_noise)
     except CalibrationError as error:
         fault = error
-    if fault is None and found.refined.scale_px < SUSPECT_PX and found.refined.used.mean() >= LEAST_AGREEING:
-        _check_distance(found.refined.setup)
-        return found
-    _check_step(camera, base_T_ee, spots, xy, fault)
+    sound = fault is None and found.refined.used.mean() >= LEAST_AGREEING
+    if not sound or found.refined.scale_px >= SUSPECT_PX:
+        check_reading(camera, base_T_ee, spots.uv_px, fault)
     if fault is not None:
         raise fault
     _check_distance(found.refined.setup)
-    if found.refined.used.mean() < LEAST_AGREEING:
+    _check_agreement(found.refined, camera.width_px)
+    return replace(found, warnings=contradictions(found.refined.used, groups))
+
+
+def _check_agreement(refined: Refined, width_px: int) -> None:
+    if refined.used.mean() < LEAST_AGREEING:
         raise CalibrationError(
-            f"only {int(found.refined.used.sum())} of {len(xy)} spots agree with each other: wrong spots, poses of "
+            f"only {int(refined.used.sum())} of {len(refined.used)} spots agree with each other: wrong spots, poses of "
             "other images, or a camera that is another one; each spot with the pose that it was seen at"
         )
-    return found
+    if refined.scale_px > LARGEST_NOISE_SHARE * width_px:
+        raise CalibrationError(
+            f"the spots don't fit the poses: residuals of {refined.scale_px:.3g} px; each spot with the pose that it "
+            "was seen at, base_T_ee in metres, the camera that took the images"
+        )
+
+
+def contradictions(used: NDArray[np.bool_], groups: Sequence[NDArray[np.intp]]) -> tuple[str, ...]:
+    """A line for each orientation most of whose spots aren't ``used`` (n,), where ``groups`` are the orientations'
+    members.  Raises :class:`CalibrationError` where too few are left for anybody to know which are right.
+    """
+    counted = [members for members in groups if len(members) >= FEWEST_SHIFTS]
+    against = [members for members in counted if used[members].mean() < LEAST_OF_ORIENTATION]
+    left = len(counted) - len(against)
+    if against and (left < FEWEST_ORIENTATIONS or len(against) > MOST_CONTRADICTING * len(counted)):
+        raise CalibrationError(
+            f"{len(against)} of {len(counted)} orientations contradict the others ({_where(against[0], used)}): the "
+            "hand turned or the plane moved between them, spots beside the plane, or another camera's file; "
+            f"at least {FEWEST_ORIENTATIONS} orientations that agree, and twice as many as don't"
+        )
+    return tuple(
+        f"an orientation contradicts the others: {_where(members, used)}; this calibration holds if it is that one "
+        "which is wrong (spots beside the plane, a pose that was misread)"
+        for members in against
+    )
+
+
+def _where(members: NDArray[np.intp], used: NDArray[np.bool_]) -> str:
+    wrong = len(members) - int(used[members].sum())
+    return f"{wrong} of its {len(members)} spots left out, spots {members.min() + 1} to {members.max() + 1}"
 
 
 def _refined(
@@ -157,22 +197,3 @@ def _check_distance(setup: LaserSetup) -> None:
         raise CalibrationError(
             f"the plane would be {setup.distance_m:.4g} m from the camera: are the poses in millimetres? metres"
         )
-
-
-def _check_step(camera: Camera, base_T_ee: Array, spots: Spots, xy: Array, fault: CalibrationError | None) -> None:
-    """Raise if the spots fit the poses of their neighbours: the tables are out of step."""
-    for offset in _OFFSETS:
-        count = len(xy) - abs(offset)
-        own = slice(max(offset, 0), max(offset, 0) + count)
-        other = slice(max(-offset, 0), max(-offset, 0) + count)
-        try:
-            start = common_plane.solve(xy[other], base_T_ee[own])
-            found = refine(SpotProblem(camera, base_T_ee[own], spots.uv_px[other]), start)
-        except CalibrationError:
-            continue
-        if found.used.mean() > 0.7 and found.scale < SUSPECT_PX:
-            which = "later" if offset > 0 else "earlier"
-            raise CalibrationError(
-                f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which} "
-                f"({int(found.used.sum())} of {count} agree, {found.scale:.2g} px); each spot with its own pose"
-            ) from fault
