@@ -1,97 +1,20 @@
-"""What the camera sees of the gripper: corners, edges and faces of its fingers, and how they move with the jaws.
-
-Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes
-from a YAML file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or
-as a table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
-"""
+"""A gripper model in arrays: where its points are at an opening, and what of it shows from where."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
 
-import msgspec
 import numpy as np
-import yaml
-from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.provenance import Provenance
+from gripmon.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
+from gripmon.gripper.motion import motion_table, offset_m
 from gripmon.records import Array
 
 LARGEST_EXTENT_M = 1.0
 LARGEST_WARP_M = 5e-4
 SMALLEST_SPREAD_RATIO = 0.02
-
-_T = TypeVar("_T")
-Vector = tuple[float, float, float]
-Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]
-
-
-class GripperError(ValueError):
-    """A gripper file that can't be used; the text is ``key: what is wrong; what would be right``."""
-
-
-class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    nominal_m: Opening
-    min_m: Opening
-    max_m: Opening
-
-
-class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Metres of finger motion in the gripper frame for each metre of opening beyond nominal."""
-
-    axis: Vector
-
-
-class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Rows ``opening_m, dx_m, dy_m, dz_m``, openings ascending; linear between rows."""
-
-    table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
-
-
-class FingerModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    motion: dict[str, Any] | None = None
-
-
-class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    finger: str
-    xyz_m: Vector
-    corner: bool = False
-
-
-class EdgeModel(
-    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}
-):
-    start: str
-    end: str
-    kind: Literal["contour", "crease"] = "contour"
-    brighter: Literal["left", "right", "any"] = "any"
-    bevel_m: Annotated[float, Meta(ge=0.0, le=0.02, description="width of a bevel or rounding (m)")] = 0.0
-
-
-class FaceModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    finger: str
-    points: Annotated[tuple[str, ...], Meta(min_length=3)]
-
-
-class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A gripper file as it is written; see ``configs/grippers`` for commented ones."""
-
-    name: str
-    fingers: dict[str, FingerModel]
-    points: dict[str, PointModel]
-    edges: dict[str, EdgeModel]
-    jaw: JawModel | None = None
-    faces: tuple[FaceModel, ...] = ()
-    provenance: Provenance | None = None
-
-
-def contents_of(model: GripperModel) -> dict[str, Any]:
-    """What a gripper file says of the gripper, for digests: all but where the file comes from."""
-    return {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +73,7 @@ class Gripper:
         self.jaw_nominal_m, self.jaw_min_m, self.jaw_max_m = jaw.nominal_m, jaw.min_m, jaw.max_m
         if self.has_jaw and not self.jaw_min_m <= self.jaw_nominal_m <= self.jaw_max_m:
             raise GripperError("jaw: nominal_m is outside min_m to max_m; min_m <= nominal_m <= max_m")
-        self._motion = [self._finger_motion(n, f.motion) for n, f in model.fingers.items()]
+        self._motion = [motion_table(n, f.motion, model.jaw) for n, f in model.fingers.items()]
         self._check()
 
     def points_grip_m(self, jaw_opening_m: float | None = None) -> Array:
@@ -296,34 +219,8 @@ class Gripper:
             np.greater(np.einsum("ij,ij->i", normals, eye_grip_m - first[:, 0]), 0.0, out=out[:-1])
         return out
 
-    def _finger_motion(self, name: str, motion: dict[str, Any] | None) -> Array:
-        """Table (rows, 4) of opening and offset; an axis becomes the table of its two ends."""
-        if motion is None:
-            return np.zeros((1, 4))
-        key = f"fingers.{name}.motion"
-        if not self.has_jaw:
-            raise GripperError(f"{key}: the gripper has no jaw; a section `jaw` with nominal_m, min_m, max_m")
-        if set(motion) == {"axis"}:
-            axis = np.array(_convert(motion, AxisMotion, key).axis)
-            if not np.isfinite(axis).all():
-                raise GripperError(f"{key}.axis: holds a value that is not finite; three ordinary numbers")
-            ends = np.array([self.jaw_min_m, self.jaw_max_m])
-            return np.column_stack([ends, (ends - self.jaw_nominal_m)[:, None] * axis])
-        if set(motion) != {"table"}:
-            raise GripperError(f"{key}: has the keys {', '.join(motion) or 'none'}; either `axis` or `table`")
-        table = np.array(_convert(motion, TableMotion, key).table)
-        if not np.isfinite(table).all():
-            raise GripperError(f"{key}.table: holds a value that is not finite; ordinary numbers")
-        if not (np.diff(table[:, 0]) > 0.0).all():
-            raise GripperError(f"{key}.table: openings don't ascend; rows sorted by opening_m")
-        if table[0, 0] > self.jaw_min_m + 1e-9 or table[-1, 0] < self.jaw_max_m - 1e-9:
-            raise GripperError(f"{key}.table: covers {table[0, 0]} to {table[-1, 0]} m; all of jaw.min_m to jaw.max_m")
-        if np.abs(_interpolate(table, self.jaw_nominal_m)).max() > 1e-6:
-            raise GripperError(f"{key}.table: the finger is not at rest at jaw.nominal_m; an offset of zero there")
-        return table
-
     def _finger_offsets_m(self, jaw_opening_m: float) -> Array:
-        return np.array([_interpolate(table, jaw_opening_m) for table in self._motion])
+        return np.array([offset_m(table, jaw_opening_m) for table in self._motion])
 
     def _check_places(self) -> None:
         strange = ~np.isfinite(self._nominal_points_m).all(axis=1)
@@ -367,42 +264,3 @@ def on_a_line(points_m: Array) -> bool:
     """Whether points (n, 3) lie on a line, or nearly so: two per cent of their extent beside it."""
     spread = np.linalg.svd(points_m - points_m.mean(axis=0), compute_uv=False)
     return bool(spread[1] <= SMALLEST_SPREAD_RATIO * spread[0])
-
-
-def _interpolate(table: Array, opening_m: float) -> Array:
-    if len(table) == 1:
-        return table[0, 1:]
-    return np.array([np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)])
-
-
-def _convert(value: Any, kind: type[_T], key: str) -> _T:
-    try:
-        return msgspec.convert(value, kind)
-    except msgspec.ValidationError as error:
-        raise GripperError(f"{key}: {error}") from None
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """Takes times, as in a provenance, for the text that they are."""
-
-
-_Loader.yaml_implicit_resolvers = {
-    first: [(tag, pattern) for tag, pattern in resolvers if tag != "tag:yaml.org,2002:timestamp"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-
-
-def gripper_from_dict(value: Any) -> Gripper:
-    """A parsed YAML document -> :class:`Gripper`.  ValidationError of msgspec where a key or a type is wrong."""
-    return Gripper(msgspec.convert(value, GripperModel))
-
-
-def load_gripper(path: Path | str) -> Gripper:
-    """Read a gripper file.  OSError if it can't be read; :class:`GripperError` if it can't be used."""
-    try:
-        value = yaml.load(Path(path).read_text(encoding="utf-8"), _Loader)
-        return gripper_from_dict(value)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise GripperError(f"not YAML: {' '.join(str(error).split())}; see configs/grippers for examples") from None
-    except msgspec.ValidationError as error:
-        raise GripperError(str(error)) from None

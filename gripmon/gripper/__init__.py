@@ -1,0 +1,43 @@
+"""What the camera sees of the gripper: corners, edges and faces of its fingers, and how they move with the jaws.
+
+Gripper frame: origin at the TCP, x across the jaws, z out of the gripper (towards the object); metres.  The model comes
+from a YAML file; its coordinates hold at the nominal jaw opening.  Each finger moves without turning, along an axis or
+as a table over the opening says (adaptive grippers move on an arc, so their fingertips also change depth).
+"""
+
+from __future__ import annotations
+
+from gripmon.gripper.core import LARGEST_EXTENT_M, EdgeView, FaceLoop, Gripper, on_a_line
+from gripmon.gripper.file import gripper_from_dict, load_gripper
+from gripmon.gripper.model import (
+    AxisMotion,
+    EdgeModel,
+    FaceModel,
+    FingerModel,
+    GripperError,
+    GripperModel,
+    JawModel,
+    PointModel,
+    TableMotion,
+    contents_of,
+)
+
+__all__ = [
+    "LARGEST_EXTENT_M",
+    "AxisMotion",
+    "EdgeModel",
+    "EdgeView",
+    "FaceLoop",
+    "FaceModel",
+    "FingerModel",
+    "Gripper",
+    "GripperError",
+    "GripperModel",
+    "JawModel",
+    "PointModel",
+    "TableMotion",
+    "contents_of",
+    "gripper_from_dict",
+    "load_gripper",
+    "on_a_line",
+]

@@ -1,0 +1,77 @@
+"""A gripper file as it is written."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.provenance import Provenance
+
+Vector = tuple[float, float, float]
+Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]
+
+
+class GripperError(ValueError):
+    """A gripper file that can't be used; the text is ``key: what is wrong; what would be right``."""
+
+
+class JawModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    nominal_m: Opening
+    min_m: Opening
+    max_m: Opening
+
+
+class AxisMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Metres of finger motion in the gripper frame for each metre of opening beyond nominal."""
+
+    axis: Vector
+
+
+class TableMotion(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Rows ``opening_m, dx_m, dy_m, dz_m``, openings ascending; linear between rows."""
+
+    table: Annotated[tuple[tuple[float, float, float, float], ...], Meta(min_length=2)]
+
+
+class FingerModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    motion: dict[str, Any] | None = None
+
+
+class PointModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    finger: str
+    xyz_m: Vector
+    corner: bool = False
+
+
+class EdgeModel(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, rename={"start": "from", "end": "to"}
+):
+    start: str
+    end: str
+    kind: Literal["contour", "crease"] = "contour"
+    brighter: Literal["left", "right", "any"] = "any"
+    bevel_m: Annotated[float, Meta(ge=0.0, le=0.02, description="width of a bevel or rounding (m)")] = 0.0
+
+
+class FaceModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    finger: str
+    points: Annotated[tuple[str, ...], Meta(min_length=3)]
+
+
+class GripperModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A gripper file as it is written; see ``configs/grippers`` for commented ones."""
+
+    name: str
+    fingers: dict[str, FingerModel]
+    points: dict[str, PointModel]
+    edges: dict[str, EdgeModel]
+    jaw: JawModel | None = None
+    faces: tuple[FaceModel, ...] = ()
+    provenance: Provenance | None = None
+
+
+def contents_of(model: GripperModel) -> dict[str, Any]:
+    """What a gripper file says of the gripper, for digests: all but where the file comes from."""
+    return {key: value for key, value in msgspec.to_builtins(model).items() if key != "provenance"}

@@ -1,0 +1,54 @@
+"""How a finger moves with the jaws: a table over the opening."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+
+from gripmon.gripper.model import AxisMotion, GripperError, JawModel, TableMotion
+from gripmon.records import Array
+
+_T = TypeVar("_T")
+
+
+def motion_table(name: str, motion: dict[str, Any] | None, jaw: JawModel | None) -> Array:
+    """Table (rows, 4) of opening and offset; an axis becomes the table of its two ends."""
+    if motion is None:
+        return np.zeros((1, 4))
+    key = f"fingers.{name}.motion"
+    if jaw is None:
+        raise GripperError(f"{key}: the gripper has no jaw; a section `jaw` with nominal_m, min_m, max_m")
+    if set(motion) == {"axis"}:
+        axis = np.array(_convert(motion, AxisMotion, key).axis)
+        if not np.isfinite(axis).all():
+            raise GripperError(f"{key}.axis: holds a value that is not finite; three ordinary numbers")
+        ends = np.array([jaw.min_m, jaw.max_m])
+        return np.column_stack([ends, (ends - jaw.nominal_m)[:, None] * axis])
+    if set(motion) != {"table"}:
+        raise GripperError(f"{key}: has the keys {', '.join(motion) or 'none'}; either `axis` or `table`")
+    table = np.array(_convert(motion, TableMotion, key).table)
+    if not np.isfinite(table).all():
+        raise GripperError(f"{key}.table: holds a value that is not finite; ordinary numbers")
+    if not (np.diff(table[:, 0]) > 0.0).all():
+        raise GripperError(f"{key}.table: openings don't ascend; rows sorted by opening_m")
+    if table[0, 0] > jaw.min_m + 1e-9 or table[-1, 0] < jaw.max_m - 1e-9:
+        raise GripperError(f"{key}.table: covers {table[0, 0]} to {table[-1, 0]} m; all of jaw.min_m to jaw.max_m")
+    if np.abs(offset_m(table, jaw.nominal_m)).max() > 1e-6:
+        raise GripperError(f"{key}.table: the finger is not at rest at jaw.nominal_m; an offset of zero there")
+    return table
+
+
+def offset_m(table: Array, opening_m: float) -> Array:
+    """Of a finger (3,) in the gripper frame at an opening."""
+    if len(table) == 1:
+        return table[0, 1:]
+    return np.array([np.interp(opening_m, table[:, 0], table[:, k]) for k in (1, 2, 3)])
+
+
+def _convert(value: Any, kind: type[_T], key: str) -> _T:
+    try:
+        return msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        raise GripperError(f"{key}: {error}") from None
