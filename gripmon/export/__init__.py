@@ -7,7 +7,7 @@ it: each has a file of its own.
 
 from __future__ import annotations
 
-from gripmon.export.export import Exporter, Part
+from gripmon.export.export import Exporter
 from gripmon.export.schemas import SCHEMAS
 
-__all__ = ["SCHEMAS", "Exporter", "Part"]
+__all__ = ["SCHEMAS", "Exporter"]

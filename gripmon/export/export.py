@@ -6,9 +6,9 @@ import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from gripmon.atomic import opened_atomically, remove_leftovers
 from gripmon.export.schemas import SCHEMAS
 from gripmon.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
-from gripmon.playback import FrameTable
-from gripmon.records import AlertRecord, Meta, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.playback import RecordedRun
+from gripmon.records import ReferenceRecord
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
@@ -29,29 +29,6 @@ _NULL = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST_NAME = 120
 _NUMBERED = re.compile(r"-(\d{4,9})$")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-
-
-class Part(Protocol):
-    """What is exported of a recording, e.g. :class:`gripmon.playback.Recording` of a single file."""
-
-    @property
-    def recording_id(self) -> str: ...
-    @property
-    def meta(self) -> Meta | None: ...
-    @property
-    def robot(self) -> str: ...
-    @property
-    def camera(self) -> str: ...
-    @property
-    def frames(self) -> FrameTable: ...
-    @property
-    def alerts(self) -> Sequence[AlertRecord]: ...
-    @property
-    def states(self) -> Sequence[StateRecord]: ...
-    @property
-    def commands(self) -> Sequence[RecordedCommand]: ...
-    @property
-    def references(self) -> Sequence[ReferenceRecord]: ...
 
 
 class Exporter:
@@ -69,7 +46,7 @@ class Exporter:
         self._from: dict[tuple[str, str, str], Path] = {}
         self._references: set[Path] = set()
 
-    def add(self, part: Part, path: Path) -> None:
+    def add(self, part: RecordedRun, path: Path) -> None:
         """Export what the file ``path`` of a recording holds.  Raises OSError if it can't be written."""
         recording_id, number = part.recording_id, _number(part, path)
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
@@ -136,7 +113,7 @@ def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
             writer.write_table(group, row_group_size=max(1, len(group)))
 
 
-def _number(part: Part, path: Path) -> int:
+def _number(part: RecordedRun, path: Path) -> int:
     """Of a file in its run; older ones say it in their names alone."""
     if part.meta is not None:
         return part.meta.file_number

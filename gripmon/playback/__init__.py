@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from gripmon.playback.opening import Collection, open_recordings, recordings_below
 from gripmon.playback.recordings import Picture, Recording, Shot, decode_image
+from gripmon.playback.run import RecordedRun
 from gripmon.playback.table import FrameTable
 
 __all__ = [
     "Collection",
     "FrameTable",
     "Picture",
+    "RecordedRun",
     "Recording",
     "Shot",
     "decode_image",

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from gripmon.records import AlertRecord, Meta, RecordedCommand, RecordedConfiguration, ReferenceRecord, StateRecord
+from gripmon.playback import RecordedRun
+from gripmon.records import RecordedConfiguration
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -13,32 +14,14 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from gripmon.playback import FrameTable, Picture
+    from gripmon.playback import Picture
 
 
-class Source(Protocol):
+class Source(RecordedRun, Protocol):
     """One run of one monitor, as :class:`gripmon.playback.Recording` is."""
 
     @property
-    def recording_id(self) -> str: ...
-    @property
-    def meta(self) -> Meta | None: ...
-    @property
-    def robot(self) -> str: ...
-    @property
-    def camera(self) -> str: ...
-    @property
     def files(self) -> Sequence[Path]: ...
-    @property
-    def frames(self) -> FrameTable: ...
-    @property
-    def alerts(self) -> Sequence[AlertRecord]: ...
-    @property
-    def references(self) -> Sequence[ReferenceRecord]: ...
-    @property
-    def commands(self) -> Sequence[RecordedCommand]: ...
-    @property
-    def states(self) -> Sequence[StateRecord]: ...
     @property
     def configuration(self) -> RecordedConfiguration | None: ...
     @property
