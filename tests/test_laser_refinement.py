@@ -9,6 +9,7 @@ from scipy.stats import f as fisher_f
 
 from gripmon.calibration.laser import common_plane, refinement
 from gripmon.calibration.laser.calibrating import Spots, calibrate, contradictions
+from gripmon.calibration.laser.held_lens import with_held_lens
 from gripmon.calibration.laser.refinement import FALSE_OUTLIERS, refine
 from gripmon.calibration.laser.setup import (
     PARAMETERS,
@@ -131,20 +132,23 @@ def test_spots_noise_that_nobody_told_is_what_the_arms_leaves():
     assert 0.6 < np.mean(sizes) < 1.7
 
 
-def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_its_prior_has_a_part_in_it():
+def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_what_is_not_known_of_it_has_a_part_in_it():
     model = LensModel("brown_conrady", 640, 480)
     right = np.array([543.0, 543.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])
     prior = np.diag([16.0, 16.0, 9.0, 9.0])
-    fixed, freed = [], []
+    fixed, freed, held = [], [], []
     for seed in range(24):
         data, uv = noisy(seed, 0.2, orientations=12)
         believed = right.copy()
         believed[:4] += np.sqrt(prior.diagonal()) * np.random.default_rng(seed + 50).normal(size=4)
         lens = LensPrior(model, believed, (0, 1, 2, 3), prior)
         start = common_plane.solve(model.camera(believed).undistort(uv), data.base_T_ee)
+        problem = SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens)
+        exact = refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)
         for out, found in (
-            (fixed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)),
-            (freed, refine(SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens), start)),
+            (fixed, exact),
+            (held, with_held_lens(exact, problem, lens)),
+            (freed, refine(problem, start)),
         ):
             error = perturbation_between(found.setup.cam_T_base, data.truth.cam_T_base)
             out.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
@@ -152,7 +156,37 @@ def test_a_lens_that_is_a_little_wrong_spoils_the_covariance_unless_its_prior_ha
         assert (found.lens_covariance.diagonal() <= prior.diagonal() * 1.001).all()
         assert found.camera.fx_px == pytest.approx(believed[0] + found.lens[0])
     assert 0.6 < np.mean(freed) < 1.6
+    assert 0.6 < np.mean(held) < 1.6
     assert np.mean(fixed) > 5.0
+
+
+@pytest.mark.parametrize(("free", "aspect"), [((0, 1, 2, 3, 4), None), ((0, 2), 542.9 / 543.0)])
+def test_a_held_lens_moves_the_solution_as_a_solution_with_another_lens_says(free, aspect):
+    data, uv = noisy(3, 0.05, orientations=8)
+    model = LensModel("brown_conrady", 640, 480)
+    believed = np.array([543.0, 542.9, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0])
+    kept = np.ones(len(uv), dtype=bool)
+
+    def solved(change):
+        parameters = believed.copy()
+        parameters[list(free)] += change
+        if aspect is not None:  # fx alone: the aspect is kept
+            parameters[1] += aspect * change[0]
+        found = refine(SpotProblem(model.camera(parameters), data.base_T_ee[kept], uv[kept]), data.truth)
+        assert not change.any() or found.used.all()
+        return found
+
+    kept = solved(np.zeros(len(free))).used
+    found = solved(np.zeros(len(free)))
+    sigmas = np.array([1.0, 1.0, 1.0, 1.0, 1e-3])[list(free)] * 0.1
+    ends = [[solved(s * sigmas * e).setup.cam_T_base for s in (-1.0, 1.0)] for e in np.eye(len(free))]
+    by_lens = np.stack([perturbation_between(*pair) / 2.0 for pair in ends], axis=1)
+    lens = LensPrior(model, believed, free, np.diag(sigmas**2))
+    problem = SpotProblem(model.camera(believed), data.base_T_ee[kept], uv[kept], lens=lens)
+    added = (with_held_lens(found, problem, lens).covariance - found.covariance)[:6, :6]
+    expected = by_lens @ by_lens.T
+    scale = np.sqrt(expected.diagonal())
+    assert np.allclose(added / np.outer(scale, scale), expected / np.outer(scale, scale), atol=0.05)
 
 
 def test_what_is_not_determined_is_refused():

@@ -53,7 +53,8 @@ def add_parser(methods: Any) -> None:
     parser.add_argument(
         "--refine-lens",
         action="store_true",
-        help="estimate the lens, too, from what its calibration's covariance leaves",
+        help="estimate the lens, too, within its calibration's covariance; else it stays as it is, and what its "
+        "covariance leaves open is in the result's",
     )
     parser.add_argument(
         "--arm-noise",
@@ -105,7 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
         files.check_output(Path(arguments.plan), force=arguments.force, option="--plan")
     calibration = _camera(arguments.camera)
     samples, spots, inputs, notes = _data(arguments, calibration)
-    result = _calibrated(calibration, samples, spots, arguments)
+    prior = _prior(calibration, arguments)
+    if prior is None:
+        notes = (*notes, f"{arguments.camera} says nothing of the camera's errors: it counts as exact")
+    result = _calibrated(calibration, prior, samples, spots, arguments)
     written = _document(result, samples, notes, inputs, arguments)
     planned = _planned(result, arguments)
     if arguments.picture is not None:
@@ -156,7 +160,11 @@ def _data(
 
 
 def _calibrated(
-    calibration: CameraCalibration, samples: Samples, spots: Spots, arguments: argparse.Namespace
+    calibration: CameraCalibration,
+    prior: LensPrior | None,
+    samples: Samples,
+    spots: Spots,
+    arguments: argparse.Namespace,
 ) -> LaserResult:
     from gripmon.calibration.laser.calibrating import calibrate
     from gripmon.calibration.sighting import CalibrationError
@@ -167,9 +175,14 @@ def _calibrated(
     except ValueError as error:
         raise common.CommandFailedError(f"--camera {arguments.camera}: {error}", common.EXIT_USAGE) from None
     try:
-        lens = _prior(calibration, arguments.camera) if arguments.refine_lens else None
         return calibrate(
-            camera, samples.base_T_ee, spots, samples.groups, lens=lens, pose_noise=_noise(arguments.arm_noise)
+            camera,
+            samples.base_T_ee,
+            spots,
+            samples.groups,
+            lens=prior,
+            refine_lens=arguments.refine_lens,
+            pose_noise=_noise(arguments.arm_noise),
         )
     except CalibrationError as error:
         raise common.CommandFailedError(f"calibrate laser: {error}") from None
@@ -181,7 +194,8 @@ def _noise(given: tuple[float, float] | None) -> PoseNoise | None:
     return None if given is None else PoseNoise(*given)
 
 
-def _prior(calibration: CameraCalibration, name: str) -> LensPrior:
+def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> LensPrior | None:
+    """What the camera's file knows of its lens; None where it says nothing of its errors."""
     import numpy as np
 
     from gripmon.calibration.intrinsics import lens_vector, model_of
@@ -194,9 +208,11 @@ def _prior(calibration: CameraCalibration, name: str) -> LensPrior:
     names, values = parameter_names(kind), lens_vector(camera)
     unknown = [key for key in calibration.parameters if key not in names]
     if count == 0 or unknown or len(values) != len(names):
+        if not arguments.refine_lens:
+            return None
         raise common.CommandFailedError(
-            f"--refine-lens: {name} has no covariance of parameters that can be refined; a file of gripmon calibrate "
-            "intrinsics",
+            f"--refine-lens: {arguments.camera} has no covariance of parameters that can be refined; a file of gripmon "
+            "calibrate intrinsics",
             common.EXIT_USAGE,
         )
     free = tuple(names.index(key) for key in calibration.parameters)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from gripmon.calibration.laser import common_plane
 from gripmon.calibration.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups
+from gripmon.calibration.laser.held_lens import with_held_lens
 from gripmon.calibration.laser.misreading import SUSPECT_PX, check_reading
 from gripmon.calibration.laser.refinement import Refined, refine
 from gripmon.calibration.laser.setup import LaserSetup
@@ -83,9 +84,12 @@ def calibrate(
     labels: Sequence[str] | None = None,
     *,
     lens: LensPrior | None = None,
+    refine_lens: bool = True,
     pose_noise: PoseNoise | None = None,
 ) -> LaserResult:
-    """Everything at once.  Raises :class:`CalibrationError` with what is wrong with the data."""
+    """Everything at once.  What isn't known of the ``lens`` comes into the covariance; without ``refine_lens`` the lens
+    itself stays as it is.  Raises :class:`CalibrationError` with what is wrong with the data.
+    """
     xy = camera.undistort(spots.uv_px)
     if not np.isfinite(xy).all():
         index = int(np.flatnonzero(~np.isfinite(xy).all(axis=1))[0])
@@ -95,7 +99,7 @@ def calibrate(
     fault: CalibrationError | None = None
     try:
         start = common_plane.solve(xy, base_T_ee, groups)
-        found = _refined(camera, base_T_ee, spots, start, lens, pose_noise)
+        found = _refined(camera, base_T_ee, spots, start, lens if refine_lens else None, pose_noise)
     except CalibrationError as error:
         fault = error
     sound = fault is None and found.refined.used.mean() >= LEAST_AGREEING
@@ -105,7 +109,11 @@ def calibrate(
         raise fault
     _check_distance(found.refined.setup)
     _check_agreement(found.refined, camera.width_px)
-    return replace(found, warnings=contradictions(found.refined.used, groups))
+    refined = found.refined
+    if lens is not None and not refine_lens:
+        problem = SpotProblem(camera, base_T_ee, found.uv_px, spots.covariance_px, lens=lens, pose_noise=pose_noise)
+        refined = with_held_lens(refined, problem, lens)
+    return replace(found, refined=refined, warnings=contradictions(refined.used, groups))
 
 
 def _check_agreement(refined: Refined, width_px: int) -> None:

@@ -12,11 +12,13 @@ from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera
 from gripmon.records import Array
 
+_FX, _FY = 0, 1  # the first two parameters of every lens model
+
 
 @dataclass(frozen=True, slots=True)
 class LensPrior:
     """A calibrated lens that may be refined, too: all its ``parameters`` (k,); ``free`` (p,) which of them were
-    estimated; ``covariance`` (p, p) of these.
+    estimated; ``covariance`` (p, p) of these.  Where fx alone was, the aspect was held and fy follows.
     """
 
     model: LensModel
@@ -31,6 +33,15 @@ class LensPrior:
             out: Array = np.linalg.inv(np.linalg.cholesky(self.covariance))
         except np.linalg.LinAlgError:
             raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
+        return out
+
+    @property
+    def slopes(self) -> Array:
+        """(k, p), all parameters by the free ones."""
+        out = np.zeros((len(self.parameters), len(self.free)))
+        out[list(self.free), np.arange(len(self.free))] = 1.0
+        if _FX in self.free and _FY not in self.free:
+            out[_FY, self.free.index(_FX)] = self.parameters[_FY] / self.parameters[_FX]
         return out
 
 
@@ -128,7 +139,7 @@ class SpotProblem:
             rows = by_point @ slopes
         else:
             uv_px, by_lens, by_point = self._lens.model.project(self._parameters(self._lens, state), spots)
-            rows = np.concatenate([by_point @ slopes, by_lens[:, :, list(self._lens.free)]], axis=2)
+            rows = np.concatenate([by_point @ slopes, by_lens @ self._lens.slopes], axis=2)
         rows = self._whiten @ rows
         values = np.einsum("nij,nj->ni", self._whiten, self.uv_px - uv_px)
         good = np.isfinite(values).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
@@ -143,6 +154,5 @@ class SpotProblem:
 
     @staticmethod
     def _parameters(lens: LensPrior, state: State) -> Array:
-        parameters = lens.parameters.copy()
-        parameters[list(lens.free)] += state.lens
-        return parameters
+        out: Array = lens.parameters + lens.slopes @ state.lens
+        return out
