@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -48,6 +49,20 @@ def _log_as_found() -> Iterator[None]:
     yield
     logger.handlers, logger.propagate = handlers, propagates
     logger.setLevel(level)
+
+
+TOOLS = Path(__file__).resolve().parent.parent / "tools"
+
+
+@pytest.fixture
+def tools_importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The packages in ``tools``, also in processes that a test starts; each test imports them anew."""
+    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
+    monkeypatch.syspath_prepend(str(TOOLS))
+    yield
+    packages = {path.name for path in TOOLS.iterdir() if path.is_dir()}
+    for name in [name for name in sys.modules if name.partition(".")[0] in packages]:
+        del sys.modules[name]
 
 
 @pytest.fixture

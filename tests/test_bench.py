@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 SIZE = (384, 288)
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    """Also in the processes that the benchmark starts."""
-    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def test_the_whole_run_in_small(capsys: pytest.CaptureFixture[str]):

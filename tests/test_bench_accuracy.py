@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,20 +12,12 @@ import pytest
 from gripmon.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.records import Frame, FrameRecord, Origin, ReferenceRecord, State, Verdict, unmeasured_record
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 TRUTH = make_transform(exp_rotation(np.array([0.5, 0.1, -0.2])), np.array([0.001, -0.002, 0.11]))
 FRAME = Frame(3, 0, np.zeros((4, 4), np.uint8), 0.03)
 REFERENCE = ReferenceRecord("first", 1, 0, "configuration", to_record(TRUTH), tuple(np.eye(6).ravel().tolist()))
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Also in the processes that the benchmark starts."""
-    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def record(error: np.ndarray, covariance: np.ndarray, source: Origin = Origin.UPDATE) -> FrameRecord:

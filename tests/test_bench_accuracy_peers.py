@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -14,15 +11,7 @@ import pytest
 from gripmon.geometry import exp_rotation, make_transform, perturb
 from gripmon.simulator import Simulator
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
-
-
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def scene(name: str, number: int, frames: int = 6) -> Any:

@@ -4,23 +4,14 @@ and against what was measured on simulated images.
 
 from __future__ import annotations
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 REGIMES = ("quiet", "working", "rough")
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def own_statistics(model, scenes: int = 200):

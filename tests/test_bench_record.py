@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,7 @@ TOOLS = Path(__file__).resolve().parent.parent / "tools"
 SIZE = (384, 288)
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    """Also in the processes that the benchmark starts."""
-    monkeypatch.setenv("PYTHONPATH", f"{TOOLS}:{TOOLS.parent}")
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 @pytest.fixture(scope="module")

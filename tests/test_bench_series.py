@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,17 +11,11 @@ from simulated import nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.simulator.scenario import Pairs
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 METHOD = Path(__file__).resolve().parent.parent.parent / "shared" / "method.md"
 VARIANTS = ("3P-U", "4P-U", "5P-U", "all-U", "4P-R", "5P-R", "edges")
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def plain_pairs(tcp_shift_m: tuple[float, float], count: int = 2):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,12 +17,7 @@ TOOLS = Path(__file__).resolve().parent.parent / "tools"
 POSES = np.random.default_rng(5).uniform(-3.0, 3.0, (20, 6))
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] in ("servoing", "benchmarks")]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 def by_hand(q: np.ndarray) -> np.ndarray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import msgspec
@@ -15,16 +14,10 @@ from gripmon.geometry import exp_rotation, from_record, invert, make_transform
 from gripmon.records import Smoothed, Transform, Verdict
 
 pytest.importorskip("pinocchio")
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 FPS = 30.0
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] in ("servoing", "benchmarks")]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 class World:

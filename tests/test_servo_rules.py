@@ -10,16 +10,10 @@ import pytest
 
 from gripmon.records import Verdict
 
-TOOLS = Path(__file__).resolve().parent.parent / "tools"
 NAN = float("nan")
 
 
-@pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(TOOLS))
-    yield
-    for name in [name for name in sys.modules if name.split(".")[0] in ("servoing", "benchmarks")]:
-        del sys.modules[name]
+pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
 @pytest.mark.parametrize(

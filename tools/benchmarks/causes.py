@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import sys
 from dataclasses import dataclass
 from typing import Any
@@ -70,12 +69,9 @@ def run(arguments: argparse.Namespace) -> int:
         return 2
     described = machine.description()
     outcomes = measure(rows, arguments.trials, arguments.seed)
-    print(as_text(described, arguments.seed, outcomes))
-    if arguments.json is not None:
-        plain = [dataclasses.asdict(outcome) for outcome in outcomes]
-        arguments.json.write_text(
-            json.dumps({"machine": described, "seed": arguments.seed, "trials": plain}, indent=1) + "\n"
-        )
+    plain = [dataclasses.asdict(outcome) for outcome in outcomes]
+    document = {"machine": described, "seed": arguments.seed, "trials": plain}
+    options.deliver(arguments, "causes", as_text(described, arguments.seed, outcomes), document)
     return 0
 
 

@@ -7,12 +7,13 @@ bracket; the live average gets every frame as the monitor gives it.  Both see th
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from benchmarks import options
 
 _DESCRIPTION = """\
 Error of the TCP's position and of the rotation, live (raw, smoothed) and corrected afterwards from the whole
@@ -304,18 +305,20 @@ def draw(path: Path, seed: int) -> None:
 
 def add_parser(commands: Any) -> None:
     """Add the benchmark to ``tools/bench``."""
-    parser = commands.add_parser(
+    parser = options.add_command(
+        commands,
         "correction",
-        help="the retroactively corrected transform beside the live ones",
-        description=_DESCRIPTION,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        run,
+        "the retroactively corrected transform beside the live ones",
+        _DESCRIPTION,
+        seed=True,
+        as_json="write all rows",
     )
-    parser.add_argument("--streams", type=int, default=8, metavar="N", help="streams of each scenario (default 8)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of everything random (default 1)")
+    parser.add_argument(
+        "--streams", type=options.positive, default=8, metavar="N", help="of each scenario (default %(default)s)"
+    )
     parser.add_argument("--only", default="", metavar="TEXT", help="scenarios whose regime: name contains it")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows")
     parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw two scenarios instead of measuring")
-    parser.set_defaults(handler=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -324,9 +327,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from benchmarks import machine
 
-    if arguments.streams < 1 or arguments.seed < 0:
-        print("correction: --streams must be at least 1 and --seed at least 0", file=sys.stderr)
-        return 2
     if arguments.picture is not None:
         draw(arguments.picture, arguments.seed)
         return 0
@@ -338,7 +338,6 @@ def run(arguments: argparse.Namespace) -> int:
     with tqdm(total=len(wanted) * arguments.streams, unit="run", file=sys.stderr, disable=None) as bar:
         rows += [measure(scenario, arguments.streams, arguments.seed, bar.update) for scenario in wanted]
     print(f"gripmon {about['commit']}, {about['date']}, {about['cpu']}; {arguments.streams} streams a scenario\n")
-    print(markdown(rows))
-    if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"machine": about, "rows": [asdict(r) for r in rows]}, indent=2) + "\n")
+    document = {"machine": about, "rows": [asdict(r) for r in rows]}
+    options.deliver(arguments, "correction", markdown(rows), document)
     return 0

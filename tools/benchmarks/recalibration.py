@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -88,11 +87,9 @@ def run(arguments: argparse.Namespace) -> int:
     numbers = range(arguments.first, arguments.first + arguments.trials)
     bar = tqdm(numbers, desc="knocks", unit="knock", file=sys.stderr, disable=None)
     outcomes = [trial(arguments.seed, number) for number in bar]
-    print(as_text(described, arguments.seed, outcomes))
-    if arguments.json is not None:
-        rows = [asdict(outcome) for outcome in outcomes]
-        document = {"machine": described, "seed": arguments.seed, "trials": rows}
-        arguments.json.write_text(json.dumps(document, indent=1) + "\n")
+    rows = [asdict(outcome) for outcome in outcomes]
+    document = {"machine": described, "seed": arguments.seed, "trials": rows}
+    options.deliver(arguments, "recalibration", as_text(described, arguments.seed, outcomes), document)
     return int(any(outcome.wrong for outcome in outcomes))
 
 

@@ -19,7 +19,6 @@ corners in both images counts as missed.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
@@ -189,16 +188,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     from benchmarks import machine
 
-    if arguments.seed < 0:
-        print(f"series: --seed {arguments.seed}: a whole number, 0 or more", file=sys.stderr)
-        return 2
     about = machine.description()
     with tqdm(desc="pairs", unit="pair", file=sys.stderr, disable=None) as bar:
         rows = tables(arguments.seed, bar.update)
     print(f"gripmon {about['commit']}, {about['date']}, {about['cpu']}; seed {arguments.seed}\n")
-    print(markdown(rows))
-    print("\n" + "\n".join(verdicts(rows)))
-    if arguments.json is not None:
-        lines = [{**asdict(row), "met": row.met} for row in rows]
-        arguments.json.write_text(json.dumps({"machine": about, "rows": lines}, indent=2) + "\n")
+    text = "\n".join((markdown(rows), "", *verdicts(rows)))
+    lines = [{**asdict(row), "met": row.met} for row in rows]
+    options.deliver(arguments, "series", text, {"machine": about, "rows": lines})
     return 0

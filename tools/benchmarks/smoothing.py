@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -189,7 +188,9 @@ def add_parser(commands: Any) -> None:
         seed=True,
         as_json="write all rows",
     )
-    parser.add_argument("--streams", type=int, default=32, metavar="N", help="streams of each regime (default 32)")
+    parser.add_argument(
+        "--streams", type=options.positive, default=32, metavar="N", help="of each regime (default %(default)s)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -199,9 +200,6 @@ def run(arguments: argparse.Namespace) -> int:
     from benchmarks import machine
     from benchmarks.noise_model import REGIMES
 
-    if arguments.streams < 1 or arguments.seed < 0:
-        print("smoothing: --streams must be at least 1 and --seed at least 0", file=sys.stderr)
-        return 2
     about = machine.description()
     quiet, events = [], []
     total = len(REGIMES) * arguments.streams * (1 + len(_ways()))
@@ -211,8 +209,6 @@ def run(arguments: argparse.Namespace) -> int:
             quiet.append(row)
             events += rows
     print(f"gripmon {about['commit']}, {about['date']}, {about['cpu']}; {arguments.streams} streams a regime\n")
-    print(markdown(quiet, events))
-    if arguments.json is not None:
-        rows_by_kind = {"quiet": [asdict(r) for r in quiet], "events": [asdict(e) for e in events]}
-        arguments.json.write_text(json.dumps({"machine": about, **rows_by_kind}, indent=2) + "\n")
+    rows_by_kind = {"quiet": [asdict(r) for r in quiet], "events": [asdict(e) for e in events]}
+    options.deliver(arguments, "smoothing", markdown(quiet, events), {"machine": about, **rows_by_kind})
     return 0
