@@ -58,7 +58,7 @@ def add_parser(methods: Any) -> None:
     )
     parser.add_argument(
         "--arm-noise",
-        type=_arm_noise,
+        type=common.arm_noise,
         metavar="M:RAD",
         help="standard deviations of the arm's poses, position (m) and rotation (rad), each axis (default: none)",
     )
@@ -79,17 +79,6 @@ def _reach(text: str) -> float:
     if value > LONGEST_ARM_M:
         raise argparse.ArgumentTypeError(f"{text} m is no arm's reach (millimetres?); metres, e.g. 0.85")
     return value
-
-
-def _arm_noise(text: str) -> tuple[float, float]:
-    parts = text.split(":")
-    try:
-        position, rotation = (float(part) for part in parts)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
-    if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
-        raise argparse.ArgumentTypeError(f"{text} is no arm's noise; metres and radians, e.g. 0.0001:0.0002")
-    return position, rotation
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, expected, margins, outside, second_check, second_run, sweep
+from gripmon.cli import check_laser, common, expected, margins, outside, second_check, second_run, sweep
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -23,6 +23,9 @@ calibrate anew, how far camera and jaws may move until too little is in view.
 Of a second camera (a configuration with a section laser): its calibration and what is known of its
 errors, and where frames and pulses come from.
 
+With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
+camera, plane and laser pointer fresh spots would tell, or do tell.
+
 With --sweep: what other camera mounts and lenses would see, as a table and a picture, before
 anyone drills a hole."""
 
@@ -31,10 +34,13 @@ _EXAMPLES = """\
   gripmon check configs/folder.yaml --json | python3 -m json.tool
   gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6 --picture sweep.png
   gripmon check configs/folder.yaml --sweep --fov 40,60,80 --roll 0,90 --at 384,288
+  gripmon check --laser laser.yaml
+  gripmon check --laser laser.yaml fresh_spots.csv --arm-noise 0.0002:0.0004
 
 exit codes: 0 sound; 2 a fault in the configuration, in a file of Zenoh's that it names, or a package
 that it needs is missing (one line says file, key, what is wrong, what would be right); 3 the
-configuration is sound, but its camera can't be reached now"""
+configuration is sound, but its camera can't be reached now; or something has moved since a laser
+calibration, or its spots don't tell"""
 
 
 def add_parser(commands: Any) -> None:
@@ -42,13 +48,27 @@ def add_parser(commands: Any) -> None:
     parser = common.add_command(
         commands, "check", run, "validate a configuration and show what it expects to see", _DESCRIPTION, _EXAMPLES
     )
-    parser.add_argument("config", metavar="CONFIG", help="configuration file (YAML)")
+    parser.add_argument(
+        "config", nargs="*", metavar="CONFIG", help="configuration file (YAML); with --laser: tables of fresh spots"
+    )
     parser.add_argument("--json", action="store_true", help="one JSON object instead of text; metres, radians, px")
     sweep.add_options(parser)
+    check_laser.add_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon check``."""
+    if arguments.laser is not None:
+        if arguments.sweep:
+            raise common.CommandFailedError("--sweep: not with --laser; one of them", common.EXIT_USAGE)
+        sweep.refuse_without_sweep(arguments)
+        return check_laser.run(arguments)
+    check_laser.refuse_without_laser(arguments)
+    if len(arguments.config) != 1:
+        raise common.CommandFailedError(
+            f"check: {len(arguments.config)} configurations; one, or --laser LASER.yaml", common.EXIT_USAGE
+        )
+    arguments.config = arguments.config[0]
     if arguments.sweep:
         return sweep.run(arguments)
     sweep.refuse_without_sweep(arguments)

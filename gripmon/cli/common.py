@@ -61,6 +61,18 @@ def positive_number(text: str) -> float:
     return value
 
 
+def arm_noise(text: str) -> tuple[float, float]:
+    """An argument M:RAD, standard deviations of an arm's poses."""
+    parts = text.split(":")
+    try:
+        position, rotation = (float(part) for part in parts)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
+    if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
+        raise argparse.ArgumentTypeError(f"{text} is no arm's noise; metres and radians, e.g. 0.0001:0.0002")
+    return position, rotation
+
+
 def seed(text: str) -> int:
     """An argument that seeds a simulation."""
     if not text.isdecimal() or int(text) > _LARGEST_SEED:

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from gripmon.calibration.laser.calibrating import Spots
     from gripmon.calibration.laser.planning import Plan
     from gripmon.calibration.laser.samples import Samples
+    from gripmon.calibration.laser.spots import Spot
+    from gripmon.calibration.sighting import NotFound
 
 _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
 
@@ -208,6 +210,35 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
             kept.append(k)
     covariance = covariances[kept] if unseen else None
     return Spots(uv_px[kept], covariance, tuple(others[k] for k in kept) if unseen else ()), kept, missing
+
+
+def candidates(samples: Samples, origins: list[Path], size_px: tuple[int, int]) -> list[list[Spot] | NotFound]:
+    """Of every sample: what may be its spot, or why there is none."""
+    from gripmon.calibration.laser.spots import find_spots as in_image
+    from gripmon.spotwatch import plain_spot
+
+    unseen = set(_unseen(samples))
+    out: list[list[Spot] | NotFound] = []
+    with common.progress_bar(len(samples), "spot") as step:
+        for k, origin in enumerate(origins):
+            step()
+            if k not in unseen:
+                _check_inside(samples, k, origin, size_px)
+                out.append([plain_spot(samples.uv_px[k])])
+                continue
+            image, off = _image(origin.parent / str(samples.images[k]), size_px), samples.laser_off[k]
+            out.append(in_image(image, None if off is None else _image(origin.parent / off, size_px)))
+    return out
+
+
+def _check_inside(samples: Samples, k: int, origin: Path, size_px: tuple[int, int]) -> None:
+    u, v = samples.uv_px[k]
+    if not (-0.5 <= u <= size_px[0] - 0.5 and -0.5 <= v <= size_px[1] - 0.5):
+        raise common.CommandFailedError(
+            f"{origin}: {samples.names[k]}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
+            f"{size_px[0]} x {size_px[1]} px; spots of this camera",
+            common.EXIT_USAGE,
+        )
 
 
 def _image(path: Path, size_px: tuple[int, int]) -> Any:

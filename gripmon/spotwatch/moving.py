@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,12 +28,14 @@ RELIEF = 0.8
 class Moved:
     """``shift_m``: how far the calibration now puts a spot from where it is, the largest over the last poses (infinite
     where the camera sees none of them any more), and that shift in camera axes (3,); ``change`` (13,) the best guess
-    of the motion; ``causes`` the most probable first; ``motion`` of the camera, if it may be that.
+    of the motion; ``plane_m`` how far the plane then is behind where it was, seen from the camera, at the last pose's
+    spot; ``causes`` the most probable first; ``motion`` of the camera, if it may be that.
     """
 
     shift_m: float
     shift_cam_m: Array | None
     change: Array
+    plane_m: float
     causes: tuple[CauseWeight, ...]
     motion: CameraMotion | None
 
@@ -49,7 +52,8 @@ def how(test: MotionTest, calibrated: Calibrated, poses: Sequence[Array]) -> Mov
     if shares[0] > MAYBE:
         motion = camera_motion(beliefs, int(camera[beliefs.weight[camera].argmax()]))
     shift_m, shift_cam_m = _shift(calibrated, change, poses)
-    return Moved(shift_m, shift_cam_m, change, tuple(sorted(causes, key=lambda w: -w.probability)), motion)
+    plane_m = _plane(calibrated, change, poses[-1]) if poses else math.nan
+    return Moved(shift_m, shift_cam_m, change, plane_m, tuple(sorted(causes, key=lambda w: -w.probability)), motion)
 
 
 def _shift(calibrated: Calibrated, change: Array, poses: Sequence[Array]) -> tuple[float, Array | None]:
@@ -68,6 +72,13 @@ def _shift(calibrated: Calibrated, change: Array, poses: Sequence[Array]) -> tup
     if found is None:
         return (float("inf") if missed else 0.0), None
     return largest, world.base_T_cam[:3, :3].T @ found
+
+
+def _plane(calibrated: Calibrated, change: Array, pose: Array) -> float:
+    lit, spot = calibrated.world.lit, foresee_moved(calibrated, change, pose).spot_base_m
+    off = float(lit.normal_cam @ spot) - lit.distance_m
+    behind = lit.distance_m - float(lit.normal_cam @ calibrated.world.base_T_cam[:3, 3])
+    return math.copysign(off, off * behind)
 
 
 def on_plane(world: World, calibrated: Calibrated, uv_px: Array) -> Array:
@@ -91,7 +102,7 @@ def alert_of(moved: Moved, settings: SpotWatchSettings, before: Alert | None) ->
         AlertKind.DRIFT,
         cause,
         _severity(moved.shift_m, settings, None if before is None else before.severity),
-        words.moved(moved.shift_m, moved.causes, cause, moved.change, moved.motion),
+        words.moved(moved.shift_m, moved.causes, cause, moved.change, moved.plane_m, moved.motion),
         causes=moved.causes,
         tcp_shift_m=None if shift is None else (float(shift[0]), float(shift[1]), float(shift[2])),
         rotation_rad=turn,

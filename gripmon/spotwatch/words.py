@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gripmon.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
-from gripmon.spotwatch.judgement import CameraMotion, Disagreement, SpotFault
+from gripmon.spotwatch.judgement import CameraMotion, SpotFault
 
 _WHAT = {
     Cause.CAMERA_MOUNT: "the camera",
@@ -19,9 +19,14 @@ _WHAT = {
 
 
 def moved(
-    shift_m: float, causes: Sequence[CauseWeight], cause: Cause, change: Array, motion: CameraMotion | None
+    shift_m: float,
+    causes: Sequence[CauseWeight],
+    cause: Cause,
+    change: Array,
+    plane_m: float,
+    motion: CameraMotion | None,
 ) -> str:
-    """Text of an alert; ``change`` (13,) is the motion of what moved."""
+    """Text of an alert; ``change`` (13,) is the motion of what moved, ``plane_m`` the plane's, away from the camera."""
     text = f"spots are {1e3 * shift_m:.2f} mm from where the calibration has them"
     if not np.isfinite(shift_m):
         text = "spots are nowhere near where the calibration has them"
@@ -34,7 +39,8 @@ def moved(
         return f"{text}: the camera moved {motion.text}"
     if cause is Cause.PLANE_MOVED:
         tilt = math.degrees(float(np.hypot(*change[6:8])))
-        return f"{text}: the plane moved, {1e3 * change[8]:+.2f} mm at the base's origin, tilted by {tilt:.3f} degrees"
+        way = "away from" if plane_m > 0.0 else "towards"
+        return f"{text}: the plane moved {1e3 * abs(plane_m):.2f} mm {way} the camera, tilted by {tilt:.3f} degrees"
     turn = math.degrees(float(np.hypot(*change[9:11])))
     shift = 1e3 * float(np.hypot(*change[11:13]))
     return f"{text}: the laser pointer moved on the arm, turned by {turn:.3f} degrees, shifted by {shift:.2f} mm"
@@ -69,8 +75,3 @@ def outlier(off_px: Array, square: float) -> str:
         f"{float(np.linalg.norm(off_px)):.1f} px from where it should be ({math.sqrt(square):.1f} sigma): "
         "a reflection, or something has moved"
     )
-
-
-def agreement(disagreements: Sequence[Disagreement]) -> str:
-    """Which of the ways to the spot agree with each other."""
-    return ", ".join(f"{' / '.join(d.ways)} {1e3 * d.distance_m:.2f} ± {1e3 * d.sigma_m:.2f} mm" for d in disagreements)
