@@ -242,6 +242,13 @@ def test_the_present_mount_is_that_of_the_configuration(capsys: pytest.CaptureFi
     assert values["present"]["weakest"]["tcp_m"] == pytest.approx(checked["accuracy"]["weakest"]["tcp_m"], rel=1e-9)
     assert math.degrees(values["present"]["tilt_rad"]) == pytest.approx(31.0, abs=0.01)
     assert values["mounts"][0]["worst_sigma_m"] == pytest.approx(values["present"]["worst_sigma_m"], rel=0.01)
+    over_jaw = checked["in_view"]["jaw_travel"]["certainty"]
+    there = dict(zip(over_jaw["opening_m"], over_jaw["worst_sigma_m"], strict=True))
+    assert there[values["present"]["worst_at_m"]] == pytest.approx(values["present"]["worst_sigma_m"], rel=1e-9)
+    # Without the part of the jaw's travel that is worst it isn't as bad.
+    open_ones = swept(capsys, "--distance", "0.1188", "--tilt", "31", "--jaw", "0.03:0.06")["present"]
+    assert open_ones["jaw"]["opening_m"][0] == 0.03 and open_ones["jaw"]["opening_m"][-1] == 0.06
+    assert open_ones["worst_sigma_m"] < values["present"]["worst_sigma_m"]
 
 
 def test_lenses_sides_and_rolls_are_axes_too(capsys: pytest.CaptureFixture[str]):
@@ -358,6 +365,9 @@ def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.
         (["--sweep", "--distance", "0.1:0.2"], "--distance 0.1:0.2: is no range"),
         (["--sweep", "--distance", "nan"], "nan m is out of bounds"),
         (["--sweep", "--distance", ""], "--distance : is no range"),
+        (["--sweep", "--jaw", "0.02"], "--jaw 0.02: is no range; MIN:MAX in metres, within 0:0.06"),
+        (["--sweep", "--jaw", "0.02:0.2"], "--jaw 0.02:0.2: is not in the jaw's travel"),
+        (["--jaw", "0.02:0.03"], "--jaw: only has a meaning for a sweep"),
         (["--sweep", "--tilt", "10:60:0"], "--tilt 10:60:0: is no range"),
         (["--sweep", "--tilt", "ten"], "--tilt ten: is no range"),
         (["--sweep", "--tilt=-10"], "-10 degrees is out of bounds"),

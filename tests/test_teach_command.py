@@ -160,6 +160,10 @@ def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest
     assert abs(largest["offset_m"]) == max(abs(v) for edge in edges.values() for v in edge.offset_m)
     assert largest["offset_px"] == pytest.approx(largest["offset_m"] * 962.0 / 0.115)
     assert report["accuracy"]["edges"] == 10, "the creases, too"
+    # A sweep looks with the same edges.
+    assert main(["check", str(rig / "config.yaml"), "--sweep", "--distance", "0.12", "--tilt", "30", "--json"]) == 0
+    present = json.loads(capsys.readouterr().out)["present"]
+    assert present["sigma"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
     assert main(["check", str(rig / "untaught.yaml")]) == 0
     assert "gripmon teach" in capsys.readouterr().out
 

@@ -187,6 +187,10 @@ def test_check_tells_the_margins(capsys: pytest.CaptureFixture[str]):
     assert may["shift_m"]["z"][0] is None and may["turn_rad"]["z"] == [None, None]
     assert f"the shortest way is {1e3 * min(may['shift_m']['y']):.1f} mm along" in text
     assert "jaw travel enough is visible in 100 % of 0 to 60 mm; corners 4 to 6, edges 5 to 8" in text
+    certainty = values["jaw_travel"]["certainty"]
+    least = max(zip(certainty["worst_sigma_m"], certainty["opening_m"], strict=True))
+    assert f"the TCP is least certain at {1e3 * least[1]:.1f} mm of opening: to {1e3 * least[0]:.3f} mm" in text
+    assert "count as suspect" not in text and least[0] < certainty["suspect_from_m"]
     assert f"{values['border']['smallest_px']:.0f} px from the {values['border']['side']}" in text
 
 

@@ -63,11 +63,12 @@ def _camera_values(config: Config, rig: Rig) -> dict[str, Any]:
 
 
 def _jaw_values(config: Config, rig: Rig) -> dict[str, Any] | None:
-    from gripmon.outlook import over_jaw
+    from gripmon.outlook import certainty, over_jaw
 
     travel = over_jaw(rig, config.cam_T_grip)
     if travel is None:
         return None
+    openings_m, sigma_m = certainty(rig, config.cam_T_grip)
     return {
         "share": travel.share,
         "gaps": [gap._asdict() for gap in travel.gaps],
@@ -75,6 +76,11 @@ def _jaw_values(config: Config, rig: Rig) -> dict[str, Any] | None:
         "edges": [int(travel.edges.min()), int(travel.edges.max())],
         "from_m": config.gripper.jaw_min_m,
         "to_m": config.gripper.jaw_max_m,
+        "certainty": {
+            "opening_m": openings_m.tolist(),
+            "worst_sigma_m": [None if math.isnan(v) else v for v in sigma_m.tolist()],
+            "suspect_from_m": config.settings.monitor.policy.suspect_sigma_m,
+        },
     }
 
 
@@ -137,7 +143,22 @@ def _jaw_lines(jaw: dict[str, Any] | None) -> list[str]:
         f"           NOT from {1e3 * gap['from_m']:.2f} to {1e3 * gap['to_m']:.2f} mm: {gap['reason']}"
         for gap in jaw["gaps"]
     ]
-    return [f"jaw travel enough is visible in {travel}; corners {corners}, edges {edges}", *gaps]
+    seen = f"jaw travel enough is visible in {travel}; corners {corners}, edges {edges}"
+    return [seen, *gaps, *_certainty_lines(jaw["certainty"])]
+
+
+def _certainty_lines(values: dict[str, Any]) -> list[str]:
+    known = [(s, m) for m, s in zip(values["opening_m"], values["worst_sigma_m"], strict=True) if s is not None]
+    if not known:
+        return []
+    (least_m, at_m), limit_m = max(known), values["suspect_from_m"]
+    lines = [f"           the TCP is least certain at {1e3 * at_m:.1f} mm of opening: to {1e3 * least_m:.3f} mm"]
+    suspect = [m for s, m in known if s >= limit_m]
+    if suspect:
+        where = f"from {1e3 * min(suspect):.1f} to {1e3 * max(suspect):.1f} mm" if len(suspect) > 1 else "there"
+        what = f"transforms count as suspect {where}: {1e3 * limit_m:g} mm and more (monitor.policy.suspect_sigma_m)"
+        lines.append(f"           {what}")
+    return lines
 
 
 def _percent(share: float) -> str:

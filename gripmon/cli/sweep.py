@@ -64,10 +64,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="U,V",
         help="where the TCP shows in the present camera's image (px; default: as now)",
     )
+    group.add_argument("--jaw", metavar="MIN:MAX", help="openings at which it has to work (m; default: all)")
     group.add_argument("--picture", metavar="FILE", help="draw the sweep (.png, .jpg)")
 
 
-_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "picture")
+_OPTIONS = ("distance", "tilt", "side", "roll", "focal", "fov", "lens", "at", "jaw", "picture")
 
 
 def refuse_without_sweep(arguments: argparse.Namespace) -> None:
@@ -79,8 +80,9 @@ def refuse_without_sweep(arguments: argparse.Namespace) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Try the mounts, print the table, draw the picture."""
-    config = common.load(arguments.config, check_source=False, with_taught=False)
+    config = common.load(arguments.config, check_source=False)
     grid, at_px = _grid(config, arguments)
+    travel_m = _travel(config, arguments.jaw)
     picture = None if arguments.picture is None else Path(arguments.picture)
     if picture is not None:
         _check_picture(picture)
@@ -88,10 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.outlook.picture import draw_sweep
 
     opening_m = config.jaw_opening_m
-    present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m)
+    present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m, travel_m)
     trials = []
     with common.progress_bar(len(grid), "mount") as step:
-        for trial in tried(grid, opening_m):
+        for trial in tried(grid, opening_m, travel_m):
             trials.append(trial)
             step()
     ranked = sorted(trials, key=lambda trial: trial.rank)
@@ -153,6 +155,23 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
             f"--sweep: {len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", common.EXIT_USAGE
         )
     return grid, at_px
+
+
+def _travel(config: Config, text: str | None) -> tuple[float, float] | None:
+    """The part of the jaw's travel that counts; a fault ends the command with exit code 2."""
+    gripper = config.gripper
+    if text is None:
+        return None
+    right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
+    if not gripper.jaw_max_m > gripper.jaw_min_m:
+        raise common.CommandFailedError("--jaw: the gripper's jaw doesn't move; leave it out", common.EXIT_USAGE)
+    try:
+        low_m, high_m = (float(part) for part in text.split(":"))
+    except ValueError:
+        raise common.CommandFailedError(f"--jaw {text}: is no range; {right}", common.EXIT_USAGE) from None
+    if not gripper.jaw_min_m <= low_m < high_m <= gripper.jaw_max_m:
+        raise common.CommandFailedError(f"--jaw {text}: is not in the jaw's travel; {right}", common.EXIT_USAGE)
+    return low_m, high_m
 
 
 def _or(text: str | None, default: str) -> str:

@@ -61,6 +61,7 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
         "sigma": None if sigma is None else {"tcp_m": sigma[:3], "rotation_rad": sigma[3:]},
         "weakest": None if weakest is None else {"tcp_m": weakest[:3], "rotation_rad": weakest[3:]},
         "worst_sigma_m": trial.worst_sigma_m,
+        "worst_at_m": trial.worst_at_m,
         "smallest": None if smallest is None else {"tcp_m": smallest[:3], "rotation_rad": smallest[3:]},
         "delay_frames": trial.delay_frames,
         "margin_px": trial.margin_px,
@@ -71,7 +72,7 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
 
 _COLUMNS = (
     ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
-    ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 7),
+    ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 8),
     ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
 )  # fmt: skip
 
@@ -82,6 +83,7 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
     lines = [
         f"{config.path}: {len(ranked)} mounts tried, {working} would work",
         f"TCP        at ({at_px[0]:.1f}, {at_px[1]:.1f}) px in all of them",
+        *_looked_at(config, present),
         " " * 10 + "".join(title.rjust(width) for title, _, width in _COLUMNS),
         " " * 10 + "".join(unit.rjust(width) for _, unit, width in _COLUMNS),
     ]
@@ -108,13 +110,25 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
     return lines
 
 
+def _looked_at(config: Config, present: Trial) -> list[str]:
+    """Which openings count, and how taught edges do."""
+    lines = []
+    low_mm, high_mm = 1e3 * present.openings_m[0], 1e3 * present.openings_m[-1]
+    if high_mm > low_mm:
+        usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
+        lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
+    if config.taught is not None:
+        lines.append("taught     as seen from the present mount; taught anew at another one it gets more exact there")
+    return lines
+
+
 def _row(camera: Camera, trial: Trial) -> str:
     mount, covariance = trial.mount, trial.covariance
     angles = (math.degrees(v) for v in (mount.tilt_rad, mount.side_rad, mount.roll_rad))
     cells = [f"{1e3 * mount.distance_m:.1f}", *(f"{round(v, 1) + 0.0:.1f}" for v in angles), f"{camera.fx_px:.0f}"]
     cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
     if covariance is not None:
-        cells += [f"{1e3 * math.sqrt(v):.3f}" for v in covariance.diagonal()[:3].tolist()]
+        cells += [_number(math.sqrt(v), 1e3, 3) for v in covariance.diagonal()[:3].tolist()]
         cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
         cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
         cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
@@ -123,7 +137,10 @@ def _row(camera: Camera, trial: Trial) -> str:
 
 
 def _number(value: float | None, factor: float, digits: int) -> str:
-    return "-" if value is None else f"{factor * value:.{digits}f}"
+    if value is None:
+        return "-"
+    scaled = factor * value
+    return f"{scaled:.{digits if abs(scaled) < 10.0 or digits < 2 else 1}f}"
 
 
 def _failing(ranked: list[Trial]) -> list[str]:

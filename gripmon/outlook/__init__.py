@@ -12,7 +12,7 @@ from gripmon.outlook.expected import (
     foresee_frame,
     weakest_direction,
 )
-from gripmon.outlook.jaw_travel import Gap, JawTravel, over_jaw
+from gripmon.outlook.jaw_travel import Gap, JawTravel, certainty, over_jaw
 from gripmon.outlook.margins import Border, Freedom, border, freedom, moved_camera, sideways_m
 from gripmon.outlook.mounts import Mount, field_of_view_rad, towards, with_focal
 from gripmon.outlook.sweep import Grid, Trial, tried, try_mount
@@ -37,6 +37,7 @@ __all__ = [
     "Trial",
     "behind_another_finger",
     "border",
+    "certainty",
     "expect",
     "field_of_view_rad",
     "foresee_frame",

@@ -9,11 +9,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.outlook.expected import foresee_frame
 from gripmon.outlook.visibility import Rig, Sight, see
 from gripmon.records import Array
 
 OPENINGS = 121
 """Openings that are looked at; where the view fails between two that both suffice is not seen."""
+
+CERTAINTY_AT = 13
+"""Openings at which a frame's accuracy is reckoned."""
 
 _HALVINGS = 14
 
@@ -62,6 +66,19 @@ def over_jaw(rig: Rig, cam_T_grip: Array, count: int = OPENINGS) -> JawTravel | 
         np.array([s.corners for s in sights], dtype=np.intp),
         np.array([s.edges for s in sights], dtype=np.intp),
     )
+
+
+def certainty(rig: Rig, cam_T_grip: Array, count: int = CERTAINTY_AT) -> tuple[Array, Array]:
+    """Openings (n,) from end to end, and the standard deviation (n,) of a frame's TCP along its least certain direction
+    there, NaN where too little is visible.
+    """
+    openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count)
+    sigma_m = np.full(count, np.nan)
+    for k, opening_m in enumerate(openings_m.tolist()):
+        if see(rig, cam_T_grip, opening_m).enough:
+            covariance = foresee_frame(rig, cam_T_grip, opening_m).covariance
+            sigma_m[k] = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    return openings_m, sigma_m
 
 
 def _gaps(openings_m: Array, enough: list[bool], look: Callable[[float], Sight]) -> tuple[Gap, ...]:

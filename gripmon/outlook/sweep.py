@@ -71,10 +71,10 @@ class Trial:
     ``sight`` at the usual opening.  ``corners``, ``edges`` (n,) at ``openings_m`` (n,), ``share`` of these openings at
     which the monitor can measure.  The rest is None unless it can at the usual opening: ``covariance`` (6, 6) of a
     frame, ``worst_sigma_m`` the standard deviation of the TCP along its least certain direction at the worst of some
-    openings, ``smallest`` (6,) steps that are noticed, ``delay_frames`` for a step of the TCP by the policy's
-    ``warn_m`` along the worst axis (None: not noticed at all); ``margin_px`` of the visible corners from the border and
-    ``shift_m`` that the camera may shift sideways until the monitor can't measure, at the usual opening.  ``faults``:
-    why this mount would not work; none if it would.
+    openings, ``worst_at_m``; ``smallest`` (6,) steps that are noticed, ``delay_frames`` for a step of the TCP by the
+    policy's ``warn_m`` along the worst axis (None: not noticed at all); ``margin_px`` of the visible corners from the
+    border and ``shift_m`` that the camera may shift sideways until the monitor can't measure, at the usual opening.
+    ``faults``: why this mount would not work; none if it would.
     """
 
     mount: Mount
@@ -87,6 +87,7 @@ class Trial:
     sight: Sight
     covariance: Array | None
     worst_sigma_m: float | None
+    worst_at_m: float | None
     smallest: Array | None
     delay_frames: int | None
     margin_px: float | None
@@ -121,20 +122,31 @@ class Trial:
         return (1.0, -self.share, self.noticed_m)
 
 
-def try_mount(rig: Rig, mount: Mount, lens: int, cam_T_grip: Array, jaw_opening_m: float | None) -> Trial:
-    """Look from one mount; ``jaw_opening_m`` is the usual one, None for a gripper without jaw."""
+def try_mount(
+    rig: Rig,
+    mount: Mount,
+    lens: int,
+    cam_T_grip: Array,
+    jaw_opening_m: float | None,
+    travel_m: tuple[float, float] | None = None,
+) -> Trial:
+    """Look from one mount; ``jaw_opening_m`` is the usual one, None for a gripper without jaw.  ``travel_m``: the jaw's
+    travel that counts, all of it if None.
+    """
     gripper = rig.gripper
     usual_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     openings_m = np.array([usual_m])
-    if gripper.jaw_max_m > gripper.jaw_min_m:
-        openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, OPENINGS)
+    low_m, high_m = travel_m or (gripper.jaw_min_m, gripper.jaw_max_m)
+    if high_m > low_m:
+        openings_m = np.linspace(low_m, high_m, OPENINGS)
     sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m.tolist()]
     sight = see(rig, cam_T_grip, usual_m)
-    frame = nearest = smallest = worst = delay = shift_m = None
+    frame = nearest = smallest = delay = shift_m = None
+    worst: tuple[float, float] | None = None
     if sight.enough:
         frame, nearest = foresee_frame(rig, cam_T_grip, usual_m), border(rig, sight)
         smallest, delay = _noticed(frame.covariance, rig.settings.drift, rig.settings.policy.warn_m)
-        worst = _worst_sigma_m(rig, cam_T_grip, [o for o, _ in _closer(openings_m, sights)], frame.covariance)
+        worst = _worst(rig, cam_T_grip, [o for o, _ in _closer(openings_m, sights)], (usual_m, frame.covariance))
         shift_m = sideways_m(rig, cam_T_grip, usual_m)
     return Trial(
         mount,
@@ -146,7 +158,8 @@ def try_mount(rig: Rig, mount: Mount, lens: int, cam_T_grip: Array, jaw_opening_
         float(np.mean([s.enough for s in sights])),
         sight,
         None if frame is None else frame.covariance,
-        worst,
+        None if worst is None else worst[0],
+        None if worst is None else worst[1],
         smallest,
         delay,
         None if nearest is None else nearest.smallest_px,
@@ -160,10 +173,10 @@ def try_mount(rig: Rig, mount: Mount, lens: int, cam_T_grip: Array, jaw_opening_
     )
 
 
-def tried(grid: Grid, jaw_opening_m: float | None) -> Iterator[Trial]:
+def tried(grid: Grid, jaw_opening_m: float | None, travel_m: tuple[float, float] | None = None) -> Iterator[Trial]:
     """Every mount of a grid, one after the other."""
     for mount, k in grid.mounts():
-        yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m)
+        yield try_mount(grid.rigs[k], mount, k, mount.cam_T_grip(grid.towards[k]), jaw_opening_m, travel_m)
 
 
 def _noticed(covariance: Array, settings: DriftSettings, step_m: float) -> tuple[Array, int | None]:
@@ -180,10 +193,10 @@ def _closer(openings_m: Array, sights: list[Sight]) -> list[tuple[float, Sight]]
     return [(float(openings_m[k]), sights[k]) for k in chosen if sights[k].enough]
 
 
-def _worst_sigma_m(rig: Rig, cam_T_grip: Array, openings_m: list[float], usual: Array) -> float:
-    """Largest standard deviation of the TCP in any direction, over the usual and some more openings."""
-    covariances = [usual, *(foresee_frame(rig, cam_T_grip, opening_m).covariance for opening_m in openings_m)]
-    return float(np.sqrt(max(np.linalg.eigvalsh(c[:3, :3])[-1] for c in covariances)))
+def _worst(rig: Rig, cam_T_grip: Array, openings_m: list[float], usual: tuple[float, Array]) -> tuple[float, float]:
+    """Largest standard deviation of the TCP in any direction, over the usual and some more openings, and at which."""
+    each = [usual, *((m, foresee_frame(rig, cam_T_grip, m).covariance) for m in openings_m)]
+    return max((float(np.sqrt(np.linalg.eigvalsh(c[:3, :3])[-1])), opening_m) for opening_m, c in each)
 
 
 def _blind(openings_m: Array, sights: list[Sight], sight: Sight) -> tuple[Fault, ...]:
@@ -212,14 +225,16 @@ def _shifted(rig: Rig, cam_T_grip: Array, openings: list[tuple[float, Sight]]) -
     return ()
 
 
-def _inexact(rig: Rig, worst_sigma_m: float | None, frame: Foreseen | None) -> tuple[Fault, ...]:
+def _inexact(rig: Rig, worst: tuple[float, float] | None, frame: Foreseen | None) -> tuple[Fault, ...]:
     """Whether what is measured would count as suspect, or leave no way back past the limit."""
-    if worst_sigma_m is None or frame is None:
+    if worst is None or frame is None:
         return ()
+    worst_sigma_m, opening_m = worst
     faults, settings = [], rig.settings
     if worst_sigma_m >= settings.policy.suspect_sigma_m:
         most = f"{1e3 * settings.policy.suspect_sigma_m:g} mm and more counts as suspect"
-        faults.append(Fault(INEXACT, f"TCP to {1e3 * worst_sigma_m:.3f} mm only: {most}"))
+        where = f" at {1e3 * opening_m:.1f} mm of opening" if rig.gripper.has_jaw else ""
+        faults.append(Fault(INEXACT, f"TCP to {1e3 * worst_sigma_m:.3f} mm only{where}: {most}"))
     if settings.recalibration.mode != "off":
         taken = rig.gripper.innermost_corners(frame.usable, CORNER_COUNTS[settings.recalibrate_corners])
         points_m = rig.gripper.points_grip_m(None)[rig.gripper.corner_points][taken]
