@@ -120,12 +120,17 @@ class Watch:
     @property
     def tcp_shift_m(self) -> tuple[float, float, float] | None:
         """Of the last transform, if it still counts: against the reference, along the camera's axes, m."""
-        return None if self._judged is None or self.verdict is Verdict.UNKNOWN else self._judged.tcp_shift_m
+        return self._judged.tcp_shift_m if self._judged is not None and self._holds else None
 
     @property
     def sigma_m(self) -> float | None:
         """Of the last transform, if it still counts: the TCP's largest standard deviation along a camera axis, m."""
-        return None if self._judged is None or self.verdict is Verdict.UNKNOWN else self._judged.sigma_m
+        return self._judged.sigma_m if self._judged is not None and self._holds else None
+
+    @property
+    def _holds(self) -> bool:
+        """Is what was said of the last frame still said?"""
+        return self._judged is not None and (self.state, self.verdict) == (self._judged.state, self._judged.verdict)
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
         """All that is raised and not cleared, the monitor's and what comes from here, the oldest first."""
@@ -164,14 +169,15 @@ def _kind(message: str) -> str:
 
 
 def _of_record(record: FrameRecord) -> Judged:
+    counts = record.verdict is not Verdict.UNKNOWN
     return Judged(
         record.state,
         record.verdict,
         usable=record.source is not Origin.HELD,
         refused=is_refused(record),
         reason=record.reason or "",
-        tcp_shift_m=None if record.drift is None else record.drift.tcp_shift_m,
-        sigma_m=None if record.covariance is None else math.sqrt(max(record.covariance[:15:7])),
+        tcp_shift_m=record.drift.tcp_shift_m if counts and record.drift is not None else None,
+        sigma_m=None if not counts or record.covariance is None else math.sqrt(max(record.covariance[:15:7])),
     )
 
 
