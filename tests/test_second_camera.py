@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from loopback import WAIT_S, free_endpoint, wait_until
@@ -53,10 +54,17 @@ def said_in(recording: Path, entity: str) -> list[dict[str, object]]:
     return texts
 
 
-def test_a_folder_with_its_pulses_runs_to_the_end(folder: Path, tmp_path: Path):
+@pytest.fixture(scope="module")
+def recorded(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ``gripmon run`` on that folder leaves."""
+    out = tmp_path_factory.mktemp("recorded")
     config = write_config(cell(), folder, None, recording={"image_format": "png"})
-    assert main(["run", str(config), "--out", str(tmp_path)]) == 0
-    found = spots(tmp_path)
+    assert main(["run", str(config), "--out", str(out)]) == 0
+    return out
+
+
+def test_a_folder_with_its_pulses_runs_to_the_end(recorded: Path):
+    found = spots(recorded)
     assert [spot.pulse for spot in found] == list(range(PULSES))
     assert all(spot.frames == 2 and spot.background and spot.candidates >= 1 for spot in found)
     before = found[:MOVED_FROM]
@@ -67,7 +75,7 @@ def test_a_folder_with_its_pulses_runs_to_the_end(folder: Path, tmp_path: Path):
     raised = [alert for spot in found[MOVED_FROM:] for alert in spot.alerts if alert.event is AlertEvent.RAISED]
     assert any(alert.kind in (AlertKind.DRIFT, AlertKind.STEP) for alert in raised)
     assert found[-1].probability_moved > 0.99 and found[-1].state is State.DRIFTING
-    (recording,) = tmp_path.glob("*.rrd")
+    (recording,) = recorded.glob("*.rrd")
     assert entities(recording) >= {
         "/base/camera/image", "/base/camera/image/spot/believed", "/base/camera/image/foreseen", "/base/beam",
         "/base/plane", "/off/px", "/off/sigma_px", "/gaps/mm", "/test/moved", "/record", "/meta", "/configuration",
@@ -78,6 +86,16 @@ def test_a_folder_with_its_pulses_runs_to_the_end(folder: Path, tmp_path: Path):
     assert {"second.yaml", "laser.yaml"} == set(configuration["files"])  # type: ignore[call-overload]
 
 
+@pytest.mark.parametrize("command", ["report", "export", "correct", "replay"])
+def test_who_reads_frames_says_that_there_are_none(
+    recorded: Path, tmp_path: Path, command: str, capsys: pytest.CaptureFixture[str]
+):
+    (recording,) = recorded.glob("*.rrd")
+    assert main([command, str(recording), "--out", str(tmp_path / "out.jsonl")]) == 3
+    said = capsys.readouterr().err
+    assert f"{recording}: holds a second camera's laser spots, no frames; gripmon view shows them" in said
+
+
 def test_a_camera_that_stands_still_gives_no_alert(tmp_path: Path):
     write_folder(cell(), tmp_path, 10)
     config = write_config(cell(), tmp_path, None)
@@ -85,6 +103,18 @@ def test_a_camera_that_stands_still_gives_no_alert(tmp_path: Path):
     found = spots(tmp_path / "out")
     assert len(found) == 10 and all(spot.used and not spot.alerts for spot in found)
     assert found[-1].verdict == "valid"
+
+
+def test_replay_decides_the_same_each_time(recorded: Path, folder: Path, tmp_path: Path):
+    """The same core: what the daemon decided, but for the time that it took."""
+    config = write_config(cell(), folder, None)
+    outs = [tmp_path / f"{k}.jsonl" for k in range(2)]
+    for out in outs:
+        assert main(["replay", str(folder / "images"), "--config", str(config), "--out", str(out)]) == 0
+    first, second = (out.read_bytes() for out in outs)
+    assert first == second
+    again = [from_json(line, SpotRecord) for line in first.splitlines()]
+    assert again == [msgspec.structs.replace(spot, latency_ns=0) for spot in spots(recorded)]
 
 
 def test_pulses_without_a_spot_are_a_failure(tmp_path: Path):

@@ -14,13 +14,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.cli import common, second_run
 from gripmon.cli.one_recording import keep
 from gripmon.cli.recorded_run import RecordedRun, is_recording
 from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.config import Config, SecondConfig
     from gripmon.recording import Recorder
     from gripmon.records import FrameRecord
     from gripmon.sources import Source
@@ -33,7 +33,10 @@ A recording of gripmon's brings its own configuration, the state that the monito
 commands that it got: without --config the same core decides again what it decided then, to the byte
 where every frame was recorded as PNG (image_format: png and an image rate of every frame), else
 closely.  With another --config one sees what that would have done; --recording then shows both, named
-recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end."""
+recorded and replayed, in one picture.  How many frames were judged otherwise is said at the end.
+
+With the configuration of a second camera (a section laser) INPUT is a folder or a video, its pulses
+are those of the table laser.pulses, and every pulse gets a line."""
 
 _EXAMPLES = """\
   gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl
@@ -41,6 +44,7 @@ _EXAMPLES = """\
   gripmon replay images/ --config configs/folder.yaml --out estimates.jsonl --recording story.rrd
 
   gripmon replay recordings/ --out again.jsonl                             all files of one run
+  gripmon replay pulses/images --config second.yaml --out spots.jsonl      a second camera's pulses
   gripmon replay shift-0001.rrd --config tighter.yaml --out - --recording both.rrd > would_be.jsonl
 
 exit codes: 0 done; 2 wrong usage or configuration; 3 no frame could be used, or writing failed (a
@@ -96,6 +100,9 @@ def run(arguments: argparse.Namespace) -> int:
     cv2.setNumThreads(1)
     paths = [Path(name) for name in arguments.input]
     _refuse_empty_folder(paths)
+    second = None if arguments.config is None else second_run.load(arguments.config, check_source=False)
+    if second is not None:
+        return _run_second(arguments, second)
     with contextlib.ExitStack() as opened:
         recorded = RecordedRun(paths, arguments.config, opened) if is_recording(paths) else None
         config = recorded.config if recorded else _given_config(paths[0], arguments.config)
@@ -120,6 +127,29 @@ def run(arguments: argparse.Namespace) -> int:
             if recorded:
                 print(recorded.summary(), file=sys.stderr)
     return common.EXIT_DONE if counts.usable else common.EXIT_FAILED
+
+
+def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
+    """The pulses of a second camera, on recorded frames."""
+    from gripmon.cli import second_replay
+
+    path = Path(arguments.input[0])
+    wrong = ""
+    if config.settings.laser.pulses is None:
+        wrong = f"{config.path}: laser.pulses: is missing; a table of the recorded pulses"
+    elif arguments.recording:
+        wrong = "replay: --recording is for wrist cameras; gripmon run with source: {kind: folder} and --out records"
+    elif len(arguments.input) > 1 or is_recording([path]):
+        wrong = f"{path}: no input for a second camera's configuration; one folder of images, or one video"
+    if wrong:
+        raise common.CommandFailedError(wrong, common.EXIT_USAGE)
+    config = second_run.with_pulses(config)
+    with contextlib.ExitStack() as opened:
+        source = _open_input(path, arguments.fps)
+        opened.callback(source.close)
+        out = opened.enter_context(_output(arguments.out))
+        step = opened.enter_context(common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame"))
+        return second_replay.run(config, source, out.write, step)
 
 
 def _refuse_empty_folder(paths: list[Path]) -> None:

@@ -44,6 +44,16 @@ def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
         raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
 
 
+def with_pulses(config: SecondConfig) -> SecondConfig:
+    """The same with the pulses of its table, where that was left out before; ends the command if it can't be read."""
+    from gripmon.config import ConfigError, load_pulses
+
+    try:
+        return load_pulses(config)
+    except ConfigError as error:
+        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+
+
 def run_second(
     config: SecondConfig, *, out: Path | None, duration_s: float | None, verbose: bool, view: str | None = None
 ) -> int:

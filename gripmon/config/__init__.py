@@ -18,7 +18,7 @@ from gripmon.config.checks import View, covariance_of, monitor_fault, predict_vi
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
 from gripmon.config.order import order_fault
-from gripmon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_second
+from gripmon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_pulses, load_second
 from gripmon.config.session import joined_or_fault
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
@@ -46,6 +46,7 @@ __all__ = [
     "check_second_network",
     "is_second",
     "load_config",
+    "load_pulses",
     "load_scenario",
     "load_second",
     "read_gripper",

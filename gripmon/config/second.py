@@ -121,9 +121,13 @@ def load_second(path: Path, *, check_source: bool = True) -> SecondConfig:
     if fault is not None:
         raise _error(path, fault)
     config = SecondConfig(path, settings, calibration_path, calibration, make_camera(calibration.camera))
-    if settings.laser.pulses is None or not check_source:
-        return config
-    return replace(config, pulses=_pulses(path, settings.laser.pulses))
+    return load_pulses(config) if check_source else config
+
+
+def load_pulses(config: SecondConfig) -> SecondConfig:
+    """The same with the pulses of its table, if there is one.  Raises :class:`ConfigError`."""
+    name = config.settings.laser.pulses
+    return config if name is None else replace(config, pulses=_pulses(config.path, name))
 
 
 def check_second_network(config: SecondConfig) -> Joining | None:

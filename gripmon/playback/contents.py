@@ -109,6 +109,11 @@ class Contents:
     def is_ours(self) -> bool:
         return self.meta is not None or len(self.frames) > 0 or self.about is not None
 
+    @property
+    def is_of_spots(self) -> bool:
+        """Is it a second camera's?  Its records are of another kind."""
+        return self.meta is not None and self.meta.kind == "spots"
+
 
 def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], None]) -> Contents:
     """Everything but the images.  ``progress`` is called with the bytes that are behind.

@@ -120,8 +120,10 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
         what = " ".join(f"{type(error).__name__}: {error}".split())
         faults.append(f"{path}: can't be read ({what:.200}); not used")
         return []
-    ours = [contents for contents in found if contents.is_ours]
-    if not ours:
+    ours = [contents for contents in found if contents.is_ours and not contents.is_of_spots]
+    if not ours and any(contents.is_of_spots for contents in found):
+        faults.append(f"{path}: holds a second camera's laser spots, no frames; gripmon view shows them; not used")
+    elif not ours:
         applications = ", ".join(sorted({repr(store.application)[:60] for store in file.stores}))
         what = f"is a recording of the application {applications} that holds no frames of a monitor's"
         faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))

@@ -109,6 +109,7 @@ def log_origin(send: Sender, scene: Scene, file_number: int) -> None:
         started_ns=time.time_ns(),
         image_policy=image_policy(scene.settings),
         has_truth=scene.has_truth,
+        kind="frames" if scene.laser is None else "spots",
     )
     send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
     if scene.configuration is not None:

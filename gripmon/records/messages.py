@@ -28,7 +28,9 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     robot: Annotated[str, Meta(description="second part of the monitor's keys")]
     camera: Annotated[str, Meta(description="third part of the monitor's keys")]
     state: State
-    verdict: Annotated[Verdict, Meta(description="of the last transform; unknown while no frames come")]
+    verdict: Annotated[
+        Verdict, Meta(description="of the last transform, of a second camera's calibration; unknown without frames")
+    ]
     stamp_ns: Annotated[int, Meta(description="when it was said, Unix ns")]
     seq: Annotated[int, Meta(description="the last frame's; -1 before the first")]
     reference_id: Annotated[str, Meta(description="the reference in force")]
@@ -44,15 +46,21 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     version: Annotated[str, Meta(description="of gripmon")]
     tcp_shift_m: Annotated[
         tuple[float, float, float] | None,
-        Meta(description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown"),
+        Meta(
+            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; of a "
+            "second camera: of the place on its plane that its axis meets, null while nothing has moved"
+        ),
     ] = None
     sigma_m: Annotated[
         float | None,
-        Meta(description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown"),
+        Meta(
+            description="largest standard deviation of the TCP's position along a camera axis, m; null: unknown; of a "
+            "second camera: of tcp_shift_m, null with it"
+        ),
     ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
     transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
-    malformed: Annotated[int, Meta(description="messages received that were none: jaw openings, frames, commands")] = 0
+    malformed: Annotated[int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")] = 0
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):

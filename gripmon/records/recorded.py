@@ -28,6 +28,9 @@ class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recordi
     started_ns: Annotated[int, msgspec.Meta(description="when this file was begun, Unix ns")]
     image_policy: Annotated[str, msgspec.Meta(description="which images are kept, and how, in words")]
     has_truth: Annotated[bool, msgspec.Meta(description="it was simulated: the TCP's true position is there, too")]
+    kind: Annotated[
+        str, msgspec.Meta(description="frames of a wrist camera, or spots: the laser's pulses of a second camera")
+    ] = "frames"
 
 
 class RecordedFile(msgspec.Struct, frozen=True):

@@ -1,0 +1,48 @@
+"""``gripmon replay`` with the configuration of a second camera: one JSON line a pulse."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+from gripmon.cli import common
+
+if TYPE_CHECKING:
+    from gripmon.config import SecondConfig
+    from gripmon.records import SpotRecord
+    from gripmon.sources import Source
+
+
+def run(config: SecondConfig, source: Source, write: Callable[[bytes], None], step: Callable[[], None]) -> int:
+    """Judge the table's pulses on recorded frames; the same input gives the same bytes.  Returns the exit code."""
+    from gripmon.records import to_json
+
+    faults: Counter[str] = Counter()
+    count = used = 0
+    try:
+        for record in _records(config, source, step):
+            write(to_json(record) + b"\n")
+            count, used = count + 1, used + record.used
+            if record.fault is not None:
+                faults[record.fault] += 1
+    finally:
+        why = ", ".join(f"{number} {fault}" for fault, number in faults.most_common())
+        print(f"replay: {count} pulses: {used} used{f'; {why}' if why else ''}", file=sys.stderr)
+    return common.EXIT_DONE if used else common.EXIT_FAILED
+
+
+def _records(config: SecondConfig, source: Source, step: Callable[[], None]) -> Iterator[SpotRecord]:
+    from gripmon.records import Frame
+
+    pulsed = config.pulsed_watch()
+    for told in config.pulses:
+        pulsed.tell(told)
+    while (item := source.read()) is not None:
+        step()
+        if isinstance(item, Frame):
+            for shown in pulsed.frame(item)[0]:
+                yield pulsed.judge(shown).record
+    for shown in pulsed.finish():
+        yield pulsed.judge(shown).record
