@@ -47,8 +47,8 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     tcp_shift_m: Annotated[
         tuple[float, float, float] | None,
         Meta(
-            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; of a "
-            "second camera: of the place on its plane that its axis meets, null while nothing has moved"
+            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; of "
+            "a second camera: of the place on its plane that its axis meets, null while nothing has moved"
         ),
     ] = None
     sigma_m: Annotated[
@@ -60,7 +60,9 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
     transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
-    malformed: Annotated[int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")] = 0
+    malformed: Annotated[
+        int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")
+    ] = 0
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
