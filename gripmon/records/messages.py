@@ -47,8 +47,8 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     tcp_shift_m: Annotated[
         tuple[float, float, float] | None,
         Meta(
-            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; of "
-            "a second camera: of the place on its plane that its axis meets, null while nothing has moved"
+            description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; "
+            "of a second camera: of the place on its plane that its axis meets, null while nothing has moved"
         ),
     ] = None
     sigma_m: Annotated[
