@@ -148,6 +148,10 @@ def test_check_says_what_it_comes_to(folder: Path, capsys: pytest.CaptureFixture
     assert "90 of 90 spots" in said and "6 frames, first one 0000.png, 640 x 480 px" in said
     assert main(["check", str(path), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
+    assert [row["pulses"] for row in report["foreseen"]["noticed"]] == sorted(
+        row["pulses"] for row in report["foreseen"]["noticed"]
+    )
+    assert "noticed    with 0.1 false alarms in 1000 pulses" in said
     assert report["pulses"]["count"] == 2 and report["pulses"]["key"] is None
     assert report["calibration"]["sigmas"]["base_T_cam.x_m"] == pytest.approx(8.6e-4, rel=0.3)
 

@@ -65,8 +65,8 @@ def run(arguments: argparse.Namespace) -> int:
     settings = _settings(arguments)
     calibration = _calibration(Path(arguments.laser))
     if not arguments.config:
-        report = _expectation(arguments.laser, calibration, settings)
-        print(json.dumps(report, indent=2) if arguments.json else "\n".join(_expectation_lines(report)))
+        report = expectation(arguments.laser, calibration, settings)
+        print(json.dumps(report, indent=2) if arguments.json else "\n".join(expectation_lines(report)))
         return common.EXIT_DONE
     report = _judged(arguments.laser, calibration, settings, [Path(name) for name in arguments.config])
     print(json.dumps(report, indent=2) if arguments.json else "\n".join(_judged_lines(report)))
@@ -106,8 +106,8 @@ def _calibration(path: Path) -> LaserCalibration:
         raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
 
 
-def _expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
-    """Metres, radians, px."""
+def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
+    """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
     from gripmon.calibration.sighting import CalibrationError
     from gripmon.spotwatch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
     from gripmon.spotwatch.world import calibrated
@@ -158,7 +158,8 @@ def _foresight_values(found: Foresight) -> dict[str, Any]:
     }
 
 
-def _expectation_lines(report: dict[str, Any]) -> list[str]:
+def expectation_lines(report: dict[str, Any]) -> list[str]:
+    """The same in words, the calibration's own line first."""
     assumed, sigma, weakest = report["assumed"], report["spot_sigma"], report["weakest"]
     tilt = math.degrees(assumed["tilt_rad"])
     low_px, high_px = sigma["px"]

@@ -6,7 +6,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, outside
+from gripmon.cli import check_laser, common, outside
 
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
@@ -14,8 +14,10 @@ if TYPE_CHECKING:
 
 def run(config: SecondConfig, *, as_json: bool) -> int:
     """Print what the configuration comes to; returns the exit code."""
+    watch = config.settings.laser.watch
     report = {
         **_values(config),
+        "foreseen": check_laser.expectation(str(config.calibration_path), config.calibration, watch),
         **outside.values(config),
         "zenoh": outside.zenoh_values(config),
         "source": outside.source_report(config),
@@ -74,6 +76,7 @@ def _as_text(report: dict[str, Any]) -> str:
     }
     lines = [f"{report['config']}: sound"]
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
+    lines += check_laser.expectation_lines(report["foreseen"])[1:]
     return "\n".join([*lines, *outside.lines(report)])
 
 
@@ -98,8 +101,7 @@ def _known_line(sigmas: dict[str, float]) -> str:
 
 def _watch_line(watch: dict[str, Any]) -> str:
     return (
-        f"{watch['false_alarms_per_1000_pulses']:g} false alarms in 1000 pulses, arm exact to "
-        f"{1e3 * watch['arm_noise_m']:g} mm and {1e3 * watch['arm_noise_rad']:g} mrad; a warning from "
+        f"arm exact to {1e3 * watch['arm_noise_m']:g} mm and {1e3 * watch['arm_noise_rad']:g} mrad; a warning from "
         f"{1e3 * watch['warn_m']:g} mm, an error from {1e3 * watch['limit_m']:g} mm"
     )
 
