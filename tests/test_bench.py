@@ -9,7 +9,6 @@ import pytest
 
 SIZE = (384, 288)
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

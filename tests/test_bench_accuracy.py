@@ -16,7 +16,6 @@ TRUTH = make_transform(exp_rotation(np.array([0.5, 0.1, -0.2])), np.array([0.001
 FRAME = Frame(3, 0, np.zeros((4, 4), np.uint8), 0.03)
 REFERENCE = ReferenceRecord("first", 1, 0, "configuration", to_record(TRUTH), tuple(np.eye(6).ravel().tolist()))
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

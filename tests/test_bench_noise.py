@@ -10,7 +10,6 @@ from scipy.signal import lfilter
 
 REGIMES = ("quiet", "working", "rough")
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

@@ -14,7 +14,6 @@ import pytest
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 SIZE = (384, 288)
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
@@ -30,7 +29,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def ring(importable: None, rendered: Path) -> Path:
+def ring(tools_importable: None, rendered: Path) -> Path:
     return rendered
 
 
@@ -48,7 +47,7 @@ def test_the_loop_is_measured_in_turns_and_nothing_that_was_stopped_stays_stoppe
     assert measured["dropped"] == {"off": 0, "on": 0, "stalled": 0}
 
 
-def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(importable: None, tmp_path: Path):
+def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(tools_importable: None, tmp_path: Path):
     from benchmarks import stalled_disk
 
     with stalled_disk.disk(tmp_path) as disk:
@@ -94,7 +93,9 @@ def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     assert not recording.faults
 
 
-def test_commands_that_are_not_there_have_no_row(importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_commands_that_are_not_there_have_no_row(
+    tools_importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     from benchmarks import record_hour
 
     monkeypatch.setattr(record_hour, "COMMANDS", {"prophesy": ("--out", "future"), "schema": ("--no-such-option",)})
@@ -121,7 +122,7 @@ def test_memory_over_frames(ring: Path):
     assert all(look["process_mib"] > 20.0 < look["daemon_mib"] for look in measured["looks"])
 
 
-def test_slopes_and_their_errors_are_right(importable: None):
+def test_slopes_and_their_errors_are_right(tools_importable: None):
     from benchmarks import record_memory
 
     rng = np.random.default_rng(3)
@@ -186,7 +187,7 @@ def results(**changes: Any) -> dict[str, Any]:
         ({"on": (float("nan"), 2_499.0)}, ["whole loop, on: median"]),
     ],
 )
-def test_what_is_not_reached_is_said(importable: None, changes: dict[str, Any], missed: list[str]):
+def test_what_is_not_reached_is_said(tools_importable: None, changes: dict[str, Any], missed: list[str]):
     from benchmarks import record_report
 
     made = results(**changes)
@@ -198,7 +199,7 @@ def test_what_is_not_reached_is_said(importable: None, changes: dict[str, Any], 
     assert all(part in text for part in ("a stall", "50 GB last", "an hour of recording", "2 times", "MiB an hour"))
 
 
-def test_a_missed_target_ends_with_code_1(importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_a_missed_target_ends_with_code_1(tools_importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     import argparse
     import json
 
@@ -213,7 +214,7 @@ def test_a_missed_target_ends_with_code_1(importable: None, monkeypatch: pytest.
         assert len(json.loads((tmp_path / "all.json").read_text())["killed"]["tries"]) == 2
 
 
-def test_quick_measures_everything_with_less(importable: None):
+def test_quick_measures_everything_with_less(tools_importable: None):
     from benchmarks import record
 
     full, quick = record.full_plans(), record.quick_plans()

@@ -14,7 +14,6 @@ from gripmon.simulator.scenario import Pairs
 METHOD = Path(__file__).resolve().parent.parent.parent / "shared" / "method.md"
 VARIANTS = ("3P-U", "4P-U", "5P-U", "all-U", "4P-R", "5P-R", "edges")
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

@@ -16,7 +16,6 @@ pytest.importorskip("pinocchio")
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
 POSES = np.random.default_rng(5).uniform(-3.0, 3.0, (20, 6))
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

@@ -16,7 +16,6 @@ from gripmon.records import Smoothed, Transform, Verdict
 pytest.importorskip("pinocchio")
 FPS = 30.0
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

@@ -12,7 +12,6 @@ from gripmon.records import Verdict
 
 NAN = float("nan")
 
-
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import socket
 import subprocess
@@ -161,3 +162,12 @@ def on_one_core() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, _CORES)
+
+
+def summary(values_us: NDArray[np.float64]) -> dict[str, float]:
+    """Median, 99th percentile, maximum and number of those that are there; NaN where none is."""
+    there = values_us[np.isfinite(values_us)]
+    if not len(there):
+        return {"median": math.nan, "p99": math.nan, "max": math.nan, "count": 0}
+    median, high = np.percentile(there, [50.0, 99.0])
+    return {"median": float(median), "p99": float(high), "max": float(there.max()), "count": len(there)}

@@ -147,15 +147,15 @@ def _latency(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
     paced = harness.RingSource(ring, plan.paced_block * plan.paced_blocks // 2, paced=True)
     with harness.published(config) as (publisher, paced_subscriber):
         harness.run_loop(config, paced, publisher)
-    back_to_back = _summary(source.latency_us()[plan.warm_up :])
+    back_to_back = harness.summary(source.latency_us()[plan.warm_up :])
     arrived_us = 1e-3 * (paced_subscriber.arrivals_ns - paced.handed_ns[paced_subscriber.seqs])
     return {
         "published_us": back_to_back,
         "frames_per_s_one_core": float(1e6 / np.mean(source.loop_us()[plan.warm_up :])),
-        "paced_published_us": _summary(paced.latency_us()[scene.WARM_UP_PACED :]),
-        "paced_received_us": _summary(arrived_us[scene.WARM_UP_PACED :]),
+        "paced_published_us": harness.summary(paced.latency_us()[scene.WARM_UP_PACED :]),
+        "paced_received_us": harness.summary(arrived_us[scene.WARM_UP_PACED :]),
         "received": [len(subscriber.seqs), plan.warm_up + plan.frames],
-        "tags_us": _summary(np.array(tags_us)),
+        "tags_us": harness.summary(np.array(tags_us)),
         "tags_found": [len(errors_m), len(tags_us)],
         "tags_tcp_error_m": float(np.median(errors_m)),
         "times_faster": float(np.median(tags_us) / back_to_back["median"]),
@@ -204,10 +204,10 @@ def _recording(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
     off, on = (source.latency_us()[settled & which] for which in (~recorded, recorded))
     loop_off, loop_on = (source.loop_us()[settled & which] for which in (~recorded, recorded))
     return {
-        "off_us": _summary(off),
-        "on_us": _summary(on),
-        "loop_off_us": _summary(loop_off),
-        "loop_on_us": _summary(loop_on),
+        "off_us": harness.summary(off),
+        "on_us": harness.summary(on),
+        "loop_off_us": harness.summary(loop_off),
+        "loop_on_us": harness.summary(loop_on),
         "dropped": recorder.dropped,
         "written_bytes": written,
     }
@@ -228,10 +228,3 @@ def _memory(size: tuple[int, int], path: Path, plan: Plan) -> dict[str, Any]:
     with harness.published(config) as (publisher, subscriber):
         harness.run_loop(config, source, publisher)
     return {"rss_bytes": rss, "received": [len(subscriber.seqs), plan.memory_marks[-1] + 1]}
-
-
-def _summary(values_us: Any) -> dict[str, float]:
-    import numpy as np
-
-    median, high = np.percentile(values_us, [50.0, 99.0])
-    return {"median": float(median), "p99": float(high), "max": float(np.max(values_us)), "count": len(values_us)}

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks import harness, scene, stalled_disk
 from benchmarks.switched import SwitchedRecorder
@@ -91,13 +90,7 @@ def _by_condition(plan: Plan, order: list[str], source: harness.RingSource) -> d
         mine = settled & (which == condition)
         results[condition] = {
             "frames": int(mine.sum()),
-            "published_us": summary(source.latency_us()[mine]),
-            "loop_us": summary(source.loop_us()[mine]),
+            "published_us": harness.summary(source.latency_us()[mine]),
+            "loop_us": harness.summary(source.loop_us()[mine]),
         }
     return results
-
-
-def summary(values_us: NDArray[np.float64]) -> dict[str, float]:
-    """Median, 99th percentile, maximum."""
-    median, high = np.percentile(values_us, [50.0, 99.0])
-    return {"median": float(median), "p99": float(high), "max": float(values_us.max())}

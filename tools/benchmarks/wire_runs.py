@@ -106,14 +106,16 @@ def conditions(path: Path, plan: Plan) -> dict[str, Any]:
         results[condition] = {
             "frames": int(mine.sum()),
             "lost": int(np.isnan(arrived_us).sum()),
-            "judged_us": summary(switched.judged_us[mine]),
-            "received_us": summary(arrived_us),
-            "published_us": summary(source.latency_us()[mine]),
-            "loop_us": summary(source.loop_us()[mine]),
+            "judged_us": harness.summary(switched.judged_us[mine]),
+            "received_us": harness.summary(arrived_us),
+            "published_us": harness.summary(source.latency_us()[mine]),
+            "loop_us": harness.summary(source.loop_us()[mine]),
         }
         in_round = [mine & (seqs // (plan.block * len(CONDITIONS)) == i) for i in range(plan.rounds)]
         for what, values_us in (("published", source.latency_us()), ("loop", source.loop_us())):
-            results[condition][f"{what}_p99_by_round_us"] = [summary(values_us[frames])["p99"] for frames in in_round]
+            results[condition][f"{what}_p99_by_round_us"] = [
+                harness.summary(values_us[frames])["p99"] for frames in in_round
+            ]
     return results
 
 
@@ -158,7 +160,7 @@ def restarts(path: Path, plan: Plan) -> dict[str, Any]:
                 "lost_while_away": int((~came & away).sum()),
             }
         )
-    return {"runs": runs, "exceptions": switched.exceptions, "loop_us": summary(source.loop_us())}
+    return {"runs": runs, "exceptions": switched.exceptions, "loop_us": harness.summary(source.loop_us())}
 
 
 @dataclass
@@ -210,12 +212,3 @@ def _arrived_us(subscriber: harness.Subscriber, source: harness.RingSource, coun
     arrived_us = np.full(count, np.nan)
     arrived_us[subscriber.seqs] = 1e-3 * (subscriber.arrivals_ns - source.handed_ns[subscriber.seqs])
     return arrived_us
-
-
-def summary(values_us: NDArray[np.float64]) -> dict[str, float]:
-    """Median, 99th percentile and maximum of those that are there."""
-    there = values_us[np.isfinite(values_us)]
-    if not len(there):
-        return {"median": float("nan"), "p99": float("nan"), "max": float("nan")}
-    median, high = np.percentile(there, [50.0, 99.0])
-    return {"median": float(median), "p99": float(high), "max": float(there.max())}
