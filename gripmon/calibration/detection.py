@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gripmon.calibration import blobs, chequers, symmetry
+from gripmon.calibration.bending import bends
 from gripmon.calibration.lattice import Index
 from gripmon.calibration.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibration.sighting import NotFound, Sighting
@@ -56,7 +57,7 @@ def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
     margin = 0.5 * (1.0 - target.marker_m / target.square_m)
     steps = _steps(plate[ids, :2] / target.square_m, corners)
     window = np.minimum(WINDOW, 1.3 * margin) * steps - (1.0 if 1.3 * margin < WINDOW else 0.0)
-    uv_px, covariance, good = _sharp(grey, corners, window)
+    uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
     note = _note(int(good.sum()), len(plate))
     return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
 
@@ -109,7 +110,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     if blur_px > TOO_BLURRED * float(np.median(steps)):
         return NotFound(_too_blurred(blur_px))
     cells = _turned(cells, target.columns, target.rows)
-    uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps)
+    uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps, cells)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
     note = _note(int(good.sum()), target.columns * target.rows, blur_px)
     return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST["chequerboard"])
@@ -209,15 +210,31 @@ def _across_squares(cells: NDArray[np.intp], points: Array) -> tuple[Array, Arra
     return ends[:, 0], ends[:, 1]
 
 
-def _sharp(grey: Grey, rough: Array, radius_px: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Corners (n, 2) to sub-pixel, covariances (n, 2, 2), and which of them are what they should be."""
-    uv_px, covariance, asymmetry = symmetry.centres_of_symmetry(grey, rough, radius_px, noise_of(grey))
+def _sharp(
+    grey: Grey, rough: Array, radius_px: Array, cells: Array | NDArray[np.intp]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Corners (n, 2) to sub-pixel, covariances (n, 2, 2), and which of them are what they should be; ``cells`` (n, 2)
+    are their places on the lattice.
+    """
+    noise = noise_of(grey)
+    found = symmetry.centres_of_symmetry(grey, rough, radius_px, noise)
+    good = _corners(grey, *found, radius_px)
+    # How the lattice bends is known once its corners are.
+    bend = np.zeros((len(rough), 3, 2))
+    size = (grey.shape[1], grey.shape[0])
+    bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
+    found = symmetry.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
+    return found[0], found[1], _corners(grey, *found, radius_px)
+
+
+def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
+    """(n,) which are free, and a corner."""
     radius = np.clip(radius_px, symmetry.SMALLEST_RADIUS_PX, symmetry.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])
     edge = np.minimum(uv_px, size - 1 - uv_px).min(axis=1)
     crosses, _ = chequers.crossing(grey, np.nan_to_num(uv_px, nan=-1e3), 0.8 * radius)
-    good = (asymmetry < symmetry.ASYMMETRIC) & (edge > radius) & crosses
-    return uv_px, covariance, good
+    good: NDArray[np.bool_] = (asymmetry < symmetry.ASYMMETRIC) & (edge > radius) & crosses
+    return good
 
 
 def _note(count: int, total: int, blur_px: float = 0.0) -> str:

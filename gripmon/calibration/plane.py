@@ -15,6 +15,7 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from gripmon.calibration.bundle import Bundle
+from gripmon.calibration.free_pose import FreePose, off_plate
 from gripmon.calibration.intrinsics import lens_vector, model_of, plate_pose
 from gripmon.calibration.lens_models import LensModel, parameter_names
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, INFERRED_FROM, Standing, stand
@@ -25,6 +26,9 @@ from gripmon.records import Array
 
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
+IMPOSSIBLE, MISSHAPEN = 1e-6, 0.005
+"""An inferred gripper's corners are no rectangle if they are improbable as one and leave it by more than this part of
+their reach: so much less than that fingers may be out of line."""
 LARGEST_RMS_SHARE = 0.005
 """Root mean square residual of the plate's points over the image's width beyond which they aren't explained at all."""
 _STEP = 0.05
@@ -34,12 +38,14 @@ _STEP = 0.05
 @dataclass(frozen=True, slots=True)
 class FingerCorners:
     """Measured corners of the gripper in one image: ``names`` (c), ``uv_px`` (c, 2), and ``covariance_px`` (2c, 2c) of
-    u and v of the first, then of the next: corners at both ends of an edge err together.
+    u and v of the first, then of the next: corners at both ends of an edge err together.  ``free``: the pose of the
+    whole gripper by all its edges, if it is known that well.
     """
 
     names: tuple[str, ...]
     uv_px: Array
     covariance_px: Array
+    free: FreePose | None = None
 
     @classmethod
     def independent(cls, names: Sequence[str], uv_px: Array, covariance_px: Array) -> FingerCorners:
@@ -88,9 +94,10 @@ class Coincidence:
     equation, four inferred ones three).  Below :data:`DOUBTED` the corners' part of the errors is ``enlarged`` by as
     much as the residuals exceed theirs.
 
-    ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above the plate) by which the corners, taken
-    alone, leave the plate, with ``apart_sigma`` (3,) and ``apart_p``; None where fewer than four known corners can't
-    tell.  ``plate_xy_m`` (c, 2): the corners in the plate's frame.
+    ``tilt_rad`` (2,) about the gripper's x and y and ``gap_m`` (positive: above the plate) by which the gripper, its
+    pose found without the plate, leaves it, with ``apart_covariance`` (3, 3) and ``apart_p``: by all its edges
+    (``corners.free``), or else by the corners; None where fewer than four known ones can't tell.  ``plate_xy_m`` (c,
+    2): the corners in the plate's frame.
     """
 
     sighting: Sighting
@@ -106,11 +113,16 @@ class Coincidence:
     enlarged: float
     tilt_rad: Array | None
     gap_m: float | None
-    apart_sigma: Array | None
+    apart_covariance: Array | None
     apart_p: float | None
     cam_T_plate: Array
     plate: Bundle
     plate_xy_m: Array
+
+    @property
+    def apart_sigma(self) -> Array | None:
+        """(3,) standard deviations of tilt and gap."""
+        return None if self.apart_covariance is None else np.sqrt(self.apart_covariance.diagonal())
 
     @property
     def covariance(self) -> Array:
@@ -139,9 +151,15 @@ def calibrate_plane(
     given = _Given(made, cam_T_plate, corners.uv_px)
     each_px2 = corners.each_px2
 
+    free = corners.free if known is not None else None
+    known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
+
     def solve(given: _Given) -> Standing:
-        known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
-        return stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
+        found = stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
+        if free is None:
+            return found
+        through = free.cam_T_grip if given.camera is made else free.through(given.camera)
+        return replace(found, apart=off_plate(through, given.cam_T_plate, contact_m))
 
     found = solve(given)
     # Residuals beyond what their covariances say are the print's: the same plate brings them into every image.
@@ -153,8 +171,12 @@ def calibrate_plane(
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
     p_value = float(chi2.sf(size, freedom)) if freedom else 1.0
+    if known is None and p_value < IMPOSSIBLE and _misfit(found) > MISSHAPEN:
+        raise CalibrationError(_no_rectangle(corners.names, found.residuals_m, p_value))
     enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
     motion[:, len(own) - 2 * len(corners.names) : len(own)] *= enlarged
+    if free is not None:
+        apart = np.concatenate([apart, free.own_slopes(cam_T_plate, contact_m)], axis=1)
     apart_covariance = apart @ apart.T
     points = found.corners_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3]
     known_apart = found.apart is not None
@@ -172,11 +194,27 @@ def calibrate_plane(
         enlarged=enlarged,
         tilt_rad=found.apart[:2] if found.apart is not None else None,
         gap_m=float(found.apart[2]) if found.apart is not None else None,
-        apart_sigma=np.sqrt(apart_covariance.diagonal()) if known_apart else None,
+        apart_covariance=apart_covariance if known_apart else None,
         apart_p=chance(found.apart, apart_covariance) if found.apart is not None else None,
         cam_T_plate=cam_T_plate,
         plate=bundle,
         plate_xy_m=((points - cam_T_plate[:3, 3]) @ cam_T_plate[:3, :3])[:, :2],
+    )
+
+
+def _misfit(found: Standing) -> float:
+    """Of the innermost corners, over their reach."""
+    left, reach = found.residuals_m[:INFERRED_FROM], found.corners_m[:INFERRED_FROM, :2]
+    return float(np.linalg.norm(left) / np.linalg.norm(reach))
+
+
+def _no_rectangle(names: Sequence[str], residuals_m: Array, p_value: float) -> str:
+    sizes_m = np.linalg.norm(residuals_m, axis=1)
+    return (
+        f"the innermost corners make no rectangle on the plate (probability {p_value:.1g}; "
+        f"{names[int(sizes_m.argmax())]} is {1e3 * float(sizes_m.max()):.3f} mm off): both "
+        "fingertips flat on the plate, rough corners nearer to the real ones where a line of the plate runs beside a "
+        "finger, the target as it was described"
     )
 
 

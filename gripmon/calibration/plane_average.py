@@ -165,10 +165,12 @@ def doubts(image: Coincidence, inferred: bool) -> list[str]:
 def _apart_text(image: Coincidence) -> str:
     assert image.tilt_rad is not None and image.gap_m is not None and image.apart_sigma is not None
     tilt, sigma = np.degrees(image.tilt_rad), np.degrees(image.apart_sigma[:2])
+    judged = "by all its edges" if image.corners.free is not None else "by its corners"
     return (
-        f"the fingertips don't stand on the plate (probability {image.apart_p:.1g}): tilted by {tilt[0]:+.2f} +- "
-        f"{sigma[0]:.2f} and {tilt[1]:+.2f} +- {sigma[1]:.2f} degrees about x and y, {1e3 * abs(image.gap_m):.3f} +- "
-        f"{1e3 * image.apart_sigma[2]:.3f} mm {'above' if image.gap_m > 0.0 else 'below'} it"
+        f"the fingertips don't stand on the plate ({judged}; probability {image.apart_p:.1g}): tilted by "
+        f"{tilt[0]:+.2f} +- {sigma[0]:.2f} and {tilt[1]:+.2f} +- {sigma[1]:.2f} degrees about x and y, "
+        f"{1e3 * abs(image.gap_m):.3f} +- {1e3 * image.apart_sigma[2]:.3f} mm "
+        f"{'above' if image.gap_m > 0.0 else 'below'} it"
     )
 
 

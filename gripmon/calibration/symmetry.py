@@ -3,6 +3,11 @@
 About the corner where two edges cross, ``I(p + d) = I(p - d)``, however blurred the image is and whatever the angle
 between the edges; light that slopes adds a part that is odd and linear in ``d``.  Least squares in the pixels of a disc
 about the point gives its place, its covariance from the image's noise, and tells where something else lies in the disc.
+
+That is exact where the target's map to the image is linear.  Perspective and lens bend it: a step and its opposite on
+the target lead to ``p + d + q(d)`` and ``p - d + q(d)``, with q quadratic.  Left out, it moves corners by some
+hundredths of a pixel, all of them towards where the target looks smaller; so opposite pixels are taken by ``bend``,
+q's coefficients (:mod:`gripmon.calibration.bending`).
 """
 
 from __future__ import annotations
@@ -30,9 +35,12 @@ _STEPS = 12
 _CONVERGED_PX = 1e-3
 
 
-def centres_of_symmetry(grey: Grey, start: Array, radius_px: Array, noise: float) -> tuple[Array, Array, Array]:
+def centres_of_symmetry(
+    grey: Grey, start: Array, radius_px: Array, noise: float, bend: Array | None = None
+) -> tuple[Array, Array, Array]:
     """Near ``start`` (n, 2), in discs of ``radius_px`` (n,): centres (n, 2), their covariances (n, 2, 2) and how
     asymmetric the image is about each (n,), as a part of its contrast; NaN and infinity where there is none.
+    ``bend`` (n, 3, 2): q of ``d`` = (x, y) px is ``[x², xy, y²]`` times it; none if it isn't known.
     """
     radius_px = np.clip(radius_px, SMALLEST_RADIUS_PX, LARGEST_RADIUS_PX)
     if not len(start):
@@ -47,12 +55,13 @@ def centres_of_symmetry(grey: Grey, start: Array, radius_px: Array, noise: float
     dv, du = (a.ravel() for a in np.mgrid[-reach : reach + 1, -reach : reach + 1].astype(np.float64))
     half = (dv > 0) | ((dv == 0) & (du > 0))  # each pair of opposite pixels once
     offsets = np.stack([du[half], dv[half]], axis=1)
+    bent = 0.0 if bend is None else _quadratic(offsets) @ bend
     weight = np.clip(radius_px[:, None] + 0.5 - np.hypot(*offsets.T), 0.0, 1.0)
     # What the light's slope adds; its columns don't move with the point.
     odd = np.broadcast_to(2.0 * offsets, (len(start), *offsets.shape))
     at, moving = start.astype(np.float64).copy(), np.full(len(start), True)
     for _ in range(_STEPS):
-        difference, gradient, _ = _opposites(levels, slopes, at, offsets)
+        difference, gradient, _ = _opposites(levels, slopes, at[:, None] + bent, offsets)
         rows = np.concatenate([gradient, odd], axis=2)
         step = -_solve(rows, difference, weight)[:, :2]
         length = np.linalg.norm(step, axis=1)
@@ -62,7 +71,13 @@ def centres_of_symmetry(grey: Grey, start: Array, radius_px: Array, noise: float
         if not moving.any():
             break
     at[moving | (np.linalg.norm(at - start, axis=1) > radius_px)] = np.nan
-    return at + corner, *_judged(levels, slopes, at, offsets, weight, odd, noise)
+    middles = np.nan_to_num(at, nan=-100.0)[:, None] + bent
+    return at + corner, *_judged(levels, slopes, at, middles, offsets, weight, odd, noise)
+
+
+def _quadratic(offsets: Array) -> Array:
+    x, y = offsets.T
+    return np.stack([x * x, x * y, y * y], axis=1)
 
 
 def _cropped(grey: Grey, points: Array, margin: int) -> tuple[Grey, Array]:
@@ -73,10 +88,17 @@ def _cropped(grey: Grey, points: Array, margin: int) -> tuple[Grey, Array]:
 
 
 def _judged(
-    levels: Array, slopes: list[Grey], at: Array, offsets: Array, weight: Array, odd: Array, noise: float
+    levels: Array,
+    slopes: list[Grey],
+    at: Array,
+    middles: Array,
+    offsets: Array,
+    weight: Array,
+    odd: Array,
+    noise: float,
 ) -> tuple[Array, Array]:
     """Covariances (n, 2, 2) and asymmetries (n,) at the centres."""
-    difference, gradient, pairs = _opposites(levels, slopes, np.nan_to_num(at, nan=-100.0), offsets)
+    difference, gradient, pairs = _opposites(levels, slopes, middles, offsets)
     rows = np.concatenate([gradient, odd], axis=2)
     # A difference of two pixels has twice their variance; that smoothing has made them alike evens out over the disc.
     information = np.einsum("nk,nki,nkj->nij", weight, rows, rows)
@@ -95,11 +117,11 @@ def _judged(
     return covariance, asymmetry
 
 
-def _opposites(levels: Array, slopes: list[Grey], at: Array, offsets: Array) -> tuple[Array, Array, Array]:
-    """Differences of opposite pixels (n, k), their derivatives by the centre (n, k, 2), and the levels (n, k) of the
-    pairs about their mean.
+def _opposites(levels: Array, slopes: list[Grey], middles: Array, offsets: Array) -> tuple[Array, Array, Array]:
+    """Differences of opposite pixels (n, k) about ``middles`` (n, 1 or k, 2), their derivatives by these (n, k, 2), and
+    the levels (n, k) of the pairs about their mean.
     """
-    plus, minus = at[:, None] + offsets, at[:, None] - offsets
+    plus, minus = middles + offsets, middles - offsets
     a, b = (
         map_coordinates(levels, [w[:, :, 1], w[:, :, 0]], order=3, prefilter=False, mode="nearest")
         for w in (plus, minus)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial import KDTree
 
+from gripmon.calibration.free_pose import FreePose
 from gripmon.calibration.plane import FingerCorners
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, stand
 from gripmon.calibration.sighting import CalibrationError, Sighting
@@ -121,7 +122,8 @@ def measure_known(
     lens = block_diag(*found.prediction.corners.d_uv_d_xy[taken])
     covariance = lens @ corners.joint_covariance_xy(taken) @ lens.T
     names = tuple(name for name, use in zip(gripper.corner_ids, taken, strict=True) if use)
-    return FingerCorners(names, corners.uv_px[taken], 0.5 * (covariance + covariance.T)), missing
+    free = FreePose(found.cam_T_grip, found.covariance[:6, :6], camera, gripper.points_grip_m(jaw_opening_m))
+    return FingerCorners(names, corners.uv_px[taken], 0.5 * (covariance + covariance.T), free), missing
 
 
 def contact_height_m(gripper: Gripper, jaw_opening_m: float | None) -> float:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera
-from gripmon.corners.consensus import ConsensusSettings
 from gripmon.corners.prediction import ROWS
 from gripmon.corners.profiles import (
     EdgeSettings,
@@ -25,9 +24,10 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
+from gripmon.onboarding.edge_errors import SeenEdge, line_covariances
 from gripmon.onboarding.outlines import Outline
 from gripmon.records import Array, Image
-from gripmon.teaching.lines import EdgePoints, Line, settle_line
+from gripmon.teaching.lines import EdgePoints, settle_line
 
 REACH_PX = 10.0
 """So far from its rough ends an edge is looked for."""
@@ -81,18 +81,19 @@ def snap(camera: Camera, image: Image, outline: Outline, printed: Printed | None
     points = outline.points
     _check_inside(camera, outline)
     for turn in range(_ROUNDS):
-        lines, bases = [], []
+        seen, bases = [], []
         for a, b in outline.edges:
             names = f"{outline.names[a]} to {outline.names[b]}"
             base, reach_px = _lay(camera, points[a], points[b], REACH_PX if turn == 0 else FINAL_REACH_PX, names)
-            lines.append(_line(camera, image, base, reach_px, names, printed, anywhere=turn == 0))
+            seen.append(_line(camera, image, base, reach_px, names, printed, anywhere=turn == 0))
             bases.append(base)
-        found = _meet(camera, outline, points, bases, [line.ends_px for line in lines])
+        found = _meet(camera, outline, points, bases, [edge.line.ends_px for edge in seen])
         moved_px = float(np.linalg.norm(found - points, axis=1).max())
         points = found
         if turn and moved_px < 0.05:
             break
-    covariance = _covariance(camera, outline, points, bases, lines)
+    covariance = _covariance(camera, outline, points, bases, seen)
+    lines = [edge.line for edge in seen]
     return Snapped(points, covariance, np.array([n.seen for n in lines]), np.array([n.rms_px for n in lines]))
 
 
@@ -125,7 +126,7 @@ def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) 
 
 def _line(
     camera: Camera, image: Image, base: _Base, reach_px: float, names: str, printed: Printed | None, *, anywhere: bool
-) -> Line:
+) -> SeenEdge:
     offsets = profile_offsets_px(reach_px + 3.0)
     row = np.arange(-(ROWS // 2), ROWS // 2 + 1)[:, None, None]
     along = np.column_stack([base.normal[:, 1], -base.normal[:, 0]])
@@ -162,7 +163,7 @@ def _line(
             f"{names}: its edge shows along {seen:.0f} % of it within {reach_px:.0f} px; at least "
             f"{100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, an image in focus"
         )
-    return line
+    return SeenEdge(line, points, np.asarray(found.width_px[near]))
 
 
 def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:
@@ -210,15 +211,13 @@ def _ideal_line(camera: Camera, base: _Base, ends_px: Array) -> tuple[Array, flo
     return normal, float(normal @ first)
 
 
-def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Base], lines: list[Line]) -> Array:
-    """(2c, 2c) of the corners: each line by its points' scatter, and by what a whole edge may be off."""
-    floor_px = ConsensusSettings().edge_floor_px
+def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Base], seen: list[SeenEdge]) -> Array:
+    """(2c, 2c) of the corners, from their lines'."""
     corners = list(outline.corners)
     out = np.zeros((2 * len(corners), 2 * len(corners)))
-    ends_px = [line.ends_px for line in lines]
-    for e, line in enumerate(lines):
-        root = np.linalg.cholesky(line.covariance_px2 + floor_px**2)
-        for column in root.T:
+    ends_px = [edge.line.ends_px for edge in seen]
+    for e, covariance in enumerate(line_covariances(seen)):
+        for column in np.linalg.cholesky(covariance).T:
             shifted = [
                 _meet(
                     camera, outline, points, bases, [x + (s * column if k == e else 0.0) for k, x in enumerate(ends_px)]
