@@ -121,6 +121,19 @@ def test_corners_of_a_marked_board_keep_their_numbers(look: Look, reach: float, 
     assert np.sqrt(np.mean(errors**2) / 2.0) < 0.06 and errors.max() < 0.2
 
 
+@pytest.mark.parametrize("quarter", range(4))
+def test_a_board_is_found_where_a_corner_of_the_image_looks_past_its_horizon(quarter: int):
+    """A wide lens and a steep view; which corner it is must not matter, nor how the board lies."""
+    wide = BrownConradyLens(width_px=640, height_px=480, fx_px=260.0, fy_px=260.0, cx_px=319.5, cy_px=239.5)
+    board = Charuco(columns=12, rows=9, square_m=0.01, marker_m=0.0075, dictionary="DICT_5X5_100")
+    for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+        T = pose(board, (0.0, 0.0, 0.07), 0.62 * np.array(signs), 0.5 * np.pi * quarter + 0.2)
+        sight = found_in(render(wide, T, board, Look(supersampling=2)), board)
+        points = points_of(board)
+        errors = np.linalg.norm(sight.uv_px - true_uv(wide, T, points)[sight.ids], axis=1)
+        assert len(sight) >= 30 and errors.max() < 0.3
+
+
 def test_a_mirrored_board_is_told():
     sight = detect(render(LENS, HELD_MARKED, MARKED, Look(supersampling=2, mirrored=True)), MARKED)
     assert isinstance(sight, NotFound) and sight.reason == "the board is mirrored; an image that isn't flipped"
