@@ -143,6 +143,32 @@ def test_the_error_of_a_configured_calibration_is_no_motion():
     assert only(Run(records(off_m))).affected
 
 
+def test_before_a_motion_nothing_is_affected_by_what_a_frame_cannot_tell():
+    """A shift past the limit along an axis that frames know less well than that; then a knock."""
+    run = stepped()
+    sigmas = np.array([1e-5, 1e-5, 1.5e-4, 1e-3, 1e-3, 1e-3])
+    for k, record in enumerate(run.records):
+        pose = record.cam_T_grip
+        x, y, z = pose.translation_m
+        run.records[k] = msgspec.structs.replace(
+            record,
+            cam_T_grip=msgspec.structs.replace(pose, translation_m=(x, y, z + 1.6e-4)),
+            covariance=tuple(np.diag(sigmas**2).ravel().tolist()),
+        )
+    (old,) = only(run).affected
+    assert old.start_ns == START_NS + 250 * PERIOD_NS and old.end_ns == START_NS + 499 * PERIOD_NS
+    # Frames that know it are believed.
+    sure = tuple(np.diag((0.1 * sigmas) ** 2).ravel().tolist())
+    run.records[:] = [msgspec.structs.replace(record, covariance=sure) for record in run.records]
+    assert only(run).affected[0].start_ns == START_NS
+
+
+def test_images_without_time_stamps_are_given_no_date():
+    shifts_m = np.zeros((100, 3))
+    assert "by a clock that began with the images" in only(Run(records(shifts_m, start_ns=0))).summary
+    assert "2023-11-14" in only(Run(records(shifts_m))).summary
+
+
 def test_what_was_lost_is_told():
     run = stepped(at=450)
     run.records[100:200] = [

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gripmon.records import Array
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import AffectedRange, Displacement, Event, Limits
+from gripmon.report.formats import COVERAGE
 from gripmon.report.lives import MOTIONS
 from gripmon.report.track import Track, displacement
 
@@ -35,10 +36,12 @@ def motion_ranges(
     """
     if not track.measured.any():
         return []
-    old = _past(track, track.against_first, limits, np.zeros(len(track), np.int64))
+    onsets = [event.onset.stamp_ns for event in events if event.kind in MOTIONS]
+    moved = track.stamp_ns >= min(onsets, default=np.iinfo(np.int64).max)
+    old = _past(track, track.against_first, limits, np.zeros(len(track), np.int64), moved)
     out = [_motion_range("old_calibration", track, track.against_first, run, table_keys[0], events) for run in old]
     if len(table_keys) > 1:
-        stale = _past(track, track.against_reference, limits, track.reference)
+        stale = _past(track, track.against_reference, limits, track.reference, moved)
         for run in stale:
             key = table_keys[int(track.reference[run[0]])]
             out.append(_motion_range("stale_reference", track, track.against_reference, run, key, events))
@@ -78,9 +81,12 @@ def runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _past(track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64]) -> list[tuple[int, int]]:
+def _past(
+    track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64], moved: NDArray[np.bool_]
+) -> list[tuple[int, int]]:
     """First and last frame of each time past the limits, in one group each; it is over only when a frame was measured
-    that is clearly within.
+    that is clearly within.  Before anything has ``moved`` (n,) it begins only where it is more than a frame's transform
+    is uncertain by: where that is as much as the limit, being past it says nothing.
     """
     from scipy.ndimage import median_filter
 
@@ -89,7 +95,11 @@ def _past(track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64]
     for part in runs_of_equal(group[frames]):  # a median over a change of reference would mix two
         smooth[part] = median_filter(vectors[frames[part]], size=(_MEDIAN_FRAMES, 1), mode="nearest")
     size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
-    excess = np.maximum(size, np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad)
+    turn = np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad
+    excess = np.maximum(size, turn)
+    told = (size >= 1.0) & _told(smooth[:, :3], track.sigma[frames, :3])
+    told |= (turn >= 1.0) & _told(smooth[:, 3:], track.sigma[frames, 3:])
+    told |= moved[frames]
     out: list[tuple[int, int]] = []
     start: int | None = None
     for i, frame in enumerate(frames.tolist()):
@@ -97,11 +107,18 @@ def _past(track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64]
         if start is not None and (excess[i] < _RELIEF or not same):
             out.append((start, frame - 1))
             start = None
-        if start is None and excess[i] >= 1.0:
+        if start is None and excess[i] >= 1.0 and told[i]:
             start = frame
     if start is not None:
         out.append((start, len(track) - 1))
     return [(a, b) for a, b in out if int(track.measured[a : b + 1].sum()) > _MEDIAN_FRAMES // 2]
+
+
+def _told(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
+    """(n,) which vectors (n, 3) are longer than what a ± of their deviations (n, 3) stands for along them."""
+    along = np.linalg.norm(vectors * sigma, axis=1)
+    out: NDArray[np.bool_] = ~(np.square(vectors).sum(axis=1) <= COVERAGE * along)  # what has no deviation is told
+    return out
 
 
 def runs_of_equal(values: NDArray[np.int64]) -> list[slice]:

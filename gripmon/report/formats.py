@@ -11,6 +11,9 @@ COVERAGE = 2.0
 """Standard deviations that a ± stands for."""
 
 
+_FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
+
+
 def clock_time(stamp_ns: int, digits: int = 1) -> str:
     """``12:34:56.7``, UTC, cut, not rounded: no such time lies after the event."""
     whole, part = divmod(stamp_ns, 1_000_000_000)
@@ -20,6 +23,14 @@ def clock_time(stamp_ns: int, digits: int = 1) -> str:
 def date(stamp_ns: int) -> str:
     """``2026-11-21``, UTC."""
     return f"{_at(stamp_ns // 1_000_000_000):%Y-%m-%d}"
+
+
+def period(start_ns: int, end_ns: int) -> str:
+    """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is no date."""
+    times = f"{clock_time(start_ns, 0)} to {clock_time(end_ns, 0)}"
+    if 0 <= start_ns < _FIRST_YEAR_NS:
+        return f"{times} by a clock that began with the images, or with 1970"
+    return f"{date(start_ns)}, {times} UTC"
 
 
 def iso(stamp_ns: int) -> str:

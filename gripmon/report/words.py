@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from gripmon.records import AlertKind, Cause
 from gripmon.report.content import AffectedRange, Event, RecordingReport
-from gripmon.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, size, span
+from gripmon.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, period, size, span
 from gripmon.report.limits import excess
 from gripmon.report.lives import MOTIONS
 
@@ -67,7 +67,7 @@ def _times(number: int) -> str:
 
 def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
     who = f"he camera of {report.robot} / {report.camera}"
-    when = f"{date(report.start_ns)}, {clock_time(report.start_ns, 0)} to {clock_time(report.end_ns, 0)} UTC"
+    when = period(report.start_ns, report.end_ns)
     if not motions:
         if report.last_measured_ns is None:
             return f"Whether t{who} moved can't be said: in no frame ({when}) could it be measured."
