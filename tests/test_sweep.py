@@ -343,7 +343,10 @@ def test_a_gripper_without_faces_is_drawn_by_its_edges(tmp_path: Path, capsys: p
     assert (
         main(["check", str(config), "--sweep", "--distance", "0.115", "--tilt", "32,40", "--picture", str(path)]) == 0
     )
-    assert "best " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "best " in said and "no faces   The gripper file has none" in said
+    assert main(["check", str(config)]) == 0
+    assert "the gripper file has no faces: what the finger itself hides isn't known" in capsys.readouterr().out
     # The present mount's thumbnail, the second of three, shows dark lines on blank grey and little else.
     second = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[-400:-120, 530:970]
     assert 0.01 < (second < 80).mean() < 0.2 and (abs(second.astype(int) - 170) < 4).mean() > 0.6

@@ -195,6 +195,9 @@ def _as_text(report: dict[str, Any]) -> str:
     }
     lines = [f"{report['config']}: sound"]
     lines += [f"{name:<10} {text}" for name, text in sections.items()]
+    if not report["gripper"]["faces"]:
+        # Before the corners, whose list follows.
+        lines.insert(-1, " " * 11 + "the gripper file has no faces: what the finger itself hides isn't known")
     lines += [_corner_line(corner) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
     lines += margins.in_view_lines(report["in_view"])

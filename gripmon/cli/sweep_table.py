@@ -105,6 +105,11 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
         "           until too little is in view.  Not known here: focus, light, what is in the camera's way, and what",
         "           hides the fingers without being in the gripper file.",
     ]
+    if not config.gripper.faces:
+        lines += [
+            "no faces   The gripper file has none, as an inferred one: every edge counts as seen from everywhere, also",
+            "           where the finger itself hides it. Trust mounts near the present one only.",
+        ]
     if ranked[0].works:
         lines += _to_copy(ranked[0])
     return lines
