@@ -87,6 +87,7 @@ class SecondCamera(Loop):
         self._believed_s = self._start_s
         self._pulses = 0
         self._failure = ""  # of the last pulse: of the code here, not of the camera
+        self._news = False  # a pulse was judged since the last frame, or that has failed
         self._unused = "no pulse yet"
 
     @property
@@ -107,7 +108,6 @@ class SecondCamera(Loop):
 
     def _handle(self, frame: Frame) -> None:
         self._seq = frame.seq
-        self._faults.clear()
         failure, refused = "", ""
         alerts: tuple[Alert, ...] = ()
         shown: list[Shown] = []
@@ -116,6 +116,7 @@ class SecondCamera(Loop):
         except Exception as error:  # noqa: BLE001  said and counted
             failure = self._failed(f"frame {frame.seq}: ", error)
         self._judge(shown)
+        self._news = self._news or bool(failure)
         failure = failure or self._failure
         self._tell(alerts, self._pulsed.state, frame.stamp_ns)
         self._gather_alerts()
@@ -123,10 +124,17 @@ class SecondCamera(Loop):
         self._newest = Newest(frame, self._frame_record(frame, judged), time.monotonic())
         for alert in self._watch.judged(judged, time.monotonic()):
             self._alert(alert, judged.state, frame.stamp_ns)
-        if shown or failure or self._faults:
+        self._end_of_frame(frame, failure, judged.state)
+
+    def _end_of_frame(self, frame: Frame, failure: str, state: State) -> None:
+        """Errors count by pulses: between them a failure is neither over nor one more."""
+        over = not failure and self._watch.errors_in_a_row > 0
+        if self._news or self._faults or over:
             undelivered = "; ".join(self._faults.values())
+            self._faults.clear()
+            self._news = False
             for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
-                self._alert(alert, judged.state, frame.stamp_ns)
+                self._alert(alert, state, frame.stamp_ns)
 
     def _judged(self, refused: str, failure: str) -> Judged:
         """How things stand with this frame."""
@@ -148,6 +156,7 @@ class SecondCamera(Loop):
         for each in shown:
             began_ns = time.monotonic_ns()
             self._pulses += 1
+            self._news = True
             try:
                 outcome, self._failure = self._pulsed.judge(each), ""
             except Exception as error:  # noqa: BLE001  said and counted
