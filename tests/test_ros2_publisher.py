@@ -69,7 +69,7 @@ class Bench:
         self._marks = 0
         self._samples: list[zenoh.Sample] = []
         self._subscriber = session.declare_subscriber(f"{settings.domain_id}/**", self._samples.append)
-        wait_until(lambda: self._marked(self._mark()), "the subscription to reach the publisher")
+        wait_until(lambda: self._mark() and self._samples, "the subscription to reach the publisher")
         self.published()
 
     def published(self) -> list[zenoh.Sample]:
