@@ -91,14 +91,16 @@ def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
     plane, mask = cv2.findHomography(
         plate[:, :2].astype(np.float64), places, cv2.RANSAC, tolerance_px, maxIters=500, confidence=0.999
     )
-    if plane is None:
-        return np.zeros(len(places), bool)
-    # Not mirrored where the points are: at the plate's origin, which may be far out of view, the sign may be another.
-    depth = plate[:, :2] @ plane[2, :2] + plane[2, 2]
-    if np.linalg.det(plane) * float(np.median(depth[mask.ravel() > 0])) < 0.0:
+    if plane is None or _mirrors(plane, plate[mask.ravel() > 0]):
         return np.zeros(len(places), bool)
     out: NDArray[np.bool_] = mask.ravel() > 0
     return out
+
+
+def _mirrors(plane: Array, plate: Array) -> bool:
+    """Whether a homography turns the plate over where these points (n, 3) are: elsewhere its sign says nothing."""
+    depth = plate[:, :2] @ plane[2, :2] + plane[2, 2]
+    return bool(np.linalg.det(plane) * np.median(depth) < 0.0)
 
 
 def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
