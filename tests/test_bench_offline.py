@@ -49,10 +49,12 @@ def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     for seed in (4, 5):
         rng = np.random.default_rng(seed)
         setting = offline_plane.Setting.random(rng, gap_m=offline_plane.GAP_M)
-        offline_plane._look(gap, setting, setting.simulators(1, (1.0,))[0].render(0), rng)
-    assert gap.count == 2 and gap.by_residuals == 2 and gap.by_apart == len(gap.apart)
+        apart = np.array([0.0, 0.0, offline_plane.GAP_M])
+        offline_plane._look(gap, setting, setting.simulators(1, (1.0,))[0].render(0), rng, apart)
+    assert gap.count == 2 and gap.by_residuals == 2 and gap.by_apart == len(gap.apart) == 2
+    assert [a[2] for a in gap.apart] == pytest.approx([offline_plane.GAP_M] * 2, rel=0.5)
     # Three corners alone can't tell; four can.
-    assert len(gap.apart) == 1 and gap.apart[0][2] == pytest.approx(offline_plane.GAP_M, rel=0.2)
+    assert min(gap.power) > 0.5 and min(gap.corner_power) == 0.0 and max(gap.corner_power) > 0.9
     text = offline.report(errors, [gap], [], [], 1, ["something"])
     assert "first seed 1" in text and "MISSED: something" in text and "nan" not in text
 

@@ -145,9 +145,13 @@ def _revealed_table(revealed: list[Revealed]) -> str:
     import numpy as np
 
     lines = [
-        "a gripper that doesn't stand on the plate: part of the images in which it is told (probability below 0.001)",
         (
-            f"{'':<30} {'noise, DN':>9} {'residuals':>10} {'tilt/gap':>9} {'tilt found x, y (degrees)':>26} "
+            "a gripper that doesn't stand on the plate: part of the images in which it is told (probability below 0.001); "
+            "power: of the best test, by all edges and by the corners alone"
+        ),
+        (
+            f"{'':<30} {'noise, DN':>9} {'residuals':>10} {'tilt/gap':>9} {'power':>6} {'corners':>8} "
+            f"{'tilt found x, y (degrees)':>28} "
             f"{'gap found (mm)':>17} {'TCP off by (mm)':>16}"
         ),
     ]
@@ -157,10 +161,11 @@ def _revealed_table(revealed: list[Revealed]) -> str:
             continue
         apart = np.array(row.apart) * [np.degrees(1.0), np.degrees(1.0), 1e3]
         mean, scatter = apart.mean(axis=0), apart.std(axis=0)
-        tilts = " ".join(f"{m:+.2f} ± {s:.2f}" for m, s in zip(mean[:2], scatter[:2], strict=True))
+        tilts = " ".join(f"{m:+.3f} ± {s:.3f}" for m, s in zip(mean[:2], scatter[:2], strict=True))
         lines.append(
             f"{row.what:<30} {row.noise_dn:>9g} {100 * row.by_residuals / row.count:>8.0f} % "
-            f"{100 * row.by_apart / row.count:>7.0f} % {tilts:>26} {mean[2]:>+8.3f} ± {scatter[2]:.3f} "
+            f"{100 * row.by_apart / row.count:>7.0f} % {100 * np.mean(row.power):>4.0f} % "
+            f"{100 * np.mean(row.corner_power):>6.0f} % {tilts:>28} {mean[2]:>+8.3f} ± {scatter[2]:.3f} "
             f"{np.mean(row.shift_mm):>16.4f}"
         )
     return "\n".join(lines)

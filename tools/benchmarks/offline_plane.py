@@ -5,20 +5,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.stats import chi2, ncx2
 
 from benchmarks.offline_images import DISCS, OPENING_M, PAPER_LENS, Setting, gripper
 from gripmon.calibration.detection import detect
 from gripmon.calibration.intrinsics import calibrate_single_view
-from gripmon.calibration.plane import Coincidence, GivenCamera
+from gripmon.calibration.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
 from gripmon.calibration.plane_average import average
 from gripmon.calibration.sighting import CalibrationError, NotFound, Sighting
 from gripmon.camera import make_camera
 from gripmon.geometry import perturbation_between
 from gripmon.onboarding import KnownGripper, UnknownGripper
+from gripmon.onboarding.measuring import contact_height_m
 from gripmon.records import Array, Image
 from gripmon.simulator.scenario import Sensor
 
@@ -61,8 +62,12 @@ class Errors:
 @dataclass
 class Revealed:
     """What doesn't coincide, at one image noise, seen by one way: ``count`` trials of which so many were told of, by
-    the residuals or by the tilt and gap that the corners alone give; ``apart`` (n, 3) those, rad, rad, m; ``shift_mm``
-    (n,) the TCP's error that follows.
+    the residuals or by the tilt and gap that the gripper's own edges give, no plate considered; ``apart`` (n, 3) those,
+    rad, rad, m; ``shift_mm`` (n,) the TCP's error that follows.
+
+    ``power`` (n,): probability with which the best test notices the true tilt and gap, ``corner_power`` (n,) the best
+    one of the corners alone; by the covariances that are stated, of chi-squared statistics with three degrees of
+    freedom, not central by ``m' C^-1 m`` for the means m: for normal errors the likelihood ratio's.
     """
 
     what: str
@@ -72,6 +77,8 @@ class Revealed:
     by_apart: int = 0
     apart: list[Array] = field(default_factory=list)
     shift_mm: list[float] = field(default_factory=list)
+    power: list[float] = field(default_factory=list)
+    corner_power: list[float] = field(default_factory=list)
 
 
 def trials(count: int, seed: int, print_m: float, progress: Callable[[], object] = lambda: None) -> list[Errors]:
@@ -135,13 +142,13 @@ def revealed(count: int, seed: int, progress: Callable[[], object] = lambda: Non
             light = simulators[0].light(0)
             for simulator, row in zip(simulators, rows, strict=True):
                 image = simulator.expose(light.copy(), 0)
-                _look(row, setting, image, rng)
+                _look(row, setting, image, rng, np.array([-tilt_rad[0], -tilt_rad[1], gap_m]))
             progress()
         out += rows
     return out
 
 
-def _look(row: Revealed, setting: Setting, image: Image, rng: np.random.Generator) -> None:
+def _look(row: Revealed, setting: Setting, image: Image, rng: np.random.Generator, true_apart: Array) -> None:
     sight = detect(image, DISCS, "")
     if isinstance(sight, NotFound):
         return
@@ -154,8 +161,28 @@ def _look(row: Revealed, setting: Setting, image: Image, rng: np.random.Generato
     row.by_apart += one.apart_p is not None and one.apart_p < REVEALED_P
     if one.tilt_rad is not None and one.gap_m is not None:
         row.apart.append(np.array([*one.tilt_rad, one.gap_m]))
+    row.power.append(_power(one, true_apart))
+    row.corner_power.append(_power(_by_corners(one), true_apart))
     shift = perturbation_between(one.cam_T_grip, setting.cam_T_grip)[:3]
     row.shift_mm.append(1e3 * float(np.linalg.norm(shift)))
+
+
+def _by_corners(one: Coincidence) -> Coincidence:
+    """The same image without the edges that leave the plate."""
+    points_m = gripper().points_grip_m(OPENING_M)
+    known = KnownCorners(
+        points_m[[gripper().point_ids.index(name) for name in one.corners.names]],
+        contact_height_m(gripper(), OPENING_M),
+    )
+    return calibrate_plane(GivenCamera(PAPER_LENS), one.sighting, replace(one.corners, free=None), known)
+
+
+def _power(one: Coincidence, true_apart: Array) -> float:
+    """0 where tilt and gap can't be told."""
+    if one.apart_covariance is None:
+        return 0.0
+    away = float(true_apart @ np.linalg.solve(one.apart_covariance, true_apart))
+    return float(ncx2.sf(chi2.isf(REVEALED_P, 3), 3, away)) if away > 0.0 else REVEALED_P
 
 
 _SEEN = ("L_in_near", "L_in_far", "L_out_near", "R_in_near", "R_in_far", "R_out_near")
