@@ -91,7 +91,7 @@ def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
     plane, mask = cv2.findHomography(
         plate[:, :2].astype(np.float64), places, cv2.RANSAC, tolerance_px, maxIters=500, confidence=0.999
     )
-    if plane is None or _mirrors(plane, plate[mask.ravel() > 0]):
+    if plane is None or _mirrors(np.asarray(plane, np.float64), plate[mask.ravel() > 0]):
         return np.zeros(len(places), bool)
     out: NDArray[np.bool_] = mask.ravel() > 0
     return out
