@@ -104,10 +104,16 @@ class Bank:
         uv_px = pulse.foreseen_px + shifts.sum(axis=2)
         rows = np.tile(pulse.rows, (len(beliefs), 1, 1))
         reach = np.sqrt(_FAR * self._calibrated.sigma_px * self._focal_px)
-        for k in np.flatnonzero(np.abs(shifts).sum(axis=2).max(axis=1) > reach):
-            found = foresee_moved(self._calibrated, change[k], pulse.base_T_ee)
-            uv_px[k] = found.uv_px if found.finite else np.nan
-            rows[k] = found.rows
+        left = np.flatnonzero(np.abs(shifts).sum(axis=2).max(axis=1) > reach)
+        while len(left):
+            # Derivatives where one of them is serve all that are near it.
+            found = foresee_moved(self._calibrated, change[left[0]], pulse.base_T_ee)
+            shifts = (change[left] - change[left[0]])[:, None, :] * found.rows
+            near = np.abs(shifts).sum(axis=2).max(axis=1) <= reach
+            near[0] = True
+            uv_px[left[near]] = found.uv_px + shifts[near].sum(axis=2) if found.finite else np.nan
+            rows[left[near]] = found.rows if found.finite else 0.0
+            left = left[~near]
         return self._with_place(beliefs, pulse, uv_px, rows)
 
     @staticmethod
@@ -166,8 +172,9 @@ class Bank:
         step = (gain @ off[:, :, None])[:, :, 0]
         before = beliefs.mean.copy()
         beliefs.mean += step
+        gain[~believed] = 0.0
         after = gain @ spread.transpose(0, 2, 1)
-        beliefs.covariance -= np.where(believed[:, None, None], after, 0.0)
+        beliefs.covariance -= after
         moved = np.abs(rows[:, :, : 2 * COUNT] * step[:, None, : 2 * COUNT]).sum(axis=2).max(axis=1)
         reach = np.sqrt(_FAR * self._calibrated.sigma_px * self._focal_px)
         for k in np.flatnonzero(believed & (moved > reach)):

@@ -27,7 +27,7 @@ LEAST_PULSES = 3
 """That speak for a motion before it is said: two wrong spots may look like one."""
 BACK_AGAIN = 100.0
 """Odds from which what had moved is where it was."""
-_KEPT = 48
+_KEPT = 32
 _REIGNING = 12
 _HOPELESS = math.log(1e-6)
 """Weight below which an alternative is dropped: those that begin now overtake it."""
@@ -89,7 +89,7 @@ class MotionTest:
         self.reigning.weight = weight - all_told
         best = self.best
         others.weight = others.weight + self._bank.weigh(others, pulse, wrong, self._share)[0] - all_told
-        self._others = _kept(others.picked(others.weight > _HOPELESS), _KEPT)
+        self._others = _kept(others, _KEPT, _HOPELESS)
         self._prune()
         odds, back_odds = self._odds()
         changes = odds >= 1.0 or back_odds >= 1.0
@@ -162,8 +162,7 @@ class MotionTest:
         return int(candidates[0]), bool(believed[0])
 
 
-def _kept(beliefs: Beliefs, most: int) -> Beliefs:
-    """The weightiest."""
-    if len(beliefs) <= most:
-        return beliefs
-    return beliefs.picked(np.sort(np.argsort(-beliefs.weight, kind="stable")[:most]))
+def _kept(beliefs: Beliefs, most: int, least: float = -math.inf) -> Beliefs:
+    """The weightiest, of those above a weight."""
+    heavy = np.argsort(-beliefs.weight, kind="stable")[:most]
+    return beliefs.picked(np.sort(heavy[beliefs.weight[heavy] > least]))
