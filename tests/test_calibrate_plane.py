@@ -104,7 +104,7 @@ def test_a_known_gripper_from_two_images(here: Path, capsys: pytest.CaptureFixtu
     assert np.sqrt(found.covariance[14]) == pytest.approx(0.115 * 0.2 / 962.0, rel=0.15)
     assert "p1.png" in said.out and "the images agree" in said.out and "TCP in the camera frame  0.4" in said.out
     picture = cv2.imread(str(here / "he.png"))
-    assert picture.shape == (1152, 1536, 3)
+    assert picture.shape[0] > 1152 and picture.shape[1:] == (1536, 3)  # and the caption below
     colours = picture.reshape(-1, 3).astype(int)
     assert np.count_nonzero(np.ptp(colours, axis=1) > 100) > 2000, "points and corners are in colour"
 

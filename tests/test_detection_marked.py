@@ -101,6 +101,15 @@ def test_discs_too_blurred_to_be_measured_are_told():
     assert isinstance(sight, NotFound) and "blurred" in sight.reason
 
 
+def test_a_target_that_is_too_small_is_not_called_blurred():
+    """A sharp image by a fisheye from far away: discs of six pixels."""
+    discs = CircleGrid(12, 10, 0.008, 0.004)
+    image = render(FISHEYE, pose(discs, (0.0, 0.0, 0.2), (0.2, 0.1), 0.5), discs, Look(supersampling=2))
+    sight = detect(image, discs)
+    assert isinstance(sight, NotFound) and "too small for its edges: its points lie 8 px apart" in sight.reason
+    assert "nearer to it" in sight.reason and "blurred" not in sight.reason
+
+
 @pytest.mark.parametrize(
     ("look", "reach", "least"),
     [

@@ -114,7 +114,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     starts, ends = _across_squares(cells, rough)
     blur_px = edge_blur_px(grey, starts, ends)
     if blur_px > TOO_BLURRED * float(np.median(steps)):
-        return NotFound(_too_blurred(blur_px))
+        return NotFound(_too_coarse(blur_px, steps))
     cells = _turned(cells, target.columns, target.rows)
     uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps, cells)
     plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
@@ -136,8 +136,9 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     starts = rough[[a for a, _ in pairs]]
     blur_px = edge_blur_px(grey, starts, 0.5 * (starts + rough[[b for _, b in pairs]]))
     share = target.diameter_m / target.spacing_m
-    if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(_steps(cells, rough))):
-        return NotFound(_too_blurred(blur_px))
+    steps = _steps(cells, rough)
+    if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(steps)):
+        return NotFound(_too_coarse(blur_px, steps))
     noise = noise_of(grey)
     first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
     centres = [blobs.refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
@@ -254,6 +255,16 @@ def _blurred(grey: Grey) -> str:
     """What is said of an image without target that isn't sharp anywhere."""
     blur_px = sharpest_blur_px(grey)
     return _too_blurred(blur_px) if blur_px > BLURRED_PX else ""
+
+
+def _too_coarse(blur_px: float, steps: Array) -> str:
+    """What is said of a target whose edges are too wide for it: blurred, or too small in a sharp image."""
+    if blur_px > BLURRED_PX:
+        return _too_blurred(blur_px)
+    return (
+        f"the target is too small for its edges: its points lie {float(np.median(steps)):.0f} px apart, and edges have "
+        f"a standard deviation of {blur_px:.1f} px; nearer to it, or sharper"
+    )
 
 
 def _too_blurred(blur_px: float) -> str:

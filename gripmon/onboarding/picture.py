@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import cv2
 import numpy as np
 
@@ -21,6 +23,8 @@ _UNUSED: _Colour = (70, 70, 250)
 _CORNER: _Colour = (40, 220, 250)
 _AXES: tuple[tuple[str, _Colour], ...] = (("x", (80, 80, 255)), ("y", (80, 230, 80)))
 _TEXT: _Colour = (255, 255, 255)
+_STRIP = 24
+_SIZE = 0.8
 
 
 def draw(image: Image, lens: LensSettings, found: Coincidence) -> Image:
@@ -43,14 +47,14 @@ def draw(image: Image, lens: LensSettings, found: Coincidence) -> Image:
     for name, uv_px, residual in zip(found.corners.names, found.corners.uv_px, found.residuals_px, strict=True):
         _circle(picture, uv_px, 5.0, zoom, _CORNER)
         _line(picture, uv_px - residual, uv_px + (enlarged - 1) * residual, zoom, _CORNER)
-        _text(picture, name, uv_px + np.array([5.0, -5.0]), zoom, _CORNER)
+        # Away from the middle, where the plate's points are: the fingers are darker, and of one shade.
+        _label(picture, name, uv_px, zoom, _CORNER, left=bool(uv_px[0] < 0.5 * lens.width_px))
     left_out = int(np.count_nonzero(~used))
     legend = (
         f"{int(used.sum())} points of the plate (green), {left_out} left out (red), "
         f"{len(found.corners.names)} corners (yellow); residuals x {enlarged}"
     )
-    _text(picture, legend, np.array([4.0, 12.0]), zoom, _TEXT)
-    return picture
+    return _with_caption(picture, legend)
 
 
 def _grey(image: Image) -> Image:
@@ -85,9 +89,27 @@ def _line(picture: Image, start: Array, end: Array, zoom: int, colour: _Colour, 
     cv2.line(picture, _fixed(start, zoom), _fixed(end, zoom), colour, thickness, cv2.LINE_AA, _SHIFT)
 
 
+def _label(picture: Image, name: str, at_px: Array, zoom: int, colour: _Colour, *, left: bool) -> None:
+    """A corner's name beside it."""
+    (width, height), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, _SIZE, 1)
+    away = np.array([-width - 12.0 if left else 12.0, 1.6 * height]) / zoom
+    _text(picture, name, at_px + away, zoom, colour)
+
+
 def _text(picture: Image, text: str, at_px: Array, zoom: int, colour: _Colour) -> None:
-    """With a shadow; OpenCV's font knows ASCII only."""
+    """With a dark outline, of the same weight: thicker letters are wider.  OpenCV's font knows ASCII only."""
     u, v = (round(float(x) * zoom) for x in at_px)
     plain = text.encode("ascii", "replace").decode()
-    for paint, shift in (((0, 0, 0), 1), (colour, 0)):
-        cv2.putText(picture, plain, (u + shift, v + shift), cv2.FONT_HERSHEY_SIMPLEX, 0.5, paint, 1, cv2.LINE_AA)
+    for right, down in (*itertools.product((-2, 0, 2), repeat=2), (0, 0)):
+        paint = colour if right == down == 0 else (0, 0, 0)
+        cv2.putText(picture, plain, (u + right, v + down), cv2.FONT_HERSHEY_SIMPLEX, _SIZE, paint, 1, cv2.LINE_AA)
+
+
+def _with_caption(picture: Image, text: str) -> Image:
+    """The words below, on a strip of their own, as large as the width allows."""
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 1.0, 1)
+    size = min(1.2 * _SIZE, 0.96 * picture.shape[1] / width)
+    strip = np.full((round(2.4 * size * height) + 8, picture.shape[1], 3), _STRIP, np.uint8)
+    place = (round(0.01 * picture.shape[1]), round(0.5 * (len(strip) + size * height)))
+    cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
+    return np.vstack([picture, strip])
