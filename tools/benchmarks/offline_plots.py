@@ -19,7 +19,7 @@ def draw(errors: list[Errors], revealed: list[Revealed], path: Path) -> None:
     os.environ.setdefault("MPLBACKEND", "Agg")
     from matplotlib import pyplot
 
-    figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(13.0, 4.0), layout="constrained")
+    figure, (left, middle, right) = pyplot.subplots(1, 3, figsize=(13.0, 4.6), layout="constrained")
     for row in errors:
         if not row.error:
             continue
@@ -34,10 +34,19 @@ def draw(errors: list[Errors], revealed: list[Revealed], path: Path) -> None:
         panel.axvline(limit, color="#222222", linewidth=0.8)
         panel.set(xscale="log", xlabel=f"TCP error {what} the optical axis (µm)", ylim=(0.0, 1.0))
     left.set(ylabel="part of the trials")
-    left.legend(fontsize=6, loc="upper left")
+    # Below: the curves fill their panels.  By columns, so that each way stands above itself on a printed plate.
+    figure.legend(*_by_way(left), fontsize=9, loc="outside lower left", ncols=3)
     _draw_apart(right, revealed)
     figure.savefig(path, dpi=110)
     pyplot.close(figure)
+
+
+def _by_way(panel: Any) -> tuple[list[Any], list[str]]:
+    """Lines and labels, the plates of each way beside each other: a legend fills column by column."""
+    lines, labels = panel.get_legend_handles_labels()
+    ways = list(_LABELS.values())
+    order = sorted(range(len(labels)), key=lambda k: (ways.index(labels[k].split(", ")[0]), k))
+    return [lines[k] for k in order], [labels[k] for k in order]
 
 
 def _draw_apart(panel: Any, revealed: list[Revealed]) -> None:
@@ -50,4 +59,4 @@ def _draw_apart(panel: Any, revealed: list[Revealed]) -> None:
     noises = sorted({row.noise_dn for row in revealed})
     panel.set_xticks(noises, labels=[f"{noise:g}" for noise in noises])
     panel.minorticks_off()
-    panel.legend(fontsize=7)
+    panel.legend(fontsize=8)
