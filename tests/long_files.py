@@ -1,6 +1,6 @@
 """The files whose tests take longest, to be begun first: a long one that is begun last keeps one worker busy alone.
 
-By processor time, or by the time on the clock where tests mostly wait, from a minute down to some ten seconds; how exact
+By processor time, or by the clock where tests mostly wait, from a minute down to some ten seconds; how exact
 the order is matters little.  ``tools/test --durations 100`` shows what has become long.
 """
 
