@@ -37,7 +37,7 @@ LONGEST = (
     "test_causes_images",
     "test_held",
     "test_replay_full_disk",
-    "test_sweep",
+    "test_sweep_command",
     "test_report_command",
     "test_recording_faults",
     "test_calibrate_command",
