@@ -27,7 +27,11 @@ the state on the network says so.
 
 The references, a proposal and open alerts survive a restart, also kill -9 and a power cut, in the file
 that state.file names: a live camera's in ~/.local/state/gripmon.  After a restart the monitor goes on
-from the last reference, checks in the picture that it still fits, and says so (alert restarted)."""
+from the last reference, checks in the picture that it still fits, and says so (alert restarted).
+
+A configuration with a section laser is that of a second camera, beside the robot: its calibration is
+tested with every pulse of a laser pointer on the arm, which the robot's program tells
+(docs/laser.md, Watching)."""
 
 _EXAMPLES = """\
   gripmon run configs/live_camera.yaml
@@ -37,9 +41,12 @@ _EXAMPLES = """\
   gripmon send undo --robot arm1                         back to the reference before
   gripmon run configs/live_camera.yaml --view web        watch it live in a browser, on this machine
 
-Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}.
+  gripmon run configs/second_camera.yaml                 a fixed camera, watched with a pulsed laser
+
+Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}; a second
+camera's on {spot,state,alert}, and it hears pulses on …/pulse.
 exit codes: 0 the source ended, the time was over, or SIGTERM; 2 wrong usage or configuration; 3 no
-usable frame, or an internal error that persisted; 130 Ctrl-C"""
+usable frame, pulses of which none showed its spot, or an internal error that persisted; 130 Ctrl-C"""
 
 
 def add_parser(commands: Any) -> None:
@@ -54,8 +61,8 @@ def add_parser(commands: Any) -> None:
     parser.add_argument(
         "--out",
         metavar="DIR",
-        help="put the recording and estimates.jsonl (one JSON line a frame) here; made if it is missing, and what "
-        "is there is kept (estimates-1.jsonl …)",
+        help="put the recording and estimates.jsonl (one JSON line a frame; spots.jsonl, a line a pulse) here; made if "
+        "it is missing, and what is there is kept (estimates-1.jsonl …)",
     )
     parser.add_argument(
         "--fresh-state",

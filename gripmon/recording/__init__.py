@@ -7,7 +7,8 @@ slow disk ever hold the interpreter that the loop runs in.  The daemon itself ne
 
 from __future__ import annotations
 
-from gripmon.recording.feed import ProcessRecorder, open_recorder, open_spot_recorder
+from gripmon.recording.feed import ProcessRecorder
+from gripmon.recording.opened import open_recorder, open_spot_recorder
 from gripmon.recording.recorder import EventRecorder, Notes, NullRecorder, Recorder, SpotRecorder, Trace
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
