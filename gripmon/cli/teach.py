@@ -201,32 +201,14 @@ def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
 
 def _opening(path: Path, config: Config, given_m: float | None) -> float | None:
     """The jaw opening in an image; None for a gripper without jaw."""
-    from gripmon.sources import SourceError
-    from gripmon.sources.folder import TIMESTAMPS_NAME, read_table
+    from gripmon.cli.teach_inputs import read_opening
+    from gripmon.sources.folder import TIMESTAMPS_NAME
 
-    gripper, opening_m = config.gripper, given_m
-    if not gripper.has_jaw:
-        if given_m is not None:
-            raise common.CommandFailedError("--jaw-opening: the gripper has no jaw; leave it out", common.EXIT_USAGE)
-        return None
-    if opening_m is None and config.settings.jaw.source == "fixed":
-        opening_m = config.jaw_opening_m
-    table = path.parent / TIMESTAMPS_NAME
-    if opening_m is None and table.exists():
-        try:
-            row = read_table(table).get(path.name)
-        except SourceError as error:
-            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
-        opening_m = None if row is None else row.jaw_opening_m
-    if opening_m is None:
+    opening_m = read_opening(path, config.gripper, config, given_m)
+    if opening_m is None and config.gripper.has_jaw:
         raise common.CommandFailedError(
             f"{path}: its jaw opening isn't known (jaw.source is {config.settings.jaw.source}); --jaw-opening M, or "
-            f"jaw_opening_m in {table}",
-            common.EXIT_USAGE,
-        )
-    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
-        raise common.CommandFailedError(
-            f"{path}: jaw opening {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m",
+            f"jaw_opening_m in {path.parent / TIMESTAMPS_NAME}",
             common.EXIT_USAGE,
         )
     return opening_m

@@ -244,10 +244,10 @@ def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | N
     from gripmon.teachpage import Picture
 
     image = read_fitting_image(path, bench.camera, bench.gripper)
-    return Picture(path.name, image, _opening(path, bench.gripper, config, given_m), str(path))
+    return Picture(path.name, image, read_opening(path, bench.gripper, config, given_m), str(path))
 
 
-def _opening(path: Path, gripper: Gripper, config: Config | None, given_m: float | None) -> float | None:
+def read_opening(path: Path, gripper: Gripper, config: Config | None, given_m: float | None) -> float | None:
     """What is known of the jaw opening in an image: given, in its folder's table, or fixed in the configuration; None
     if nothing is.
     """

@@ -97,26 +97,22 @@ def _on_plate(
 ) -> tuple[Array, Array]:
     """By the plane coincidence, as ``gripmon calibrate plane`` does it, with the known gripper."""
     from gripmon.calibration.detection import detect
-    from gripmon.calibration.plane import GivenCamera, KnownCorners, calibrate_plane
+    from gripmon.calibration.plane import GivenCamera
     from gripmon.calibration.plane_average import average
     from gripmon.calibration.sighting import CalibrationError, NotFound
     from gripmon.geometry import from_record
-    from gripmon.onboarding.measuring import contact_height_m, measure_known
+    from gripmon.onboarding import KnownGripper
 
     target = files.target_of(target_text)
     assert first.cam_T_grip is not None
-    expected, gripper = from_record(first.cam_T_grip), config.gripper
-    points_m = gripper.points_grip_m(opening_m)
+    method = KnownGripper(GivenCamera(config.settings.camera), config.gripper, opening_m, from_record(first.cam_T_grip))
     found = []
     for path, image in images:
         sighting = detect(image, target, str(path))
         if isinstance(sighting, NotFound):
             raise common.CommandFailedError(f"{path}: {sighting.reason}")
         try:
-            corners, _ = measure_known(config.camera, gripper, image, expected, opening_m)
-            known_m = points_m[[gripper.point_ids.index(name) for name in corners.names]]
-            known = KnownCorners(known_m, contact_height_m(gripper, opening_m))
-            found.append(calibrate_plane(GivenCamera(config.settings.camera), sighting, corners, known))
+            found.append(method.look(image, sighting, None).coincidence)
         except CalibrationError as error:
             raise common.CommandFailedError(f"{path}: {error}") from None
     together = average(found, inferred=False)
