@@ -163,6 +163,21 @@ def test_a_second_motion_after_the_first_is_followed(known):
     assert last.causes[0].cause is Cause.CAMERA_MOUNT
 
 
+@pytest.mark.parametrize("places", [3, 100])
+def test_a_creep_is_noticed_and_not_taken_back_for_the_next_one(known, places):
+    """0.1 mrad a pulse: what is believed since the calibration doesn't creep along."""
+    rng = np.random.default_rng(17)
+    truth, watch = true_world(), SpotWatch(calibration())
+    judged = []
+    for k in range(60):
+        pose = poses()[k % places % len(poses())]
+        crept = truth.moved(1e-4 * max(0, k - 10) * AXES[3])
+        judged.append(watch.judge(replace(next(pulses(crept, (pose,), 1, rng)), stamp_ns=2_000_000_000 * k)))
+    ((k, alert),) = raised(judged)
+    assert 10 <= k < 40
+    assert watch.state is State.DRIFTING and watch.book.about("motion").alert_id == alert.alert_id
+
+
 def test_wrong_spots_raise_no_drift_and_are_said_to_be_wrong(known):
     rng = np.random.default_rng(9)
     watch = SpotWatch(calibration())

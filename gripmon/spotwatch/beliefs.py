@@ -30,8 +30,8 @@ class Beliefs:
     """n of them: ``mean`` (n, 50) of the calibration's error (13), the motion since (13), and the places' offsets (12
     times 2, px), with ``covariance`` (n, 50, 50); ``weight`` (n,) logarithm of how much better than the reigning belief
     it has foreseen the pulses; ``kind`` and ``scale`` (n,) what moved in it at last and by what order, ``pulses`` (n,)
-    which of them were believed since, ``prior`` (n, 13, 13) what was assumed of that motion and ``motions`` (n,) how
-    many there were.
+    which of them were believed since, ``born`` (n,) how many there were before, ``prior`` (n, 13, 13) what was assumed
+    of that motion and ``motions`` (n,) how many there were.
     """
 
     mean: Array
@@ -40,6 +40,7 @@ class Beliefs:
     kind: NDArray[np.intp]
     scale: NDArray[np.intp]
     pulses: NDArray[np.intp]
+    born: NDArray[np.intp]
     prior: Array
     motions: NDArray[np.intp]
 
@@ -71,7 +72,7 @@ def as_calibrated(calibrated: Calibrated) -> Beliefs:
     covariance[0, :COUNT, :COUNT] = calibrated.covariance
     none = np.zeros(1, dtype=np.intp)
     return Beliefs(
-        np.zeros((1, SIZE)), covariance, np.zeros(1), none - 1, none.copy(), none.copy(),
+        np.zeros((1, SIZE)), covariance, np.zeros(1), none - 1, none.copy(), none.copy(), none.copy(),
         np.zeros((1, COUNT, COUNT)), none.copy(),
     )  # fmt: skip
 

@@ -14,6 +14,7 @@ far off: uniformly in the logarithm of the distance.
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,6 +29,8 @@ LEAST_PULSES = 3
 BACK_AGAIN = 100.0
 """Odds from which what had moved is where it was."""
 _KEPT = 32
+_REMEMBERED = 64
+"""Pulses for which it is remembered what was believed before them."""
 _REIGNING = 12
 _HOPELESS = math.log(1e-6)
 """Weight below which an alternative is dropped: those that begin now overtake it."""
@@ -65,7 +68,9 @@ class MotionTest:
         """Everything is as calibrated."""
         self.reigning = as_calibrated(self._calibrated)
         self._others = self.reigning.picked(np.array([], dtype=np.intp))
-        self._places: dict[int, Array] = {}
+        self._pulses = 0
+        self._history: deque[Beliefs] = deque(maxlen=_REMEMBERED)
+        self._before = self.reigning
         self.moved = False
 
     @property
@@ -75,14 +80,16 @@ class MotionTest:
 
     def at_new_place(self, place: int, covariance_px: Array) -> None:
         """Pulses come from another pose, in a place's stead."""
-        self._places[place] = covariance_px
-        self.reigning.at_new_place(place, covariance_px)
-        self._others.at_new_place(place, covariance_px)
+        for beliefs in (self.reigning, self._others, self._before, *self._history):
+            beliefs.at_new_place(place, covariance_px)
 
     def add(self, pulse: Pulse) -> Verdict:
         """One pulse with a candidate at least."""
         wrong = self._wrong(pulse)
         others = self._others.joined(self._begun())
+        if not self.moved:
+            self._history.append(self.reigning.picked(np.array([self.best])))
+        self._pulses += 1
         told, candidates, believed = self._bank.weigh(self.reigning, pulse, wrong, self._share)
         weight = self.reigning.weight + told
         all_told = float(np.logaddexp.reduce(weight))
@@ -96,6 +103,8 @@ class MotionTest:
         candidate, is_believed = int(candidates[best]), bool(believed[best])
         if changes:
             self._others, self.reigning = self._crowned(back=back_odds > odds)
+            if not self.moved:
+                self._remember(int(self.reigning.born[self.best]))
             self.moved = back_odds <= odds
             candidate, is_believed = self._chosen(pulse)
         return Verdict(max(odds, 0.0), changes and self.moved, changes and not self.moved, candidate, is_believed)
@@ -122,14 +131,19 @@ class MotionTest:
         out.weight[:] = self._shares
         out.kind[:], out.scale[:], out.prior[:] = self._kinds, self._scales, self._assumed
         out.pulses[:] = 0
+        out.born[:] = self._pulses
         out.motions += 1
         if not self.moved:
             return out
-        back = as_calibrated(self._calibrated)
-        for place, covariance_px in self._places.items():
-            back.at_new_place(place, covariance_px)
-        back.kind[:] = BACK
+        back = self._before.picked(np.zeros(1, dtype=np.intp))
+        back.kind[:], back.weight[:], back.pulses[:], back.born[:] = BACK, 0.0, 0, self._pulses
         return out.joined(back)
+
+    def _remember(self, born: int) -> None:
+        """What was believed before the motion, which what came after it had no part in yet."""
+        ago = min(self._pulses - born, len(self._history))
+        self._before = self._history[-ago]
+        self._history.clear()
 
     def _prune(self) -> None:
         """What has become negligible among those that reign."""
