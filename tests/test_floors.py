@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from long_files import LONGEST
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "gripmon"
@@ -142,3 +143,8 @@ def test_package_list_matches_the_tree():
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     found = {".".join(p.parent.relative_to(ROOT).parts) for p in PACKAGE.rglob("*.py")}
     assert listed - {"gripmon.configs"} == found
+
+
+def test_files_that_are_begun_first_are_there():
+    """A name that was left behind by a renamed file would do nothing, and nobody would notice."""
+    assert [name for name in LONGEST if not (ROOT / "tests" / f"{name}.py").exists()] == []
