@@ -37,8 +37,7 @@ def _records(config: SecondConfig, source: Source, step: Callable[[], None]) -> 
     from gripmon.records import Frame
 
     pulsed = config.pulsed_watch()
-    for told in config.pulses:
-        pulsed.tell(told)
+    pulsed.load(config.pulses)
     while (item := source.read()) is not None:
         step()
         if isinstance(item, Frame):

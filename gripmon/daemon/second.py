@@ -41,6 +41,7 @@ from gripmon.sources import Source
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"
+_PULSES_A_TURN = 16
 _NOT_HERE = (
     "this is a second camera, which measures no reference of its own; to calibrate it anew: gripmon calibrate laser"
 )
@@ -89,18 +90,21 @@ class SecondCamera(Loop):
         self._failure = ""  # of the last pulse: of the code here, not of the camera
         self._news = False  # a pulse was judged since the last frame, or that has failed
         self._unused = "no pulse yet"
+        self._said_unused: PulseFault | None = None  # in the log
 
     @property
     def _in_force(self) -> tuple[str, int]:
         return self._pulsed.reference_id, 0
 
     def _begin(self) -> None:
-        for told in self._table:
-            self._judge(self._pulsed.tell(told))
+        self._pulsed.load(self._table)
 
     def _between(self) -> None:
         now_s = time.monotonic()
-        while self._feed is not None and (told := self._feed.poll()) is not None:
+        for _ in range(_PULSES_A_TURN):  # so that nobody can keep frames waiting by sending pulses
+            told = None if self._feed is None else self._feed.poll()
+            if told is None:
+                break
             self._judge(self._pulsed.tell(told, now_s))
         self._judge(self._pulsed.tick(now_s))
         self._look_for_silence(now_s)
@@ -173,7 +177,9 @@ class SecondCamera(Loop):
             self._believed_s, self._unused = time.monotonic(), ""
         else:
             self._unused = f"the last pulse is not used: {record.reason}"
-            _log.info("pulse %d is not used: %s", record.pulse, record.reason)
+            if record.fault is not self._said_unused:
+                _log.info("pulse %d is not used: %s", record.pulse, record.reason)
+        self._said_unused = record.fault
         self._deliver("recording", self._recorder.spot, record, outcome.image)
         self._deliver("lines", self._lines.write, record)
 

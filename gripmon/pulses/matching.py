@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from gripmon.pulses.settings import PulseSettings
+from gripmon.pulses.told import Told
 from gripmon.records import Array, Frame, Image, PulseFault
 
 _NS = 1_000_000_000
@@ -52,7 +55,7 @@ class Shown:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Told, and not complete yet; ``until_s`` it is waited for, by the caller's clock."""
+    """Told, and not complete yet; ``until_s`` it is waited for, by the caller's clock (of a table for ever)."""
 
     pulse: Pulse
     until_s: float
@@ -101,20 +104,28 @@ class Matcher:
         """Pulses whose last frame hasn't come."""
         return len(self._waiting)
 
-    def tell(self, stamp_ns: int, until_ns: int, base_T_ee: Array, now_s: float | None = None) -> list[Shown]:
+    def tell(self, told: Told, now_s: float) -> list[Shown]:
         """A pulse was told; those that are complete now, oldest first.  ``now_s``: by any clock, the one that
-        :meth:`tick` goes by; None: its frames are waited for until :meth:`finish`.
+        :meth:`tick` goes by.
         """
-        pulse = Pulse(self._told, stamp_ns, until_ns, base_T_ee)
+        pulse = Pulse(self._told, *told)
         if any(pulse.repeats(known) for known in (*self._done, *(each.pulse for each in self._waiting))):
             return []
         self._told += 1
-        length_s = 1e-9 * (until_ns - stamp_ns)
-        entry = _Waiting(pulse, math.inf if now_s is None else now_s + length_s + self._settings.wait_s)
-        self._check(entry, bounded=now_s is not None)
+        if len(self._waiting) >= _MOST_WAITING:
+            text = f"{_MOST_WAITING} pulses wait for their frames already; each told when it is over"
+            return [Shown(pulse, fault=PulseFault.OUT_OF_ORDER, reason=text)]
+        length_s = 1e-9 * (pulse.until_ns - pulse.stamp_ns)
+        entry = _Waiting(pulse, now_s + length_s + self._settings.wait_s)
+        self._check(entry)
         self._waiting.append(entry)
         self._waiting.sort(key=lambda each: each.pulse.stamp_ns)
         return self._complete()
+
+    def load(self, table: Sequence[Told]) -> None:
+        """All pulses of recorded frames at once, by their stamps, none of them overlapping; before any frame."""
+        self._waiting = [_Waiting(Pulse(k, *told), math.inf) for k, told in enumerate(table)]
+        self._told = len(table)
 
     def frame(self, frame: Frame) -> list[Shown]:
         """A frame came, its image None if it is no use; the pulses that are complete with it."""
@@ -141,12 +152,9 @@ class Matcher:
         entries, self._waiting = self._waiting, []
         return [self._shown(entry) for entry in entries]
 
-    def _check(self, entry: _Waiting, *, bounded: bool) -> None:
+    def _check(self, entry: _Waiting) -> None:
         """What speaks against a new pulse, and against those that it contradicts."""
         pulse = entry.pulse
-        if bounded and len(self._waiting) >= _MOST_WAITING:
-            entry.fault = PulseFault.OUT_OF_ORDER
-            entry.reason = f"{_MOST_WAITING} pulses wait for their frames already; each told when it is over"
         for other in self._waiting:
             if pulse.overlaps(other.pulse):
                 text = "overlaps with another pulse, and the hand can't have stood still in two places"
@@ -162,8 +170,12 @@ class Matcher:
             )
 
     def _complete(self) -> list[Shown]:
-        over = [each for each in self._waiting if each.pulse.until_ns < self._newest_ns]
-        self._waiting = [each for each in self._waiting if each.pulse.until_ns >= self._newest_ns]
+        # By their beginnings: of a long table only the first few are looked at.
+        begun = bisect_left(self._waiting, self._newest_ns, key=lambda each: each.pulse.stamp_ns)
+        over = [each for each in self._waiting[:begun] if each.pulse.until_ns < self._newest_ns]
+        if over:
+            on = [each for each in self._waiting[:begun] if each.pulse.until_ns >= self._newest_ns]
+            self._waiting = on + self._waiting[begun:]
         return [self._shown(entry) for entry in over]
 
     def _shown(self, entry: _Waiting) -> Shown:
@@ -192,7 +204,8 @@ class Matcher:
     def _lit(self, frame: Frame) -> bool:
         """Was the laser on then, for another pulse?"""
         margin_ns = self._margin_ns
-        pulses = (*self._done, *(each.pulse for each in self._waiting))
+        begun = bisect_right(self._waiting, frame.stamp_ns + margin_ns, key=lambda each: each.pulse.stamp_ns)
+        pulses = (*self._done, *(each.pulse for each in self._waiting[:begun]))
         return any(p.stamp_ns - margin_ns <= frame.stamp_ns <= p.until_ns + margin_ns for p in pulses)
 
     def _not_shown(self, pulse: Pulse, within: list[Frame]) -> tuple[PulseFault, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -102,9 +103,13 @@ class PulsedWatch:
         self.displacement = None
         return self._watch.reset()
 
-    def tell(self, told: Told, now_s: float | None = None) -> list[Shown]:
-        """A pulse was told; those that are to be judged now.  ``now_s`` as in :meth:`Matcher.tell`."""
-        return self._matcher.tell(*told, now_s)
+    def load(self, table: Sequence[Told]) -> None:
+        """All pulses of recorded frames, before any frame."""
+        self._matcher.load(table)
+
+    def tell(self, told: Told, now_s: float) -> list[Shown]:
+        """A pulse was told; those that are to be judged now.  ``now_s``: by any clock, as in :meth:`tick`."""
+        return self._matcher.tell(told, now_s)
 
     def frame(self, frame: Frame) -> tuple[list[Shown], tuple[Alert, ...], str]:
         """A frame came: the pulses that are to be judged now, alerts about the image, and what is wrong with it."""
