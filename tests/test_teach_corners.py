@@ -17,6 +17,7 @@ from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, 
 from gripmon.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import Settings, builtin_config, load_config
+from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
@@ -216,7 +217,8 @@ def test_without_a_page_a_file_of_corners_does_the_same(rig: Rig, tmp_path: Path
         assert getattr(config.settings, name) == defaults[name]
     # Its own corners are a file of corners again.
     again: list[object] = ["teach", rig.image_path, "--corners", tmp_path / "mine" / "corners.yaml", *rig.options]
-    assert run([*again, "--out", tmp_path / "again"], capsys)[0] == 0
+    assert run([*again, "--jaw-source", "zenoh", "--out", tmp_path / "again"], capsys)[0] == 0
+    assert load_config(tmp_path / "again" / "config.yaml").settings.jaw == JawSettings(source="zenoh")
     # Nothing is replaced without a word.
     before = {path.name: path.read_bytes() for path in (tmp_path / "mine").iterdir()}
     code, _, err = run(command, capsys)
@@ -313,6 +315,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, "--page", "--camera", tmp_path / "half.yaml", "--gripper", gripper], "height_px"),
         ([*page], "no image; image files, or --page --live DEVICE"),
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
+        ([image, "--page", "--config", camera, "--jaw-source", "zenoh"], "--jaw-source: --config says where"),
         ([image, *page, "--live-wait", "3"], "--live-wait: goes with --live"),
         ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, or --reference FILE"),
         ([image, *page, "--corners", rough], "--page and --corners"),

@@ -94,6 +94,12 @@ def _add_corner_options(parser: argparse.ArgumentParser) -> None:
     page.add_argument("--camera", metavar="FILE", help="without --config: the camera's calibration")
     page.add_argument("--gripper", metavar="FILE", help="without --config: the gripper file")
     page.add_argument("--reference", metavar="FILE", help="without --config: calibration of hand and eye, if there is")
+    page.add_argument(
+        "--jaw-source",
+        choices=("fixed", "frames", "zenoh"),
+        help="in the configuration written: where jaw openings come from; zenoh: the robot puts them on a key (default: "
+        "frames with a timestamps.csv that has them, else fixed)",
+    )
     page.add_argument("--robot", type=_key, metavar="NAME", help="the robot's name in the configuration written")
     page.add_argument("--camera-name", type=_key, metavar="NAME", help="the camera's name in it")
     page.add_argument("--port", type=_port, default=0, metavar="N", help="port of the page (default: any free one)")
@@ -156,7 +162,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
         raise common.CommandFailedError(
             "teach: --config is missing; a configuration, or --page with --camera and --gripper", common.EXIT_USAGE
         )
-    for option in ("camera", "gripper", "reference", "robot", "camera_name", "live_wait"):
+    for option in ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source"):
         if getattr(arguments, option) is not None:
             name = option.replace("_", "-")
             raise common.CommandFailedError(f"teach: --{name} goes with --page or --corners", common.EXIT_USAGE)

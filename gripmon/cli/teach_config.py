@@ -105,11 +105,20 @@ def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> 
     return "\n".join(lines)
 
 
+_FROM_ELSEWHERE = {
+    "frames": "the opening comes with each image (timestamps.csv)",
+    "zenoh": "the robot puts it on gripmon/<robot>/<camera_name>/jaw",
+}
+
+
 def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
+    if inputs.jaw_source in _FROM_ELSEWHERE:
+        return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
     openings = [picture.jaw_opening_m for picture in inputs.pictures]
     table = [(Path(p.path).parent / "timestamps.csv").exists() for p in inputs.pictures if p.path is not None]
-    if table and all(table) and None not in openings and len(set(table)) == 1 and _in_table(inputs):
-        return "jaw:\n  source: frames  # the opening comes with each image (timestamps.csv)"
+    told = inputs.jaw_source is None and table and all(table)
+    if told and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+        return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
     lines = [
         "jaw:",
         f"  source: fixed  # {_JAW_SOURCES}",

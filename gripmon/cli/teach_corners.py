@@ -52,6 +52,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
         refuse(f"{len(arguments.images)} images; with --corners one, the image that they were put in")
     if arguments.picture is not None:
         refuse("--picture goes with --config alone; look at the page")
+    if arguments.config is not None and arguments.jaw_source is not None:
+        refuse("--jaw-source: --config says where jaw openings come from; leave it out")
     if arguments.config is not None and any((arguments.camera, arguments.gripper, arguments.reference)):
         refuse("--config has camera, gripper and reference already; either that, or --camera and --gripper")
 

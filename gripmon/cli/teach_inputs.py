@@ -40,6 +40,7 @@ class Inputs:
     command: str
     live: str | None
     calibrations: dict[str, Path]
+    jaw_source: str | None = None
 
 
 def read_inputs(arguments: argparse.Namespace) -> Inputs:
@@ -59,6 +60,8 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
         gripper, gripper_path = _gripper(arguments.gripper)
         camera, error, reference = _calibrations(arguments, gripper)
         bench = Bench(camera, gripper, MonitorSettings(), reference, error)
+    if arguments.jaw_source is not None and not bench.gripper.has_jaw:
+        raise common.CommandFailedError("--jaw-source: the gripper has no jaw; leave it out", common.EXIT_USAGE)
     pictures = tuple(_picture(Path(name), bench, config, arguments.jaw_opening) for name in arguments.images)
     folder = Path(arguments.out) if arguments.out else config.directory if config is not None else Path()
     common.make_directory(folder)
@@ -74,6 +77,7 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
         command=_command(arguments),
         live=arguments.live,
         calibrations=_named(arguments),
+        jaw_source=arguments.jaw_source,
     )
 
 
@@ -294,7 +298,7 @@ def _source(arguments: argparse.Namespace, camera: Camera) -> FolderSettings | L
 
 def _command(arguments: argparse.Namespace) -> str:
     words = ["gripmon", "teach", *(["--page"] if arguments.page else []), *arguments.images]
-    for name in ("live", "corners", "config", "camera", "gripper", "reference", "out", "jaw_opening"):
+    for name in ("live", "corners", "config", "camera", "gripper", "reference", "out", "jaw_opening", "jaw_source"):
         value = getattr(arguments, name)
         words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
     return shlex.join(words)

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gripmon.teachpage import RoughDesk
 
 ROUGH = "rough.yaml"
-_NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening")
+_NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
 
 
 def is_meant(arguments: argparse.Namespace) -> bool:
