@@ -97,7 +97,7 @@ def _add_corner_options(parser: argparse.ArgumentParser) -> None:
     page.add_argument(
         "--jaw-source",
         choices=("fixed", "frames", "zenoh"),
-        help="in the configuration written: where jaw openings come from; zenoh: the robot puts them on a key (default: "
+        help="in the configuration written: where jaw openings come from; zenoh: the robot says them (default: "
         "frames with a timestamps.csv that has them, else fixed)",
     )
     page.add_argument("--robot", type=_key, metavar="NAME", help="the robot's name in the configuration written")
