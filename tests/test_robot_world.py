@@ -127,6 +127,50 @@ def test_the_command_writes_both_transforms(tmp_path, capsys):
     assert main(["calibrate", "robot-world", table, "--out", str(out)]) == 2
 
 
+MISREAD = {
+    "inverted arm": (lambda arm, target: (np.linalg.inv(arm), target), 3, "with the arm's or the target's inverted"),
+    "inverted target": (lambda arm, target: (arm, np.linalg.inv(target)), 3, "with the arm's or the target's inverted"),
+    "one row later": (lambda arm, target: (arm, np.roll(target, -1, axis=0)), 3, "out of step"),
+    "two rows earlier": (lambda arm, target: (arm, np.roll(target, 2, axis=0)), 3, "out of step"),
+    "shuffled": (lambda arm, target: (arm, target[::-1]), 3, "contradict each other"),
+    "millimetres": (lambda arm, target: (arm, millimetres(target)), 2, "from the camera (median): millimetres? metres"),
+    "arm in millimetres": (lambda arm, target: (millimetres(arm), target), 2, "millimetres? metres"),
+}
+
+
+def millimetres(T):
+    out = T.copy()
+    out[:, :3, 3] *= 1000.0
+    return out
+
+
+@pytest.mark.parametrize("name", MISREAD)
+def test_poses_that_are_meant_otherwise_are_named_and_nothing_is_written(name, tmp_path, capsys):
+    change, code, text = MISREAD[name]
+    _, _, base_T_ee, cam_T_target = poses(11)
+    measured = noisy(cam_T_target, np.array([2e-4] * 3 + [1e-3] * 3), 2)
+    table = write(tmp_path / "poses.csv", *change(base_T_ee, measured))
+    assert main(["calibrate", "robot-world", str(table), "--out", str(tmp_path / "rw.yaml")]) == code
+    said = capsys.readouterr().err
+    assert text in said and said.count("\n") == 1
+    assert not (tmp_path / "rw.yaml").exists()
+
+
+def test_a_camera_on_the_hand_that_is_taken_for_one_that_stands_is_told(tmp_path, capsys):
+    _, _, base_T_ee, cam_T_target = poses(12)
+    table = write(tmp_path / "poses.csv", base_T_ee, cam_T_target)
+    out = ("--out", str(tmp_path / "rw.yaml"))
+    assert main(["calibrate", "robot-world", str(table), "--eye-in-hand", *out]) == 3
+    assert "--eye-in-hand is missing, or too much" in capsys.readouterr().err
+
+
+def test_a_pose_that_is_there_twice_is_refused(tmp_path, capsys):
+    _, _, base_T_ee, cam_T_target = poses(13)
+    table = write(tmp_path / "poses.csv", base_T_ee[[0, 1, 2, 3, 1]], cam_T_target[[0, 1, 2, 3, 1]])
+    assert main(["calibrate", "robot-world", str(table), "--out", str(tmp_path / "rw.yaml")]) == 2
+    assert "poses.csv, line 6: is the same pose as poses.csv, line 3" in capsys.readouterr().err
+
+
 def test_a_camera_on_the_hand(tmp_path):
     rng = np.random.default_rng(8)
     ee_T_cam, base_T_target = transform(rng, 0.1), transform(rng)

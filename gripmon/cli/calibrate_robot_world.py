@@ -50,6 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     import numpy as np
 
     from gripmon.calibration import robot_world
+    from gripmon.calibration.robot_world_doubts import check_reading
     from gripmon.calibration.sighting import CalibrationError
     from gripmon.geometry import invert
 
@@ -60,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         start = robot_world.solve(poses.cam_T_target, arm)
         found = robot_world.refine(poses.cam_T_target, arm, start, poses.covariance)
+        check_reading(found, poses.cam_T_target, arm)
     except CalibrationError as error:
         raise common.CommandFailedError(f"calibrate robot-world: {error}") from None
     written = _document(found, poses, arguments)
@@ -82,6 +84,7 @@ def _poses(arguments: argparse.Namespace) -> _Poses:
     import numpy as np
 
     from gripmon.calibration.laser.samples import check_scale, pose_of
+    from gripmon.calibration.robot_world_doubts import check_target_scale
     from gripmon.cli.laser_tables import rows_of
 
     arm: list[Array] = []
@@ -118,6 +121,7 @@ def _poses(arguments: argparse.Namespace) -> _Poses:
         )
     try:
         check_scale(np.stack(arm))
+        check_target_scale(np.stack(target))
         _check_once(arm, target, names)
     except ValueError as error:
         raise common.CommandFailedError(f"{inputs[0]}: {error}", common.EXIT_USAGE) from None
