@@ -78,6 +78,9 @@ def add_parser(commands: Any) -> None:
         "--picture", metavar="FILE.png", help="also draw the first image with what was taught, offsets enlarged"
     )
     parser.add_argument("--force", action="store_true", help="replace the file if there is one")
+    parser.add_argument(
+        "--into-config", action="store_true", help="also write the line that names it into the configuration"
+    )
     _add_corner_options(parser)
 
 
@@ -148,10 +151,28 @@ def run(arguments: argparse.Namespace) -> int:
         raise common.CommandFailedError(f"teach: {refused}") from None
     model = _model(config, taught, inputs, arguments)
     _write(model, out)
+    if arguments.into_config:
+        config = _named_in(config, out)
     print(_summary(config, taught, out))
     if arguments.picture is not None:
         _draw(config, model, images[0], Path(arguments.picture))
     return common.EXIT_DONE
+
+
+def _named_in(config: Config, out: Path) -> Config:
+    """The configuration with the line that names the file, if it hadn't."""
+    import os
+
+    from gripmon.atomic import write_atomically
+    from gripmon.cli.teach_config import with_taught
+
+    if config.taught_path is None:
+        name = Path(os.path.relpath(out.resolve(), config.directory.resolve())).as_posix()
+        try:
+            write_atomically(config.path, with_taught(config.path, name).encode())
+        except OSError as error:
+            raise common.not_writable(config.path, error, "--into-config") from None
+    return common.load(str(config.path), check_source=False)
 
 
 def _check_usage(arguments: argparse.Namespace) -> None:
@@ -185,6 +206,11 @@ def _out(arguments: argparse.Namespace, config: Config) -> Path:
             common.make_directory(path.parent, option)
             if path.is_dir():
                 raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+    if arguments.into_config and config.taught_path is not None and config.taught_path.resolve() != out.resolve():
+        raise common.CommandFailedError(
+            f"--into-config: {config.path} names {config.taught_path} already; without it, or without --out",
+            common.EXIT_USAGE,
+        )
     if out.exists() and not arguments.force:
         raise common.CommandFailedError(
             f"--out {out}: is there already; another file, or --force to replace it", common.EXIT_USAGE
@@ -302,7 +328,7 @@ def _summary(config: Config, taught: Taught, out: Path) -> str:
     lines.append(f"written: {out}")
     if config.taught_path is None or config.taught_path.resolve() != out.resolve():
         name = out.name if out.parent.resolve() == config.directory.resolve() else out.resolve()
-        lines.append(f"next: put the line `taught: {name}` into {config.path}")
+        lines.append(f"next: put the line `taught: {name}` into {config.path} (--into-config does)")
     return "\n".join(lines)
 
 

@@ -50,6 +50,8 @@ def _check_options(arguments: argparse.Namespace) -> None:
         refuse("no image; image files, or --page --live DEVICE")
     if arguments.corners is not None and len(arguments.images) > 1:
         refuse(f"{len(arguments.images)} images; with --corners one, the image that they were put in")
+    if arguments.into_config:
+        refuse("--into-config: with --page and --corners the configuration gets its line anyway; leave it out")
     if arguments.picture is not None:
         refuse("--picture goes with --config alone; look at the page")
     if arguments.config is not None and arguments.jaw_source is not None:
