@@ -39,7 +39,7 @@ _NEGLIGIBLE = math.log(1e-5)
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class Finding:
     """``odds``: R over the limit that it must reach for an alarm; ``alarm``: it has, just now; ``back``: everything is
     where it was again, just now.  ``candidate`` that the best belief takes for the spot, ``believed`` whether it does.
     """
@@ -83,7 +83,7 @@ class MotionTest:
         for beliefs in (self.reigning, self._others, self._before, *self._history):
             beliefs.at_new_place(place, covariance_px)
 
-    def add(self, pulse: Pulse) -> Verdict:
+    def add(self, pulse: Pulse) -> Finding:
         """One pulse with a candidate at least."""
         wrong = self._wrong(pulse)
         others = self._others.joined(self._begun())
@@ -107,7 +107,7 @@ class MotionTest:
                 self._remember(int(self.reigning.born[self.best]))
             self.moved = back_odds <= odds
             candidate, is_believed = self._chosen(pulse)
-        return Verdict(max(odds, 0.0), changes and self.moved, changes and not self.moved, candidate, is_believed)
+        return Finding(max(odds, 0.0), changes and self.moved, changes and not self.moved, candidate, is_believed)
 
     def _wrong(self, pulse: Pulse) -> Array:
         """(k,) density of wrong spots, around where the best belief has the right one; 1/px²."""

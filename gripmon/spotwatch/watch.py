@@ -72,7 +72,11 @@ class SpotWatch:
             return self._told(seen, SpotFault.NOT_FORESEEN, why_not)
         if isinstance(seen.candidates, NotFound):
             return self._missing(seen, foreseen, seen.candidates.reason)
-        spots = [(k, spot) for k, spot in enumerate(seen.candidates) if np.isfinite(spot.uv_px).all()]
+        spots = [
+            (k, spot)
+            for k, spot in enumerate(seen.candidates)
+            if np.isfinite(spot.uv_px).all() and np.isfinite(spot.covariance_px).all()
+        ]
         if not spots:
             return self._missing(seen, foreseen, "no spot was found")
         return self._seen(seen, foreseen, spots)
