@@ -19,18 +19,19 @@ def spot_blueprint(scene: Scene) -> rrb.Blueprint:
     events = rrb.TextLogView(origin="events", name="Alerts and changes", columns=columns)
     cell = rrb.Spatial3DView(origin="base", contents=["base/**"], name="Base, camera, plane and beam", line_grid=False)
 
-    def plot(origin: str, title: str, legend: bool = True) -> rrb.TimeSeriesView:
-        shown = rrb.PlotLegend(visible=legend)
-        return rrb.TimeSeriesView(origin=origin, contents=f"{origin}/**", name=title, axis_x=axis, plot_legend=shown)
+    def plot(contents: str, title: str, legend: bool = True) -> rrb.TimeSeriesView:
+        origin, shown = contents.partition("/")[0], rrb.PlotLegend(visible=legend)
+        return rrb.TimeSeriesView(origin=origin, contents=contents, name=title, axis_x=axis, plot_legend=shown)
 
     judged = rrb.Vertical(
         cell,
-        plot("off", "Spot less foreseen (px), band of one standard deviation", legend=False),
-        plot("gaps", "Disagreement of the three ways (mm)"),
+        plot("off/**", "Spot less foreseen (px), band of one standard deviation", legend=False),
+        plot("gaps/**", "Disagreement of the three ways (mm)"),
         rrb.Tabs(
-            plot("test", "Normalised square of the spot; probability that something moved"),
-            plot("shift", "Motion of the camera (mm, mrad)"),
-            plot("timing", "Time a pulse (ms)"),
+            plot("test/moved", "Probability that something moved", legend=False),
+            plot("test/square", "Normalised square", legend=False),
+            plot("shift/**", "Camera (mm, mrad)"),
+            plot("timing/**", "Time (ms)"),
             rrb.TextDocumentView(origin="about", name="About"),
             active_tab=0,
         ),

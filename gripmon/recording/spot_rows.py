@@ -36,9 +36,9 @@ from gripmon.recording.wire import Events, Scene
 from gripmon.records import Array, SpotRecord, to_json
 
 _AXIS_M, _SIDE = 0.1, 0.4
-_SPOT_PX = 4.0
+_SPOT_PX = 2.5
 _UV, _XYZ = ["u", "v"], ["x", "y", "z"]
-_GAPS: tuple[palette.Colour, ...] = (palette.BUSY, palette.DOUBTFUL, palette.REPAIR)
+_GAPS: tuple[palette.Colour, ...] = (palette.BUSY, palette.DOUBTFUL, palette.REPAIR, palette.GOOD)
 
 
 class SpotWriter:
