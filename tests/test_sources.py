@@ -142,7 +142,9 @@ def test_alpha_is_left_out_and_double_becomes_single(tmp_path: Path):
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".bmp", ".tif", ".pgm"])
-def test_a_truncated_file_is_a_fault_and_the_sequence_goes_on(tmp_path: Path, suffix: str):
+def test_a_truncated_file_is_a_fault_and_the_sequence_goes_on(
+    tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
+):
     whole = [write(tmp_path, f"{i}{suffix}", picture(i)) for i in range(4)]
     (tmp_path / f"1{suffix}").write_bytes(whole[1][: len(whole[1]) // 2])
     cut = 5 if suffix == ".tif" else 1  # libtiff pads the end of its directory
@@ -151,6 +153,8 @@ def test_a_truncated_file_is_a_fault_and_the_sequence_goes_on(tmp_path: Path, su
     assert [f.image is None for f in frames] == [False, True, True, False]
     assert [f.fault is None for f in frames] == [True, False, False, True]
     assert [f.seq for f in frames] == [0, 1, 2, 3]
+    if suffix == ".png":
+        assert capfd.readouterr().err == ""  # the fault says it, in one line
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG\r\n\x1a\n", bytes(1000)])

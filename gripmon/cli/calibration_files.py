@@ -51,7 +51,8 @@ def images_of(paths: Sequence[Path]) -> Iterator[tuple[Path, Image]]:
             raise common.CommandFailedError(f"{path}: is a folder; an image file", common.EXIT_USAGE)
         image, fault = read_image(path)
         if image is None:
-            raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
+            what = "an image file" + ("" if path.exists() else ", or a folder of them")
+            raise common.CommandFailedError(f"{path}: {fault}; {what}", common.EXIT_USAGE)
         # The same image twice would make every uncertainty too small.
         first = seen.setdefault(hashlib.sha256(image.tobytes()).digest(), path)
         if first is not path:

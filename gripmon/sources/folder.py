@@ -98,6 +98,11 @@ class FolderSource:
         self._seq = len(self._names)
 
 
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG_END_BYTES = 8
+"""The last chunk's name and checksum."""
+
+
 def natural_key(name: str) -> tuple[list[Any], str]:
     """Order in which a person counts: digits as numbers, the rest as text; equal numbers by the name itself."""
     parts = re.split(r"([0-9]+)", name)
@@ -117,6 +122,8 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
         return None, f"the file can't be read: {error.strerror}"
     if not data:
         return None, "the file is empty"
+    if data.startswith(_PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
+        return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
     try:
         # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
