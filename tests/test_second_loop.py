@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -230,3 +231,10 @@ def test_whatever_a_stranger_sends_is_refused_in_one_line():
         else:
             assert 0 < told.until_ns - told.stamp_ns <= 1e9 * LONGEST_S and np.isfinite(told.base_T_ee).all()
     assert refused > 3500
+
+
+def test_the_pulse_on_the_page_is_one():
+    page = (Path(__file__).parent.parent / "docs" / "laser.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    told = of_message(from_json(block.encode(), LaserPulse))
+    assert told.until_ns - told.stamp_ns == 250_000_000
