@@ -205,7 +205,7 @@ class _Counts:
 
     def summary(self) -> str:
         if not self.frames:
-            return "replay: no frames"
+            return "replay: no frames: nothing in the input can be read as an image"
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self._verdicts.most_common())
         text = f"replay: {self.frames} frames: {verdicts}; median {self._median_ms():.2f} ms a frame"
         if self._first_failure:
