@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import csv
+import shutil
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -59,6 +61,7 @@ def _plane_seen(setup: LaserSetup, moved: Array) -> dict[str, object]:
 def cell() -> Cell:
     """The same for all tests of a process."""
     folder = Path(mkdtemp(prefix="gripmon-cell-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
     rng = np.random.default_rng(4)
     setup = paper_setup(rng)
     known = sampled(setup, rng, orientations=9)
