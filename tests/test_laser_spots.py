@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from laser_images import cluttered, spot_image
@@ -105,3 +106,68 @@ def test_a_laser_off_image_of_another_size_is_refused():
     found = find_spots(image, image[:200])
     assert isinstance(found, NotFound)
     assert "640 x 200" in found.reason
+
+
+def test_a_spot_that_the_border_cuts_is_none():
+    rng = np.random.default_rng(7)
+    found = find_spots(spot_image(np.array([2.0, 200.0]), rng))
+    assert isinstance(found, NotFound)
+    assert "cut off by the image's border" in found.reason
+
+
+def scene_image(kind, rng, truth):
+    """Image, laser-off image or None: conditions that no other test has."""
+    v, u = np.mgrid[0:480, 0:640].astype(float)
+    spot = np.exp(-((u - truth[0]) ** 2 + (v - truth[1]) ** 2) / 18.0)
+
+    def grains(width):
+        parts = [cv2.GaussianBlur(rng.normal(size=u.shape), (0, 0), width / 2.355) for _ in range(2)]
+        return sum(np.square(part) for part in parts) / np.mean(sum(np.square(part) for part in parts))
+
+    def taken(light):
+        return np.clip(np.rint(light + rng.normal(0.0, 2.0, light.shape)), 0, 255).astype(np.uint8)
+
+    texture = sum(cv2.GaussianBlur(rng.normal(size=u.shape), (0, 0), s) * s for s in (1.0, 2.0, 4.0, 8.0))
+    if kind == "textured plane":
+        return taken(90.0 + 15.0 * texture / texture.std() + 150.0 * spot), None
+    if kind == "steep light":
+        return taken(20.0 + 190.0 / (1.0 + np.exp(np.clip((truth[0] + 8.0 - u) / 6.0, -50, 50))) + 60.0 * spot), None
+    if kind == "whole speckle":  # contrast 1, as a laser on a rough surface has it
+        return taken(30.0 + 150.0 * spot * grains(2.5)), None
+    if kind == "saturated speckle":
+        return taken(30.0 + 800.0 * spot * grains(2.5)), None
+    if kind == "shadow that moved":
+        shadow = 60.0 * (u > rng.uniform(100.0, 500.0))
+        return taken(100.0 - shadow + 120.0 * spot), taken(np.full(u.shape, 100.0))
+    assert kind == "smeared"
+    along = np.array([np.cos(1.0), np.sin(1.0)])
+    places = [truth + t * 25.0 * along for t in np.linspace(-0.5, 0.5, 25)]
+    streak = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / 12.5) for x, y in places)
+    return taken(30.0 + 120.0 * streak), None
+
+
+@pytest.mark.parametrize(
+    ("kind", "limit_px"),
+    [
+        ("textured plane", 0.4),
+        ("steep light", 0.5),
+        ("whole speckle", 1.0),
+        ("saturated speckle", 0.7),
+        ("shadow that moved", 0.06),
+        ("smeared", 0.05),
+    ],
+)
+def test_what_light_and_surface_do_to_the_spot_is_in_its_covariance(kind, limit_px):
+    found, sizes = [], []
+    for seed in range(16):
+        rng = np.random.default_rng(seed)
+        truth = rng.uniform([60.0, 60.0], [580.0, 420.0])
+        spots = find_spots(*scene_image(kind, rng, truth))
+        assert not isinstance(spots, NotFound), spots
+        error = spots[0].uv_px - truth
+        found.append(error)
+        sizes.append(error @ np.linalg.solve(spots[0].covariance_px, error) / 2.0)
+    assert rms(found) < limit_px
+    # Normalised squares are 1 for what is stated exactly; standard deviations are within a factor of about two.
+    assert np.mean(sizes) < 4.5
+    assert np.median(sizes) / 0.693 < 5.0

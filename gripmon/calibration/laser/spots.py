@@ -21,9 +21,15 @@ MOST_CANDIDATES = 5
 MOST_OF_IMAGE = 0.05
 SATURATED = 0.98
 GRAIN_PX = 5
-"""Width of a speckle grain: so far its deviations hang together, and gaps between grains of one spot are closed."""
+"""Width of a fine speckle grain: gaps between grains of one spot are closed so far."""
+GRAINS_PX = (5, 9, 13)
+"""Widths over which a spot's deviations may hang together; the one that says the most counts."""
+BESIDE = 12
+"""Places around a spot that tell what its surroundings do to the centre."""
 _SMALLEST_SIGMA_PX = 0.02
 _LEAST_AREA_PX = 4
+_MOST_HIDDEN = 0.75
+_MOST_CUT = 0.35
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +58,20 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
                 f"the image with the laser off is {laser_off.shape[1]} x {laser_off.shape[0]} {laser_off.dtype}, the "
                 f"other {image.shape[1]} x {image.shape[0]} {image.dtype}; both by the same camera"
             )
-        signal = _brightest_change(image, laser_off)
-    else:
-        signal = grey - _background(grey, ceiling)
+        change = _brightest_change(image, laser_off)
+        found = _candidates(change, grey, _grey(laser_off), ceiling)
+        if not isinstance(found, NotFound):
+            return found
+        # A shadow that moved in between changes a part of the image: against its own neighbourhood the spot stands out.
+        middle = 0.5 * (change + np.float32(ceiling))
+        local = 2.0 * (middle - _background(middle, ceiling))
+        again = _candidates(local, grey, _grey(laser_off), ceiling)
+        return found if isinstance(again, NotFound) else again
+    return _candidates(grey - _background(grey, ceiling), grey, grey, ceiling)
+
+
+def _candidates(signal: Array, grey: Array, ambient: Array, ceiling: float) -> list[Spot] | NotFound:
+    """From what stands out; ``ambient`` is the light without the laser as far as it is known, ``grey`` the image."""
     # Quantisation is noise, too; the median is ambient light that changed between the images.
     signal = signal - np.median(signal)
     noise = max(1.4826 * float(np.median(np.abs(signal))), ceiling / 255.0 / np.sqrt(12.0))
@@ -65,16 +82,36 @@ def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | Not
     if peak < limit:
         return NotFound(f"no spot: the brightest place is {peak / limit * DETECTION:.1f} times its noise; laser on?")
     labels, count = _blobs(smooth > max(limit, 0.02 * peak))
-    spots = [_measured(signal, grey, labels == k, ceiling, noise) for k in range(1, count)]
+    scene = _Scene(signal, grey, ambient, labels > 0, ceiling, noise)
+    spots = [_measured(scene, labels == k) for k in range(1, count)]
     largest = MOST_OF_IMAGE * signal.size
     kept = [s for s in spots if s is not None and s.area_px <= largest]
+    if not kept and any(_touches_border(labels == k) for k in range(1, count)):
+        return NotFound("no spot: what is bright is cut off by the image's border; a spot that is seen whole")
     if not kept:
         return NotFound("no spot: what is bright is too small or too large for one; a laser spot of a few pixels")
     return sorted(kept, key=lambda s: -s.flux)[:MOST_CANDIDATES]
 
 
-def _measured(signal: Array, grey: Array, blob: NDArray[np.bool_], ceiling: float, noise: float) -> Spot | None:
-    """Centroid of what stands out, in a window that follows the spot's own second moments."""
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """What all candidates of an image share; ``bright`` where any of them lies."""
+
+    signal: Array
+    grey: Array
+    ambient: Array
+    bright: NDArray[np.bool_]
+    ceiling: float
+    noise: float
+
+
+def _touches_border(blob: NDArray[np.bool_]) -> bool:
+    return bool(blob[0].any() or blob[-1].any() or blob[:, 0].any() or blob[:, -1].any())
+
+
+def _measured(scene: _Scene, blob: NDArray[np.bool_]) -> Spot | None:
+    """Centroid of what stands out; None for what is no spot, or not seen whole."""
+    signal, noise = scene.signal, scene.noise
     rows, columns = np.nonzero(blob)
     margin = GRAIN_PX
     top, left = max(rows.min() - margin, 0), max(columns.min() - margin, 0)
@@ -88,11 +125,18 @@ def _measured(signal: Array, grey: Array, blob: NDArray[np.bool_], ceiling: floa
     weight = part[mask] - max(SHARE_OF_PEAK * peak, 3.0 * noise)
     flux = float(weight.sum())
     places = np.stack([u + left, v + top], axis=1).astype(float)
+    border = ((places == 0) | (places == np.array(signal.shape[::-1]) - 1)).any(axis=1)
+    if weight[border].max(initial=0.0) > _MOST_CUT * peak:
+        return None  # where its middle is can't be told
     centre = weight @ places / flux
     offset = places - centre
     shape = np.einsum("n,ni,nj->ij", weight, offset, offset) / flux
     covariance = _centre_covariance(part, mask, weight, offset, shape, noise)
-    saturated = float(np.mean(grey[window][mask] >= SATURATED * ceiling))
+    # Of what the border cuts off, as much again as is seen at it.
+    missing = weight[border] @ offset[border] / flux
+    covariance += np.outer(missing, missing)
+    covariance += _surroundings(scene, np.stack([v + top, u + left], axis=1), weight, offset)
+    saturated = float(np.mean(scene.grey[window][mask] >= SATURATED * scene.ceiling))
     return Spot(centre, covariance, flux, peak, int(mask.sum()), saturated)
 
 
@@ -112,23 +156,64 @@ def _centre_covariance(
     rows, columns = np.nonzero(mask)
     lever = np.zeros((*part.shape, 2))
     lever[mask] = (deviation[mask] - _mirrored(deviation, rows, columns, offset))[:, None] * offset
-    together = np.asarray(cv2.blur(lever, (GRAIN_PX, GRAIN_PX), borderType=cv2.BORDER_CONSTANT)) * GRAIN_PX**2
     # The centre follows the speckle that it is measured by, which hides about half of the variance on rendered grains;
     # the difference of two pixels has twice that of each.
     sensor = noise**2 * (offset.T @ offset) / flux**2
-    speckle = np.einsum("vui,vuj->ij", lever, together) / flux**2 - 2.0 * sensor
-    values, axes = np.linalg.eigh(0.5 * (speckle + speckle.T))
-    out: Array = (axes * np.maximum(values, 0.0)) @ axes.T + sensor + _SMALLEST_SIGMA_PX**2 * np.eye(2)
+    speckle = 0.0
+    for width in GRAINS_PX:
+        # The centre is where all levers cancel: a window as wide as the spot would see none of their variance.
+        hidden = min(width**2 / len(offset), _MOST_HIDDEN)
+        if width > GRAIN_PX and hidden == _MOST_HIDDEN:
+            break
+        together = np.asarray(cv2.blur(lever, (width, width), borderType=cv2.BORDER_CONSTANT)) * width**2
+        wider = float((lever * together).sum()) / flux**2 - 2.0 * float(np.trace(sensor))
+        speckle = max(speckle, wider / (1.0 - hidden))
+    # A few grains tell how much, not where to: that is the spot's form.
+    levers = (offset.T * np.square(model)) @ offset
+    out: Array = speckle * levers / np.trace(levers) + sensor + _SMALLEST_SIGMA_PX**2 * np.eye(2)
+    return out
+
+
+def _surroundings(scene: _Scene, places: NDArray[np.intp], weight: Array, offset: Array) -> Array:
+    """(2, 2): what ambient light and a surface that isn't the same everywhere do to the centre, by the same sums at
+    places beside the spot: light that isn't the laser's adds to it, and where the surface is darker it sends less of
+    the laser back.  Places on both sides count together: what the spot's own rim does to them cancels.
+    """
+    flux = float(weight.sum())
+    level = float(np.median(scene.ambient[tuple(places.T)]))
+    shading = max(level, 4.0 * scene.noise)
+    far = 2.0 * float(np.linalg.norm(offset, axis=1).max()) + GRAIN_PX
+    total, count = np.zeros((2, 2)), 0
+    for angle in np.pi * np.arange(BESIDE // 2) / (BESIDE // 2):
+        shift = np.rint(far * np.array([np.sin(angle), np.cos(angle)])).astype(int)
+        pair = [places + shift, places - shift]
+        if any((p < 0).any() or (p >= scene.signal.shape).any() or scene.bright[tuple(p.T)].any() for p in pair):
+            continue
+        added = sum(scene.signal[tuple(p.T)] @ offset for p in pair) / flux / np.sqrt(2.0)
+        dimmed = sum(((scene.ambient[tuple(p.T)] - level) / shading * weight) @ offset for p in pair)
+        dimmed = dimmed / flux / np.sqrt(2.0)
+        total += np.outer(added, added) + np.outer(dimmed, dimmed)
+        count += 1
+    if not count:
+        return total
+    noisy = scene.noise**2 * (offset.T @ offset + (offset.T * np.square(weight / shading)) @ offset) / flux**2
+    return _positive(total / count - noisy)
+
+
+def _positive(matrix: Array) -> Array:
+    """The nearest (2, 2) covariance."""
+    values, axes = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    out: Array = (axes * np.maximum(values, 0.0)) @ axes.T
     return out
 
 
 def _mirrored(values: Array, rows: NDArray[np.intp], columns: NDArray[np.intp], offset: Array) -> Array:
-    """``values`` on the other side of the centre, to the nearest pixel; zero outside."""
-    v = np.rint(rows - 2.0 * offset[:, 1]).astype(int)
-    u = np.rint(columns - 2.0 * offset[:, 0]).astype(int)
-    there = (v >= 0) & (v < values.shape[0]) & (u >= 0) & (u < values.shape[1])
-    out: Array = np.where(there, values[np.where(there, v, 0), np.where(there, u, 0)], 0.0)
-    return out
+    """``values`` on the other side of the centre, between pixels bilinearly; zero outside."""
+    grid = np.indices(values.shape).astype(float)
+    other_v = (2.0 * (rows[0] - offset[0, 1]) - grid[0]).astype(np.float32)
+    other_u = (2.0 * (columns[0] - offset[0, 0]) - grid[1]).astype(np.float32)
+    out = cv2.remap(values.astype(np.float32), other_u, other_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    return np.asarray(out, dtype=float)[rows, columns]
 
 
 def _blobs(bright: NDArray[np.bool_]) -> tuple[NDArray[np.int32], int]:
