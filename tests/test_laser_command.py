@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -310,6 +311,18 @@ def nonsense(data, uv):
     return data.base_T_ee, np.random.default_rng(1).uniform([0.0, 0.0], [640.0, 480.0], uv.shape)
 
 
+def far_laser(data, uv):
+    rng = np.random.default_rng(2)
+    data = sampled(replace(paper_setup(rng), point_ee_m=np.array([0.0, 1.6, 0.03])), rng, orientations=6)
+    return data.base_T_ee, data.uv_px
+
+
+def thousandth(data, uv):
+    poses = data.base_T_ee.copy()
+    poses[:, :3, 3] *= 0.001
+    return poses, uv
+
+
 def inverted(data, uv):
     return np.stack([invert(pose) for pose in data.base_T_ee]), uv
 
@@ -335,6 +348,8 @@ def turned_back(data, uv):
         (inverted, "the poses are ee_T_base: inverted, the spots fit"),
         (w_first, "the quaternions have w first: read so, the spots fit"),
         (turned_back, "the rotations are the other way round"),
+        (thousandth, "mm from the camera: were metres divided once too often"),
+        (far_laser, "pass the end-effector's origin at"),
         (out_of_step, "poses and images are out of step: spots fit the poses 1 row(s)"),
         (one_orientation, "1 orientation(s) with at least"),
         (on_a_line, "all spots lie on one line in the image"),
@@ -344,8 +359,6 @@ def turned_back(data, uv):
 def test_data_that_cannot_be_calibrated_from_end_with_why_and_nothing_is_written(
     change, text, tmp_path, camera, capsys
 ):
-    from dataclasses import replace
-
     data, uv = scene()
     poses, uv = change(data, uv)
     table = write_csv(tmp_path / "spots.csv", rows_of(replace(data, base_T_ee=poses), uv))

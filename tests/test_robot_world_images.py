@@ -65,3 +65,7 @@ def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
     assert main(again) == 3
     assert "none of 6 images shows the target" in capsys.readouterr().err
     assert not (tmp_path / "without5.yaml").exists()
+    for target in ("chequerboard:8x6:0.03", "circles:8x8:0.008:0.004"):
+        assert main([*command, "--target", target, "--out", str(tmp_path / "no.yaml")]) == 2
+        assert "doesn't tell which way up" in capsys.readouterr().err
+    assert not (tmp_path / "no.yaml").exists()

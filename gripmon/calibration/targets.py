@@ -106,3 +106,10 @@ def name_of(target: Target) -> str:
     if isinstance(target, CircleGrid):
         return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
     return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
+
+
+def tells_its_turn(target: Target) -> bool:
+    """Whether an image of it tells which way up it is.  (Colours would tell chequerboards of an even and an odd number
+    of corners; their corners are numbered without them.)
+    """
+    return isinstance(target, Charuco)

@@ -221,7 +221,8 @@ def _document(
     options = {
         "--camera": arguments.camera, "--out": arguments.out, "--picture": arguments.picture,
         "--recording": arguments.recording, "--refine-lens": arguments.refine_lens, "--arm-noise": noise,
-        "--plan": arguments.plan, "--reach": arguments.reach, "--force": arguments.force,
+        "--plan": arguments.plan, "--poses": arguments.poses if arguments.plan is not None else None,
+        "--reach": arguments.reach, "--force": arguments.force,
     }  # fmt: skip
     provenance = provenance_of(files.command_line("laser", arguments.data, options), inputs, SEED)
     other = [name for name, k in zip(samples.names, result.candidate, strict=True) if k > 0]

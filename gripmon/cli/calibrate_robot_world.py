@@ -21,7 +21,8 @@ Calibrate a fixed camera against an arm that holds a target, or with --eye-in-ha
 against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
 DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
 qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
-or image, from which --camera and --target find it (a target that looks the same from two sides won't do).
+or image, from which --camera and --target find it (a charuco board: others don't tell which way up they
+are).
 Turn the hand about at least two axes; ten poses or more are good."""
 
 _EXAMPLES = """\
@@ -185,6 +186,7 @@ class _Seer:
         return pose, covariance
 
     def _prepare(self) -> None:
+        from gripmon.calibration.targets import tells_its_turn
         from gripmon.config.calibrated import read_camera
         from gripmon.config.errors import ConfigError
 
@@ -197,6 +199,12 @@ class _Seer:
         except ConfigError as error:
             raise common.CommandFailedError(f"--camera: {error}", common.EXIT_USAGE) from None
         self._target = files.target_of(self._arguments.target)
+        if not tells_its_turn(self._target):
+            raise common.CommandFailedError(
+                f"--target {self._arguments.target}: an image of it doesn't tell which way up it is, so any pose may "
+                "be turned by half; a charuco board",
+                common.EXIT_USAGE,
+            )
         self.files.append(Path(self._arguments.camera))
 
 

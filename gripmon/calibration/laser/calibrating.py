@@ -20,6 +20,9 @@ from gripmon.camera import Camera
 from gripmon.records import Array
 
 FARTHEST_PLANE_M = 50.0
+NEAREST_PLANE_M = 0.01
+FARTHEST_LASER_M = 1.0
+"""Of the beam's line from the end-effector's origin: no hand holds it farther off."""
 LEAST_AGREEING = 0.5
 """Part of the spots that has to agree: with fewer, another set-up might explain as many."""
 MOST_TURN_RAD = 0.02
@@ -107,7 +110,7 @@ def calibrate(
         check_reading(camera, base_T_ee, spots.uv_px, fault)
     if fault is not None:
         raise fault
-    _check_distance(found.refined.setup)
+    _check_sizes(found.refined)
     _check_agreement(found.refined, camera.width_px)
     refined = found.refined
     if lens is not None and not refine_lens:
@@ -200,8 +203,24 @@ def _refined(
     return LaserResult(start, found, uv_px, choice)
 
 
-def _check_distance(setup: LaserSetup) -> None:
+def _check_sizes(found: Refined) -> None:
+    """Positions in another unit fit as well: camera, plane and laser then are as many times too far, and the image says
+    nothing of it.  Only sizes that no cell has do.
+    """
+    setup = found.setup
     if setup.distance_m > FARTHEST_PLANE_M:
         raise CalibrationError(
             f"the plane would be {setup.distance_m:.4g} m from the camera: are the poses in millimetres? metres"
+        )
+    if setup.distance_m < NEAREST_PLANE_M:
+        raise CalibrationError(
+            f"the plane would be {1e3 * setup.distance_m:.4g} mm from the camera: were metres divided once too often? "
+            "metres"
+        )
+    across = setup.point_ee_m - setup.direction_ee * float(setup.point_ee_m @ setup.direction_ee)
+    offset, sigma = float(np.linalg.norm(across)), float(np.sqrt(found.covariance.diagonal()[11:13].max()))
+    if offset - 3.0 * sigma > FARTHEST_LASER_M:
+        raise CalibrationError(
+            f"the laser's line would pass the end-effector's origin at {offset:.3g} m: are the poses in centimetres or "
+            "inches, or of another frame than the hand's? metres, base_T_ee"
         )
