@@ -28,6 +28,7 @@ from gripmon.outlook import expect
 from gripmon.provenance import Provenance
 from gripmon.simulator import Simulator
 from gripmon.simulator.scenario import JawScript, Sensor
+from gripmon.teaching import TeachingImage
 from gripmon.teaching.bench import Bench
 from gripmon.teaching.corner_pose import CameraError, pose_from_corners
 from gripmon.teaching.placing import place, usual_view
@@ -141,7 +142,9 @@ def test_a_photograph_of_a_box_without_jaw():
 def test_what_is_expected_is_what_check_says(rig: Rig, bench: Bench):
     found = bench.look(rig.image, put(rig.rough(*INNER)), (), OPENING_M)
     assert found.reference is not None and found.prospects is not None
-    outlook = expect(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M)
+    # As of the configuration that is saved then, which names what this image teaches.
+    _, taught = bench.taught(found.reference, [TeachingImage(rig.image, found.snapped.jaw_opening_m, "")])
+    outlook = expect(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M, taught)
     np.testing.assert_allclose(found.prospects.sigma, outlook.sigma)
     assert (found.prospects.smallest > 0.0).all() and found.prospects.edges == outlook.edges
 

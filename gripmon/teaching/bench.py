@@ -21,7 +21,7 @@ from gripmon.teaching.measure import Taught, teach
 from gripmon.teaching.placing import Prior, place, prior_of, usual_view
 from gripmon.teaching.prospects import Prospects, prospects
 from gripmon.teaching.snapping import Snapped, Snapper
-from gripmon.teaching.views import TeachingImage
+from gripmon.teaching.views import TeachingImage, TeachingRefused
 
 LARGEST_OFF_PX = 100_000.0
 """Corners are put in the image, or beside it; nothing farther is meant."""
@@ -83,8 +83,17 @@ class Bench:
                 why = str(refused)
         expected = None
         if reference is not None:
-            expected = prospects(self.camera, self.gripper, self.settings, reference, snapped.jaw_opening_m)
+            taught = self._taught_by(image, reference, snapped.jaw_opening_m)
+            expected = prospects(self.camera, self.gripper, self.settings, reference, snapped.jaw_opening_m, taught)
         return Found(snapped, pose, reference, why, expected)
+
+    def _taught_by(self, image: Image, reference: ReferenceRecord, jaw_opening_m: float | None) -> TaughtEdges | None:
+        """What this image alone would teach; None if nothing."""
+        opening_m = self.gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+        try:
+            return self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
+        except TeachingRefused:
+            return None
 
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
         """What the images show of every edge.  Raises :class:`gripmon.teaching.TeachingRefused`."""
