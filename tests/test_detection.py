@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 
 import cv2
@@ -193,3 +194,19 @@ def test_a_knights_move_is_no_step_of_a_chequerboard():
     assert turns.basis(0, right, down)
     assert not turns.basis(0, right, down + 2.0 * right)
     assert not turns.basis(0, right - 2.0 * down, down)
+
+
+@pytest.mark.parametrize("target", ["chequerboard:9x6:0.02", "circles:9x6:0.02:0.01"])
+def test_more_than_the_plate_has_is_told_where_the_plate_ends_all_round(target: str):
+    """And only there: where a finger hides a part, or the image ends, the rest may be anywhere."""
+    plate, more = parse_target(target), parse_target(target.replace("9x6", "9x8"))
+    look = Look(supersampling=1, margin=1.2)
+    T = pose(plate, (0.0, 0.0, 0.4), (0.3, -0.2), 0.3)
+    for inverted in (False, True):
+        whole = detect(render(LENS, T, plate, dataclasses.replace(look, inverted=inverted)), more)
+        assert isinstance(whole, NotFound) and "shows 9 x 6" in whole.reason and "have 9 x 8" in whole.reason
+    assert isinstance(detect(render(LENS, T, plate, look), plate), Sighting)
+    assert isinstance(detect(render(LENS, T, plate, look, covers=fingers(LENS, 0.35)), more), Sighting)
+    part = T.copy()
+    part[0, 3] += 0.09
+    assert isinstance(detect(render(LENS, part, plate, look), more), Sighting)

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from gripmon.calibration import blobs, chequers, symmetry
 from gripmon.calibration.bending import bends
+from gripmon.calibration.counting import ends_all_round
 from gripmon.calibration.lattice import Index
 from gripmon.calibration.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibration.sighting import NotFound, Sighting
@@ -108,7 +109,8 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
     if not found:
         return NotFound(_blurred(grey) or "no chequerboard in the image; one that is evenly lit and not too small")
     cells, rough = _arrays(found[0])
-    if not chequers.fits(found[0], target.columns, target.rows):
+    fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
+    if fewer or not chequers.fits(found[0], target.columns, target.rows):
         return _wrong_count(cells, target.columns, target.rows, "inner corners")
     steps = _steps(cells, rough)
     starts, ends = _across_squares(cells, rough)
@@ -129,7 +131,8 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
         return NotFound(_blurred(grey) or "no lattice of discs in the image; one that is evenly lit and not too small")
     cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
     seen = cells.max(axis=0) + 1
-    if max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
+    fewer = len(cells) < columns * rows and ends_all_round(grey, cells, rough, squares=False)
+    if fewer or max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
         return _wrong_count(cells, columns, rows, "discs")
     where = {(int(c), int(r)): k for k, (c, r) in enumerate(cells.tolist())}
     pairs = [(k, where[c + 1, r]) for (c, r), k in where.items() if (c + 1, r) in where]

@@ -51,14 +51,16 @@ class PlaneCalibration:
 def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     """The weighted mean of all images on the manifold, pose and inferred lengths jointly.
 
-    Weights are the images' own covariances; what the camera, or the plate's print, is off by comes into all of them
-    and isn't taken to average out.  Where the images differ by more than their covariances allow, the mean's is
-    enlarged by as much (Birge, "The calculation of errors by the method of least squares", 1932), which is a warning.
-    :class:`CalibrationError` for inferred grippers of different corners.
+    Weights are the images' covariances less the camera's part; what the camera, or the plate's print, is off by comes
+    into all of them and isn't taken to average out.  (Weights that left the print out, too, would turn its error along
+    the line of sight, which is large, into errors across it that differ from image to image.)  Where the images differ
+    by more than their covariances allow, the mean's is enlarged by as much (Birge, "The calculation of errors by the
+    method of least squares", 1932), which is a warning.  :class:`CalibrationError` for inferred grippers of different
+    corners.
     """
     if inferred and len({i.corners.names for i in images}) > 1:
         raise CalibrationError("the images show different corners; for a gripper that is inferred the same in all")
-    information = [_inverse(i.own @ i.own.T) for i in images]
+    information = [_inverse(i.own @ i.own.T + i.printed @ i.printed.T) for i in images]
     total = np.linalg.inv(np.sum(information, axis=0))
     gains = [total @ i for i in information]
     cam_T_grip = images[0].cam_T_grip
@@ -72,8 +74,9 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     freedom = len(total) * (len(images) - 1)
     consistency_p = float(chi2.sf(size, freedom)) if freedom else None
     warnings = list(_of_images(images, inferred))
+    own = np.sum([g @ i.own @ i.own.T @ g.T for g, i in zip(gains, images, strict=True)], axis=0)
     if consistency_p is not None and consistency_p < DOUBTED:
-        total = total * (size / freedom)
+        own = own * (size / freedom)
         farthest = max(zip(images, away, strict=True), key=lambda both: float(np.linalg.norm(both[1][:3])))
         warnings.append(
             f"the images contradict each other (probability {consistency_p:.1g}), most of all "
@@ -81,7 +84,7 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
             f"between them, or the gripper didn't stand on the plate; uncertainty x {np.sqrt(size / freedom):.1f}"
         )
     common = np.sum([g @ i.common for g, i in zip(gains, images, strict=True)], axis=0)
-    covariance = total + common @ common.T + _of_print([g @ i.printed for g, i in zip(gains, images, strict=True)])
+    covariance = own + common @ common.T + _of_print([g @ i.printed for g, i in zip(gains, images, strict=True)])
     return PlaneCalibration(
         cam_T_grip,
         0.5 * (covariance + covariance.T)[:6, :6],

@@ -11,10 +11,10 @@ from gripmon.corners.prediction import STRETCH
 from gripmon.records import Array
 from gripmon.teaching.lines import EdgePoints, Line
 
-SHARED_PX = 0.005
+SHARED_PX = 0.01
 """Standard deviation of a whole sharp edge's place, which its own points share and so don't show; grows with the edge's
 width.  In rendered images (five hundred edges of bevelled, brushed fingers that contrast with the plate) the middles of
-lines are off by 0.010 px, and what their points' scatter explains is 0.013 px: what is shared hides in that.
+lines are off by 0.010 px altogether, so what is shared is no more.
 """
 _LEAST_PX = 0.01
 """Standard deviation of a point: no image gives it better than that."""

@@ -146,8 +146,8 @@ def _revealed_table(revealed: list[Revealed]) -> str:
 
     lines = [
         (
-            "a gripper that doesn't stand on the plate: part of the images in which it is told (probability below 0.001); "
-            "power: of the best test, by all edges and by the corners alone"
+            "a gripper that doesn't stand on the plate: part of the images in which it is told (probability below "
+            "0.001); power: of the best test, by all edges and by the corners alone"
         ),
         (
             f"{'':<30} {'noise, DN':>9} {'residuals':>10} {'tilt/gap':>9} {'power':>6} {'corners':>8} "
