@@ -16,6 +16,7 @@ SHARED_PX = 0.01
 width.  In rendered images (five hundred edges of bevelled, brushed fingers that contrast with the plate) the middles of
 lines are off by 0.010 px altogether, so what is shared is no more.
 """
+_FEWEST_FREE = 3.0
 _LEAST_PX = 0.01
 """Standard deviation of a point: no image gives it better than that."""
 
@@ -37,12 +38,15 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     point if all are independent, and up to :data:`STRETCH` times that if those of a stretch are one.  Either way the
     line's covariance is ``v (A' A)^-1``, A being its design (Huber, "Robust statistics", 1981, section 6.3, for groups
     that err together).  v comes from all edges together, as one alone has few stretches, or from the edge itself where
-    that shows more (which makes up for v being an estimate).
+    that shows more.
 
     On top comes what all points of an edge share, which no residual shows.
     """
     squares, freedom = np.array([_stretches(edge) for edge in seen]).T
-    usual_px2 = squares.sum() / max(freedom.sum(), 1.0)
+    free = float(freedom.sum())
+    # Known from few stretches itself: Student's distribution has this variance.
+    student = free / (free - 2.0) if free >= _FEWEST_FREE else _FEWEST_FREE
+    usual_px2 = student * float(squares.sum()) / max(free, 1.0)
     out = []
     for edge, own, count in zip(seen, squares, freedom, strict=True):
         way, inlier = edge.points.way[edge.line.inlier], edge.line.inlier
