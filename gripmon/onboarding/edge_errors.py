@@ -7,15 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gripmon.corners.consensus import ConsensusSettings
 from gripmon.corners.prediction import STRETCH
 from gripmon.records import Array
 from gripmon.teaching.lines import EdgePoints, Line
 
-SHARED_PX = 0.01
-"""Standard deviation of a whole sharp edge's place, which its own points share and so don't show; grows with the edge's
-width.  In rendered images (five hundred edges of bevelled, brushed fingers that contrast with the plate) the middles of
-lines are off by 0.010 px altogether, so what is shared is no more.
-"""
 _FEWEST_FREE = 3.0
 _LEAST_PX = 0.01
 """Standard deviation of a point: no image gives it better than that."""
@@ -47,12 +43,13 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     # Known from few stretches itself: Student's distribution has this variance.
     student = free / (free - 2.0) if free >= _FEWEST_FREE else _FEWEST_FREE
     usual_px2 = student * float(squares.sum()) / max(free, 1.0)
+    floor_px = ConsensusSettings().edge_floor_px
     out = []
     for edge, own, count in zip(seen, squares, freedom, strict=True):
         way, inlier = edge.points.way[edge.line.inlier], edge.line.inlier
         design = np.column_stack([1.0 - way, way])
         variance_px2 = max(usual_px2, own / max(count, 1.0), _LEAST_PX**2)
-        shared_px = SHARED_PX * max(float(np.median(edge.width_px[inlier])), 1.0)
+        shared_px = floor_px * max(float(np.median(edge.width_px[inlier])), 1.0)
         out.append(variance_px2 * np.linalg.inv(design.T @ design) + shared_px**2)
     return out
 
