@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.config import Config, SecondConfig
     from gripmon.daemon import JawFeed, Reports
+    from gripmon.metrics import MetricsServer
     from gripmon.publish import Publisher, ZenohCommands
     from gripmon.sources import Source
     from gripmon.wire import Keys, Link
@@ -73,21 +74,28 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None) -> Network:
 
 
 def with_metrics(config: Config, publisher: Publisher) -> Publisher:
-    """The publisher, and beside it the server for Prometheus where the configuration wants one; ends the command with
-    exit code 2 where it can't listen.
+    """The publisher, and beside it the server for Prometheus where the configuration wants one."""
+    from gripmon.publish import Publishers
+
+    metrics = metrics_server(config)
+    return publisher if metrics is None else Publishers(publisher, {"metrics": metrics})
+
+
+def metrics_server(config: Config | SecondConfig) -> MetricsServer | None:
+    """The server for Prometheus where the configuration wants one; ends the command with exit code 2 where it can't
+    listen.
     """
     from gripmon.metrics import MetricsError, MetricsServer
-    from gripmon.publish import Publishers
 
     settings = config.settings
     if not settings.metrics.enabled:
-        return publisher
+        return None
     try:
         metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
     except MetricsError as error:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
     _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return Publishers(publisher, {"metrics": metrics})
+    return metrics
 
 
 def with_source(reports: Reports, source: Source) -> Reports:

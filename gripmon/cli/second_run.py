@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from gripmon.sources import Source
     from gripmon.wire import Link
 
-_log = logging.getLogger(__name__)
 _PATIENCE_S = 30.0  # recorded frames outrun any camera: they wait for the recording rather than be dropped
 
 
@@ -140,18 +138,11 @@ def _on_link(config: SecondConfig, link: Link) -> _Network:
 
 def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
-    from gripmon.metrics import MetricsError, MetricsServer
+    from gripmon.cli.network import metrics_server
     from gripmon.publish import SpotPublishers
 
-    settings = config.settings
-    if not settings.metrics.enabled:
-        return publisher
-    try:
-        metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
-    except MetricsError as error:
-        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
-    _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
-    return SpotPublishers(publisher, {"metrics": metrics})
+    metrics = metrics_server(config)
+    return publisher if metrics is None else SpotPublishers(publisher, {"metrics": metrics})
 
 
 def _open_source(config: SecondConfig, link: Link | None) -> Source:

@@ -132,6 +132,9 @@ class Viewer:
         """
         meter = self._meter(None)
         found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, _CLEAR_SHARE, _EVERYWHERE)
+        if found.trusted:
+            # Once more from there: the first look goes by predictions at the reference, and clutter may mislead it.
+            found = meter.measure(image.image, found.cam_T_grip, image.jaw_opening_m, _CLEAR_SHARE, _EVERYWHERE)
         away_px = meter.moved_px(found, self.ref_cam_T_grip)
         if found.trusted and away_px > self._settings.sampling.reach_px:
             motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
