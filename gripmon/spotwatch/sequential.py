@@ -7,8 +7,8 @@ the ratios less the number of pulses is a martingale, so that R exceeds K once i
 alternatives there are and however few of them are kept (Pollak, Ann. Statist. 13, 1985).  What is common to pulses (the
 calibration's errors, an arm's at one pose) is an unknown of every belief, and no evidence.
 
-A spot may be wrong: a reflection, or speckle beside it.  Wrong ones lie anywhere, and near the right one as readily as
-far off: uniformly in the logarithm of the distance.
+A spot may be wrong: a reflection, or speckle beside it.  Half of the wrong ones lie anywhere in the image, the others
+near the right one as readily as far off: uniformly in the logarithm of the distance.
 """
 
 from __future__ import annotations
@@ -113,14 +113,16 @@ class MotionTest:
         """(k,) density of wrong spots, around where the best belief has the right one; 1/px²."""
         best = self.reigning.picked(np.array([self.best]))
         uv_px, rows = self._bank.foreseen(best, pulse)
+        camera = self._calibrated.camera
+        anywhere = 1.0 / (camera.width_px * camera.height_px)
         if not np.isfinite(uv_px).all():
-            camera = self._calibrated.camera
-            return np.full(len(pulse.uv_px), 1.0 / (camera.width_px * camera.height_px))
+            return np.full(len(pulse.uv_px), anywhere)
         own = rows[0] @ best.covariance[0] @ rows[0].T
         near = math.sqrt(0.5 * float(np.trace(own)) + self._calibrated.sigma_px**2)
         near = min(3.0 * near, 0.1 * self._diagonal_px)
         distance = np.maximum(np.linalg.norm(pulse.uv_px - uv_px[0], axis=1), near)
-        out: Array = 1.0 / (2.0 * np.pi * distance**2 * (0.5 + math.log(self._diagonal_px / near)))
+        around = 1.0 / (2.0 * np.pi * distance**2 * (0.5 + math.log(self._diagonal_px / near)))
+        out: Array = 0.5 * (anywhere + around)
         return out
 
     def _begun(self) -> Beliefs:
