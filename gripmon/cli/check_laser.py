@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--wrong-spots",
         type=common.positive_number,
         metavar="PART",
-        help="part of the spots that may be reflections (default 0.1, at most 0.5)",
+        help="part of the spots that may be reflections (default 0.2, at most 0.5)",
     )
 
 

@@ -28,7 +28,7 @@ class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     ] = 2e-4
     wrong_spots: Annotated[
         float, Meta(gt=0.0, le=0.5, description="part of the pulses whose spot may be a reflection or none at all")
-    ] = 0.1
+    ] = 0.2
     probable: Annotated[
         float, Meta(gt=0.5, lt=1.0, description="probability from which a cause is named, else it is unknown")
     ] = 0.9
