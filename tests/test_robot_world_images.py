@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -11,8 +12,12 @@ import yaml
 from plates import pose, render
 from test_robot_world import columns, transform
 
+from gripmon.calibration.detection import detect
 from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibration.intrinsics import plate_pose
+from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import parse_target
+from gripmon.calibration.upright import upright
 from gripmon.camera import BrownConradyLens
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
@@ -65,7 +70,30 @@ def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
     assert main(again) == 3
     assert "none of 6 images shows the target" in capsys.readouterr().err
     assert not (tmp_path / "without5.yaml").exists()
-    for target in ("chequerboard:8x6:0.03", "circles:8x8:0.008:0.004"):
+    for target in ("chequerboard:8x6:0.03", "circles:8x8:0.008:0.004"):  # the same after half a turn
         assert main([*command, "--target", target, "--out", str(tmp_path / "no.yaml")]) == 2
         assert "doesn't tell which way up" in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
+
+
+def test_a_chequerboard_is_turned_by_its_colours():
+    target = parse_target("chequerboard:9x6:0.025")
+    rng = np.random.default_rng(4)
+    turns = []
+    for k, roll in enumerate((0.1, 1.7, 3.0, 4.5)):
+        true = pose(target, [*rng.uniform(-0.01, 0.01, 2), 0.45], rng.uniform(-0.4, 0.4, 2), roll)
+        image = render(LENS, true, target, seed=k)
+        sighting = upright(image, detect(image, target), target)
+        assert isinstance(sighting, Sighting)
+        found, _, _ = plate_pose(LENS, sighting)
+        turns.append(found[:3, :3].T @ true[:3, :3])
+        # The board's own frame, or that after half a turn: the same one whichever way up it is in the image.
+        assert np.abs(turns[-1] - turns[0]).max() < 0.01
+        assert np.abs(np.abs(turns[-1]) - np.eye(3)).max() < 0.01
+        dark = 255 - image
+        inverted = upright(dark, sighting, target)
+        assert isinstance(inverted, Sighting)
+        assert np.allclose(inverted.plate_m[:, :2], [0.2, 0.125] - sighting.plate_m[:, :2])
+    part = replace(sighting, uv_px=sighting.uv_px[1:], plate_m=sighting.plate_m[1:])
+    assert isinstance(upright(image, part, target), NotFound)
+    assert isinstance(upright(np.full_like(image, 90), sighting, target), NotFound)

@@ -109,7 +109,9 @@ def name_of(target: Target) -> str:
 
 
 def tells_its_turn(target: Target) -> bool:
-    """Whether an image of it tells which way up it is.  (Colours would tell chequerboards of an even and an odd number
-    of corners; their corners are numbered without them.)
+    """Whether an image of it tells which way up it is: by marks, or by the colours of a board whose numbers of corners
+    are one even, one odd (:mod:`gripmon.calibration.upright`).
     """
+    if isinstance(target, Chequerboard):
+        return (target.columns + target.rows) % 2 == 1
     return isinstance(target, Charuco)

@@ -21,8 +21,8 @@ Calibrate a fixed camera against an arm that holds a target, or with --eye-in-ha
 against a target that stands: both unknown transforms at once, from the arm's poses and the target's.
 DATA are tables (.csv, .yaml, .json) with a row for each pose: base_T_ee as tx_m, ty_m, tz_m with qx, qy,
 qz, qw or with rx_rad, ry_rad, rz_rad; and cam_T_target as the same columns with cam_ before their names,
-or image, from which --camera and --target find it (a charuco board: others don't tell which way up they
-are).
+or image, from which --camera and --target find it (a charuco board, or a chequerboard with an even and
+an odd number of corners, wholly in view: others don't tell which way up they are).
 Turn the hand about at least two axes; ten poses or more are good."""
 
 _EXAMPLES = """\
@@ -157,7 +157,9 @@ class _Seer:
         """``cam_T_target`` and its covariance, None if the image doesn't show it; what is wrong ends the command."""
         from gripmon.calibration.detection import detect
         from gripmon.calibration.intrinsics import plate_pose
-        from gripmon.calibration.sighting import CalibrationError, NotFound
+        from gripmon.calibration.sighting import CalibrationError, NotFound, Sighting
+        from gripmon.calibration.targets import Chequerboard
+        from gripmon.calibration.upright import upright
         from gripmon.sources.folder import read_image
 
         if not row.get("image"):
@@ -175,6 +177,8 @@ class _Seer:
                 common.EXIT_USAGE,
             )
         sight = detect(image, self._target, str(path))
+        if isinstance(sight, Sighting) and isinstance(self._target, Chequerboard):
+            sight = upright(image, sight, self._target)
         if isinstance(sight, NotFound):
             self.unseen.append(f"{path}: {sight.reason}")
             return None
@@ -202,7 +206,7 @@ class _Seer:
         if not tells_its_turn(self._target):
             raise common.CommandFailedError(
                 f"--target {self._arguments.target}: an image of it doesn't tell which way up it is, so any pose may "
-                "be turned by half; a charuco board",
+                "be turned by half; a charuco board, or a chequerboard with one even, one odd number of corners",
                 common.EXIT_USAGE,
             )
         self.files.append(Path(self._arguments.camera))
