@@ -75,6 +75,20 @@ def test_a_laser_off_image_takes_a_lamp_away_that_outshines_the_spot():
     assert np.abs(with_dark[0].uv_px - truth).max() < 0.2
 
 
+def test_many_wide_faint_things_don_t_crowd_the_spot_out():
+    """Without an image with the laser off: a plane with smudges, each wider than the spot and far fainter."""
+    rng = np.random.default_rng(7)
+    size, truth = (900, 700), np.array([452.3, 347.8])
+    v, u = np.mgrid[0 : size[1], 0 : size[0]].astype(float)
+    ambient = np.full((size[1], size[0]), 60.0)
+    for x in range(60, 900, 90):
+        for y in range(50, 700, 100):
+            ambient += 25.0 * np.exp(-((u - x) ** 2 + (v - y) ** 2) / (2.0 * 8.0**2))
+    found = find_spots(spot_image(truth, rng, size_px=size, ambient=ambient))
+    assert not isinstance(found, NotFound)
+    assert np.linalg.norm(found[0].uv_px - truth) < 0.3
+
+
 def test_a_saturated_core_is_reported():
     rng = np.random.default_rng(4)
     for height, least, most in ((150.0, 0.0, 0.0), (2000.0, 0.3, 1.0)):

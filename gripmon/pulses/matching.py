@@ -255,8 +255,8 @@ def mean_image(frames: tuple[Frame, ...]) -> Image:
     images = [frame.image for frame in frames if frame.image is not None]
     if len(images) == 1:
         return images[0]
-    total: Array = np.zeros(images[0].shape, np.float64)
-    for image in images:
+    total = images[0].astype(np.float64)
+    for image in images[1:]:
         total += image
     total /= len(images)
     if np.issubdtype(images[0].dtype, np.integer):
