@@ -94,6 +94,18 @@ def test_fresh_spots_are_judged(laser, tmp_path, capsys, change, code, verdict, 
     assert f"verdict    {verdict}: " in text and text.count("line ") == 12
 
 
+def test_what_is_concluded_is_what_all_spots_say(laser, tmp_path, capsys):
+    """The alarm comes with the third spot, which can't tell yet how the camera has moved."""
+    sigmas = []
+    for count in (3, 12):
+        spots = table(tmp_path / "fresh.csv", true_world().moved(math.radians(1.0) * AXES[3]), count)
+        assert main(["check", "--laser", str(laser), str(spots), "--json"]) == 3
+        report = json.loads(capsys.readouterr().out)
+        assert report["text"].endswith(report["motion"]["text"])
+        sigmas.append(np.sqrt(np.linalg.eigvalsh(np.reshape(report["motion"]["covariance"], (6, 6)))[-1]))
+    assert sigmas[1] < 0.5 * sigmas[0]
+
+
 def test_two_spots_that_are_far_off_are_not_enough_to_say_that_something_moved(laser, tmp_path, capsys):
     spots = table(tmp_path / "fresh.csv", true_world().moved(0.05 * AXES[3]), 2)
     assert main(["check", "--laser", str(laser), str(spots)]) == 3

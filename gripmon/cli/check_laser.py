@@ -244,10 +244,10 @@ def _values(array: Array | None) -> Any:
 
 def _conclusion(watch: SpotWatch, rows: list[dict[str, Any]], last: SpotJudgement) -> dict[str, Any]:
     """``same``; ``moved``; ``unclear`` where fewer than half of the spots could be believed."""
-    alerts = [entry.alert for entry in watch.book.open if entry.alert.kind == "drift"]
+    alert = watch.motion_alert  # of all spots: the one that was raised knew the first few only
     believed = sum(row["used"] for row in rows)
-    if alerts:
-        verdict, text = "moved", alerts[-1].text
+    if alert is not None:
+        verdict, text = "moved", alert.text
     elif 2 * believed <= len(rows):
         verdict = "unclear"
         text = f"only {believed} of {len(rows)} spots can be believed, too few or too different to tell a motion by"
@@ -256,7 +256,7 @@ def _conclusion(watch: SpotWatch, rows: list[dict[str, Any]], last: SpotJudgemen
     return {
         "verdict": verdict,
         "text": text,
-        "cause": str(alerts[-1].cause) if alerts else None,
+        "cause": None if alert is None else str(alert.cause),
         "causes": [{"cause": str(w.cause), "probability": w.probability} for w in last.causes],
         "probability_moved": last.probability_moved,
         "motion": None if last.motion is None else _motion_values(last.motion),

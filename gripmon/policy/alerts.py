@@ -63,8 +63,13 @@ class AlertBook:
         entry = self._open.get(topic)
         return None if entry is None else entry.alert
 
-    def present(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> tuple[Alert, ...]:
-        """The condition holds, as ``alert`` says now; what there is to tell: one event or none."""
+    def present(
+        self, topic: str, alert: Alert, now_s: float, stamp_ns: int, *, news: bool = False
+    ) -> tuple[Alert, ...]:
+        """The condition holds, as ``alert`` says now; what there is to tell: one event or none.
+
+        ``news``: the text alone says something new to a person; else only another cause, severity or size does.
+        """
         entry = self._open.get(topic)
         if entry is None:
             self._raised += 1
@@ -86,7 +91,7 @@ class AlertBook:
         worse = _RANK[alert.severity] > _RANK[known.severity]
         explained = known.cause is Cause.UNKNOWN and alert.cause is not Cause.UNKNOWN
         due = (explained or now_s - entry.said_s >= self._update_s) and not known.acknowledged
-        if worse or (due and _differ(known, updated)):
+        if worse or (due and (news or _differ(known, updated))):
             self._keep(topic, updated, now_s)
             return (updated,)
         self._open[topic] = replace(entry, absent_since_s=None)

@@ -60,5 +60,6 @@ def _text(shift: Array, covariance: Array, unknown: Array) -> str:
     ways = []
     for direction in unknown.T[::-1]:
         names = [_NAMES[i] for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > _TOLD]
-        ways.append(" with ".join(names))
-    return f"{text}; pulses so far don't tell it {', '.join(dict.fromkeys(ways))}: others, the hand turned, would"
+        ways.append(" and ".join(names) + " at once" * (len(names) > 1))
+    untold = "; nor ".join(dict.fromkeys(ways))
+    return f"{text}; pulses so far hardly tell a motion {untold}: others, from elsewhere or with the hand turned, would"

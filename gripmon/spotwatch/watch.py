@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from gripmon.records import Alert, State, Verdict
 from gripmon.spotwatch import words
 from gripmon.spotwatch.beliefs import Pulse
 from gripmon.spotwatch.judgement import SpotFault, SpotJudgement, SpotSeen
+from gripmon.spotwatch.motion import UNIT
 from gripmon.spotwatch.moving import Moved, alert_of, how
 from gripmon.spotwatch.places import Places
 from gripmon.spotwatch.sequential import MotionTest
@@ -25,6 +27,8 @@ MOTION, VIEW = "motion", "view"
 """What alerts are about."""
 SUSPICIOUS = 0.03
 """Odds of a motion, over those of an alarm, from which the calibration is suspect."""
+BETTER = 0.5
+"""Part of the standard deviation that an open alert says, below which it is updated."""
 _OCCLUDED = 2
 """Pulses in a row that can't be believed, from which the view counts as blocked."""
 
@@ -59,6 +63,7 @@ class SpotWatch:
         self._good = 0
         self._odds = 0.0
         self._moved: Moved | None = None
+        self._said_sigma = math.inf  # of the camera's motion, in the alert as it was last told
 
     def judge(self, seen: SpotSeen) -> SpotJudgement:
         """What a pulse says.  Stamps that go back count as the last one's."""
@@ -185,10 +190,39 @@ class SpotWatch:
             alerts = book.present(VIEW, words.lost_alert(self._bad), now_s, stamp_ns)
         else:
             alerts = book.absent(VIEW, "spots are seen again", now_s, at_once=True) if not self._bad else ()
-        if self._moved is not None:
-            known = book.about(MOTION)
-            return alerts + book.present(MOTION, alert_of(self._moved, self.settings, known), now_s, stamp_ns)
+        motion_alert = self.motion_alert
+        if motion_alert is not None:
+            told = book.present(MOTION, motion_alert, now_s, stamp_ns, news=self._known_better())
+            if told:
+                self._said_sigma = self._sigma
+            return alerts + told
+        self._said_sigma = math.inf
         return alerts + book.absent(MOTION, "spots are where the calibration has them again", now_s, at_once=True)
+
+    @property
+    def motion_alert(self) -> Alert | None:
+        """What the pulses so far say of a motion, whether or not the open alert has been updated since; None if
+        nothing has moved.
+        """
+        if self._moved is None:
+            return None
+        return alert_of(self._moved, self.settings, self.book.about(MOTION))
+
+    @property
+    def _sigma(self) -> float:
+        """How well the camera's motion is known: its largest standard deviation, in 10 mm and 10 mrad; infinite where
+        none is told.
+        """
+        motion = None if self._moved is None else self._moved.motion
+        if motion is None:
+            return math.inf
+        return math.sqrt(float(np.linalg.eigvalsh(motion.covariance / np.outer(UNIT, UNIT))[-1]))
+
+    def _known_better(self) -> bool:
+        """The first pulses hardly tell how a camera has moved: later ones are worth an update when they tell it much
+        better than what was said.
+        """
+        return self._sigma < BETTER * self._said_sigma
 
     @property
     def _now_s(self) -> float:
