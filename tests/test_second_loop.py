@@ -108,6 +108,16 @@ def pause(seconds: float) -> Callable[[object], None]:
     return lambda _: time.sleep(seconds)
 
 
+@pytest.mark.parametrize("background", [True, False])
+def test_a_spot_that_is_not_seen_without_a_background_says_what_would_help(background):
+    bench = Bench()
+    items = bench.pulse(0, image=dark(np.random.default_rng(1)))
+    bench.run(items if background else items[1:])
+    (record,) = bench.network.spots
+    assert record.fault is PulseFault.NO_SPOT and record.background is background
+    assert ("no frame to subtract" in record.reason) is not background
+
+
 def test_pulses_are_judged_said_and_recorded():
     bench = Bench()
     assert bench.run([item for k in range(3) for item in bench.pulse(k)]) == 0

@@ -36,10 +36,14 @@ from gripmon.records import (
     Verdict,
     to_json,
 )
-from gripmon.spotwatch import SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
+from gripmon.spotwatch import SpotFault, SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
 
 _IMAGE = "image"
 _IMAGE_ALERT_AFTER_S = 1.0
+_NO_BACKGROUND = (
+    "; no frame to subtract, none since the pulse before had the laser off: a longer pause, by more than "
+    "laser.frames.margin_s after a pulse and before the next one"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +137,8 @@ class PulsedWatch:
         image = mean_image(shown.lit)
         found = find_spots(image, None if shown.dark is None else shown.dark.image)
         judged = self._watch.judge(SpotSeen(shown.pulse.stamp_ns, shown.pulse.base_T_ee, found))
+        if shown.dark is None and judged.fault in (SpotFault.NO_SPOT, SpotFault.OUTLIER):
+            judged = replace(judged, reason=judged.reason + _NO_BACKGROUND)
         self.usable += judged.used
         if judged.motion is not None:
             self.displacement = self._displacement(judged.motion.shift, judged.motion.covariance)
