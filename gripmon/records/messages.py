@@ -48,7 +48,7 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         tuple[float, float, float] | None,
         Meta(
             description="displacement of the TCP along the camera's x, y, z against the reference, m; null: unknown; "
-            "of a second camera: of the place on its plane that its axis meets, null while nothing has moved"
+            "of a second camera: of the place on its plane that its axis meets, null unless it has moved itself"
         ),
     ] = None
     sigma_m: Annotated[
