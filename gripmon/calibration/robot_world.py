@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from gripmon.calibration.robot_world_noise import arm_sigmas, arm_slopes, with_arm
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import invert, make_transform, perturb, skew
 from gripmon.records import Array
@@ -26,7 +27,7 @@ BIWEIGHT = 4.685
 FALSE_OUTLIERS = 0.05
 """How many good poses of a whole data set may be left out, on average."""
 _ITERATIONS = 60
-_ROUNDS = 20
+_ROUNDS, _ARM_ROUNDS = 20, 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,26 +94,38 @@ def translations(cam_T_target: Array, base_T_ee: Array, cam_R_base: Array) -> tu
 
 
 def refine(
-    cam_T_target: Array, base_T_ee: Array, start: tuple[Array, Array], covariance: Array | None = None
+    cam_T_target: Array,
+    base_T_ee: Array,
+    start: tuple[Array, Array],
+    covariance: Array | None = None,
+    *,
+    inexact_arm: bool = False,
 ) -> RobotWorld:
     """All twelve unknowns at once, robustly.  ``covariance`` (n, 6, 6) of the measured ``cam_T_target`` (position then
     rotation, camera axes), believed up to a common scale; without it positions and rotations are weighed by what their
-    residuals show.
+    residuals show.  With an ``inexact_arm`` what that adds to the covariances is estimated, too.
     """
     cam_T_base, ee_T_target = start
     count = len(cam_T_target)
     if 6 * count <= 12:
         raise CalibrationError(f"{count} pose(s); at least {FEWEST_POSES}, better ten")
-    whiten = None if covariance is None else np.linalg.inv(np.linalg.cholesky(covariance))
+    whiten = None if covariance is None else _whitening(covariance)
     used = np.ones(count, dtype=bool)
+    weights: Array = np.ones(count)
+    sigmas: Array | None = None
     for turn in range(_ROUNDS):
         values = residuals(cam_T_target, base_T_ee, cam_T_base, ee_T_target)
+        if covariance is not None and inexact_arm and turn < _ARM_ROUNDS:
+            by_arm, rows = arm_slopes(base_T_ee, cam_T_base, ee_T_target), slopes(base_T_ee, cam_T_base, ee_T_target)
+            sigmas = arm_sigmas(covariance, by_arm, rows, values, weights, sigmas)
+            whiten = _whitening(with_arm(covariance, by_arm, sigmas))
         root = whiten if whiten is not None else _weights_of(values[used])
-        weights = _biweight(_sizes(root, values), 6) if count > FEWEST_POSES else np.ones(count)
+        if count > FEWEST_POSES:
+            weights = _biweight(_sizes(root, values), 6)
         before = cam_T_base, ee_T_target
         cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, before, root, weights)
         if (
-            turn > 2
+            turn > _ARM_ROUNDS
             and np.allclose(before[0], cam_T_base, atol=1e-12)
             and np.allclose(before[1], ee_T_target, atol=1e-12)
         ):
@@ -198,6 +211,11 @@ def _check_turns(cam_T_target: Array, base_T_ee: Array) -> None:
             raise CalibrationError(
                 f"the {which} poses are turned about one axis only, or not at all; poses turned about at least two axes"
             )
+
+
+def _whitening(covariance: Array) -> Array:
+    out: Array = np.linalg.inv(np.linalg.cholesky(covariance))
+    return out
 
 
 def _weights_of(values: Array) -> Array:

@@ -61,7 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
     arm = np.stack([invert(T) for T in poses.base_T_ee]) if arguments.eye_in_hand else poses.base_T_ee
     try:
         start = robot_world.solve(poses.cam_T_target, arm)
-        found = robot_world.refine(poses.cam_T_target, arm, start, poses.covariance)
+        found = robot_world.refine(poses.cam_T_target, arm, start, poses.covariance, inexact_arm=True)
         check_reading(found, poses.cam_T_target, arm)
     except CalibrationError as error:
         raise common.CommandFailedError(f"calibrate robot-world: {error}") from None
