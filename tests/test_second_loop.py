@@ -108,6 +108,24 @@ def pause(seconds: float) -> Callable[[object], None]:
     return lambda _: time.sleep(seconds)
 
 
+@pytest.mark.parametrize(("moves_px", "fault"), [(0.0, None), (6.0, PulseFault.MOVING), (25.0, PulseFault.MOVING)])
+def test_a_hand_that_moves_during_a_pulse_is_told_from_something_that_moved(moves_px, fault):
+    """Each spot would be off by half of its way, three of them look like a motion."""
+    bench, rng, items = Bench(), np.random.default_rng(2), []
+    for k in range(6):
+        first, _, told, last = bench.pulse(k)
+        way = moves_px * np.array([0.8, 0.6])
+        lights = [
+            bench.frame(START_NS + k * PERIOD_NS + (3 + 3 * j) * 10_000_000, lit(cell().uv_px(k) + way * j / 4, rng))
+            for j in range(5)
+        ]
+        items += [first, *lights, told, last]
+    bench.run(items)
+    assert [record.fault for record in bench.network.spots] == [fault] * 6
+    assert not [alert for alert in bench.network.alerts if alert.kind is AlertKind.DRIFT]
+    assert fault is None or all("during the pulse" in record.reason for record in bench.network.spots)
+
+
 @pytest.mark.parametrize("background", [True, False])
 def test_a_spot_that_is_not_seen_without_a_background_says_what_would_help(background):
     bench = Bench()

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gripmon.calibration.laser.document import LaserCalibration, setup_of
-from gripmon.calibration.laser.spots import find_spots
+from gripmon.calibration.laser.spots import Spot, find_spots
 from gripmon.calibration.sighting import NotFound
 from gripmon.camera import make_camera
 from gripmon.geometry import from_record, perturb, quaternion_xyzw, skew
 from gripmon.policy import AlertBook
 from gripmon.pulses.matching import Matcher, Shown, mean_image
 from gripmon.pulses.settings import PulseSettings
+from gripmon.pulses.standing import way_px
 from gripmon.pulses.told import Told
 from gripmon.records import (
     Alert,
@@ -37,9 +38,12 @@ from gripmon.records import (
     to_json,
 )
 from gripmon.spotwatch import SpotFault, SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
+from gripmon.spotwatch.world import LEAST_NOISE_PX
 
 _IMAGE = "image"
 _IMAGE_ALERT_AFTER_S = 1.0
+_STILL = 3.0
+"""Standard deviations of the way between a pulse's halves, each at most twice a spot's own, that noise explains."""
 _NO_BACKGROUND = (
     "; no frame to subtract, none since the pulse before had the laser off: a longer pause, by more than "
     "laser.frames.margin_s after a pulse and before the next one"
@@ -81,6 +85,7 @@ class PulsedWatch:
         self._size_px = camera.width_px, camera.height_px
         self._base_T_cam = from_record(calibration.base_T_cam)
         setup = setup_of(calibration)
+        self._sigma_px = max(calibration.residuals.sigma_px, LEAST_NOISE_PX)
         self._axis_point_m = np.array([0.0, 0.0, setup.distance_m / setup.normal_cam[2]])
         self._book = AlertBook(update_s=np.inf, clear_s=0.0)
         self._refused_since_ns: int | None = None
@@ -136,6 +141,8 @@ class PulsedWatch:
             return self.unjudged(shown, shown.fault, shown.reason)
         image = mean_image(shown.lit)
         found = find_spots(image, None if shown.dark is None else shown.dark.image)
+        if not isinstance(found, NotFound) and (moving := self._moving(shown, found[0])):
+            return replace(self.unjudged(shown, PulseFault.MOVING, moving), image=image)
         judged = self._watch.judge(SpotSeen(shown.pulse.stamp_ns, shown.pulse.base_T_ee, found))
         if shown.dark is None and judged.fault in (SpotFault.NO_SPOT, SpotFault.OUTLIER):
             judged = replace(judged, reason=judged.reason + _NO_BACKGROUND)
@@ -145,6 +152,16 @@ class PulsedWatch:
         elif judged.used:
             self.displacement = None
         return Outcome(self._record(shown, judged, 0 if isinstance(found, NotFound) else len(found)), image)
+
+    def _moving(self, shown: Shown, brightest: Spot) -> str:
+        """In one line, if the hand didn't stand still: the spot is then off by about its way between the halves."""
+        way = way_px(shown.lit, shown.dark, brightest)
+        if way is None or not np.linalg.norm(way) > 2.0 * _STILL * self._sigma_px:
+            return ""
+        return (
+            f"the spot moves by {float(np.linalg.norm(way)):.1f} px during the pulse; the laser on only while the hand "
+            "stands still"
+        )
 
     def unjudged(self, shown: Shown, fault: PulseFault, reason: str) -> Outcome:
         """A pulse of which nothing can be told."""

@@ -43,6 +43,7 @@ class PulseFault(OpenEnum):
     OVERLAP = "overlap"
     OUT_OF_ORDER = "out_of_order"
     IMAGE = "image"
+    MOVING = "moving"
     NO_SPOT = "no_spot"
     OUTLIER = "outlier"
     NOT_FORESEEN = "not_foreseen"
