@@ -193,12 +193,16 @@ def test_a_knock_is_heard_by_whoever_listens(daemon: Daemon, folder: Path, capfd
     found = daemon.feed(folder, rubbish=len(NOT_PULSES))
     assert [spot.state for spot in found[2:MOVED_FROM]] == [State.TRACKING] * (MOVED_FROM - 2)
     # A feeder that begins late is an alert of the source, before any pulse.
-    wait_until(lambda: any(alert.kind is not AlertKind.SOURCE for alert in daemon.alerts), "an alert")
-    first = next(alert for alert in daemon.alerts if alert.kind is not AlertKind.SOURCE)
+
+    def of_pulses() -> list[AlertRecord]:
+        return [alert for alert in daemon.alerts if alert.kind is not AlertKind.SOURCE]
+
+    wait_until(of_pulses, "an alert")
+    first = of_pulses()[0]
     assert first.kind in (AlertKind.DRIFT, AlertKind.STEP) and first.event is AlertEvent.RAISED
     assert (first.robot, first.camera, first.revision) == ("cell", "second", 0)
     assert first.reference_id.startswith("laser-") and first.stamp_ns >= found[MOVED_FROM].stamp_ns
-    assert all(alert.stamp_ns > found[MOVED_FROM - 1].until_ns for alert in daemon.alerts)
+    assert all(alert.stamp_ns > found[MOVED_FROM - 1].until_ns for alert in of_pulses())
 
     def state() -> object:
         (status,) = daemon.fleet.monitors()
