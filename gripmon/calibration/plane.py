@@ -147,6 +147,10 @@ def calibrate_plane(
             f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, "
             "and the target as it is"
         )
+    if sighting.disc_radius_m == 0.0 and bundle.scale < 1.0:
+        # Errors that a board's corners share go into the pose, not into its residuals: these don't make it surer than
+        # the corners' own uncertainties do.
+        plate_covariance = plate_covariance / bundle.scale**2
     made = make_camera(camera.lens)
     given = _Given(made, cam_T_plate, corners.uv_px)
     each_px2 = corners.each_px2

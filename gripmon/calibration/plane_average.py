@@ -17,6 +17,8 @@ from gripmon.records import Array
 
 BESIDE_STEPS = 2.0
 """Steps of the pattern beyond the points that were seen from which a corner is said to be off the plate."""
+VAGUE_M = 1.5e-5
+"""Standard deviation of the TCP beyond which one image of an inferred gripper is said to tell little."""
 OTHER_WAY_RAD = np.pi / 2.0
 """Nobody's rough calibration is off by as much."""
 _ROUNDS = 3
@@ -159,6 +161,13 @@ def doubts(image: Coincidence, inferred: bool) -> list[str]:
         )
     if image.apart_p is not None and image.apart_p < DOUBTED:
         out.append(_apart_text(image))
+    own_mm = 1e3 * float(np.sqrt(np.linalg.eigvalsh(image.own[:3] @ image.own[:3].T)[-1]))
+    if inferred and own_mm > 1e3 * VAGUE_M:
+        out.append(
+            f"the inferred corners leave the TCP uncertain by {own_mm:.3f} mm (standard deviation): where the fingers' "
+            "edges hardly stand out from the plate's print, they are seen along a part only; a plate of discs, light "
+            "fingers before dark print or the reverse, or more images"
+        )
     beside = [n for n, off in zip(names, _beside(image.sighting, image.plate_xy_m), strict=True) if off]
     if beside:
         out.append(f"off the part of the plate that is seen: {', '.join(beside)}; the gripper amid the pattern")

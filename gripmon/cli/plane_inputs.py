@@ -73,7 +73,7 @@ def read(arguments: argparse.Namespace) -> Inputs:
     config = None if arguments.config is None else common.load(arguments.config, check_source=False, with_taught=False)
     target = files.target_of(arguments.target)
     camera = _camera(arguments, config)
-    method, note = _method(arguments, config, camera)
+    method, note = _method(arguments, config, camera, target)
     paths = files.image_paths(arguments.images)
     images = files.read_images(paths)
     for path, image in zip(paths, images, strict=True):
@@ -114,11 +114,11 @@ def _camera(arguments: argparse.Namespace, config: Config | None) -> GivenCamera
 
 
 def _method(
-    arguments: argparse.Namespace, config: Config | None, camera: GivenCamera
+    arguments: argparse.Namespace, config: Config | None, camera: GivenCamera, target: Target
 ) -> tuple[KnownGripper | UnknownGripper, str | None]:
     """How to calibrate, and what is to be said of the jaw opening."""
     if arguments.infer:
-        return UnknownGripper(camera), None
+        return UnknownGripper(camera, target), None
     gripper = _gripper(arguments, config)
     opening_m: float | None = arguments.jaw_opening
     if opening_m is not None and not gripper.has_jaw:

@@ -19,11 +19,21 @@ _LEAST_PX = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SeenEdge:
-    """A line with the ``points`` (k,) it was chosen from and their edges' ``width_px`` (k,)."""
+    """A line with the ``points`` (k,) it was chosen from, their edges' ``width_px`` (k,), and what they know of the
+    line (k,), on average 1; None: all the same.
+    """
 
     line: Line
     points: EdgePoints
     width_px: Array
+    worth: Array | None = None
+
+    def design(self) -> tuple[Array, Array]:
+        """Rows (m, 2) and values (m,) of the weighted least squares whose solution is the line."""
+        inlier = self.line.inlier
+        way = self.points.way[inlier]
+        root = np.ones(len(way)) if self.worth is None else np.sqrt(self.worth[inlier])
+        return np.column_stack([1.0 - way, way]) * root[:, None], self.points.offset_px[inlier] * root
 
 
 def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
@@ -46,10 +56,9 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     floor_px = ConsensusSettings().edge_floor_px
     out = []
     for edge, own, count in zip(seen, squares, freedom, strict=True):
-        way, inlier = edge.points.way[edge.line.inlier], edge.line.inlier
-        design = np.column_stack([1.0 - way, way])
+        design = edge.design()[0]
         variance_px2 = max(usual_px2, own / max(count, 1.0), _LEAST_PX**2)
-        shared_px = floor_px * max(float(np.median(edge.width_px[inlier])), 1.0)
+        shared_px = floor_px * max(float(np.median(edge.width_px[edge.line.inlier])), 1.0)
         out.append(variance_px2 * np.linalg.inv(design.T @ design) + shared_px**2)
     return out
 
@@ -57,9 +66,8 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
 def _stretches(edge: SeenEdge) -> tuple[float, float]:
     """Sum of squares of the stretches' residuals, and what it would be for independent points of unit variance."""
     inlier = edge.line.inlier
-    way = edge.points.way[inlier]
-    design = np.column_stack([1.0 - way, way])
-    residual = edge.points.offset_px[inlier] - design @ edge.line.ends_px
+    design, values = edge.design()
+    residual = values - design @ edge.line.ends_px
     member = edge.points.profile[inlier] // STRETCH
     stretch = (member[:, None] == np.unique(member)).astype(np.float64)
     stretch /= np.sqrt(stretch.sum(axis=0))

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
-from scipy.spatial import KDTree
 
 from gripmon.calibration.free_pose import FreePose
 from gripmon.calibration.plane import FingerCorners
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, stand
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera
 from gripmon.corners import FingertipMeter, MeasurementSettings, Patience
 from gripmon.gripper import Gripper
 from gripmon.onboarding.outlines import Outline
-from gripmon.onboarding.snapping import Printed, Snapped, snap
+from gripmon.onboarding.plate_print import PlatePrint
+from gripmon.onboarding.snapping import Snapped, snap
 from gripmon.records import Array, Image
 
 JAW_SIGMA_M = 2e-4
@@ -25,12 +24,10 @@ USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before a plate's pattern."""
 _PATIENCE = Patience(when_doubtful=True, when_lost=True)
 _ROUGH_PX = 3.0
-PRINTED_PX = 2.0
-"""So far from a line of the print a point may still be its own."""
 
 
 def measure_outlines(
-    camera: Camera, image: Image, outline: Outline, printed: Printed | None = None
+    camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
 ) -> tuple[FingerCorners, Snapped]:
     """Corners of fingertips that aren't known, from their rough outlines; ``printed``: see :func:`snap`.  Raises
     :class:`CalibrationError`.
@@ -39,24 +36,6 @@ def measure_outlines(
     corners = list(outline.corners)
     names = tuple(outline.names[k] for k in corners)
     return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped
-
-
-def printed_lines(camera: Camera, cam_T_plate: Array, sighting: Sighting) -> Printed | None:
-    """Where a chequerboard's lines are; None for discs, whose outlines nobody takes for a finger's."""
-    if sighting.disc_radius_m > 0.0:
-        return None
-    xy_m = sighting.plate_m[:, :2]
-    step_m = float(np.median(KDTree(xy_m).query(xy_m, k=2)[0][:, 1]))
-
-    def printed(uv_px: Array) -> NDArray[np.bool_]:
-        with np.errstate(invalid="ignore", divide="ignore"):
-            sight = np.column_stack([camera.undistort(uv_px), np.ones(len(uv_px))])
-            depth = (cam_T_plate[:3, 2] @ cam_T_plate[:3, 3]) / (sight @ cam_T_plate[:3, 2])
-            where = ((sight * depth[:, None] - cam_T_plate[:3, 3]) @ cam_T_plate[:3, :2] - xy_m[0]) / step_m
-            off_m = step_m * np.abs(where - np.rint(where)).min(axis=1)
-            return np.asarray(off_m < PRINTED_PX * depth / camera.fx_px)
-
-    return printed
 
 
 def rough_pose(

@@ -11,6 +11,7 @@ from gripmon.calibration.intrinsics import plate_pose
 from gripmon.calibration.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
 from gripmon.calibration.plane_average import PlaneCalibration, against
 from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibration.targets import Target
 from gripmon.camera import make_camera
 from gripmon.gripper import Gripper, GripperModel
 from gripmon.onboarding.measuring import (
@@ -18,10 +19,10 @@ from gripmon.onboarding.measuring import (
     contact_height_m,
     measure_known,
     measure_outlines,
-    printed_lines,
     rough_pose,
 )
 from gripmon.onboarding.outlines import Outline, inferred_model, outlines_of, points_in_gripper
+from gripmon.onboarding.plate_print import plate_print
 from gripmon.provenance import Provenance
 from gripmon.records import Array, Image
 
@@ -79,15 +80,18 @@ class KnownGripper:
 
 @dataclass(frozen=True, slots=True)
 class UnknownGripper:
-    """Calibrates with rough outlines alone; the gripper comes out, too."""
+    """Calibrates with rough outlines alone; the gripper comes out, too.  ``target``: the plate, whose print is told
+    from the fingers then.
+    """
 
     camera: GivenCamera
+    target: Target | None = None
 
     def look(self, image: Image, sighting: Sighting, rough: Rough) -> Look:
         """Raises :class:`CalibrationError`."""
         outline = outlines_of(rough)
         camera = make_camera(self.camera.lens)
-        printed = printed_lines(camera, plate_pose(self.camera.lens, sighting)[0], sighting)
+        printed = plate_print(camera, plate_pose(self.camera.lens, sighting)[0], sighting, self.target, image)
         corners, snapped = measure_outlines(camera, image, outline, printed)
         found = calibrate_plane(self.camera, sighting, corners, None)
         return Look(found, {}, outline, snapped.points)

@@ -6,11 +6,9 @@ its own, as the rough ends may be off by several pixels each in any direction.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera
@@ -24,8 +22,10 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
+from gripmon.onboarding.before_print import look_at, moves, rough_line, sharpness
 from gripmon.onboarding.edge_errors import SeenEdge, line_covariances
-from gripmon.onboarding.outlines import Outline
+from gripmon.onboarding.outlines import INNERMOST, Outline
+from gripmon.onboarding.plate_print import PlatePrint
 from gripmon.records import Array, Image
 from gripmon.teaching.lines import EdgePoints, settle_line
 
@@ -39,15 +39,12 @@ SEEN_SHARE = 0.4
 """Part of its profiles that must show an edge."""
 SMALLEST_ANGLE_RAD = 0.06
 SHORTEST_PX = 12.0
-PRINTED_WORTH = 0.2
-"""Of a point of an edge that may as well be the plate's print."""
+TELLING = 0.1
+"""Of the most that a profile knows of its edge before a print: what knows less isn't counted."""
 _GRID_PX = 0.5
 _START_PX = 1.0
 _ROUNDS = 3
-
-
-Printed = Callable[[Array], NDArray[np.bool_]]
-"""Which of some pixels (n, 2) lie on a line of the plate's pattern."""
+_MOVES = 6
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,20 +70,27 @@ class _Base:
     way: Array
 
 
-def snap(camera: Camera, image: Image, outline: Outline, printed: Printed | None = None) -> Snapped:
-    """The outline on the edges that the image shows; where ``printed`` says that the plate has a line of its own, an
-    edge needs much more support.  Raises :class:`CalibrationError`, which names the corner or edge:
+def snap(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> Snapped:
+    """The outline on the edges that the image shows; before a known print, which has edges of its own, by
+    :mod:`~gripmon.onboarding.before_print`.  Raises :class:`CalibrationError`, which names the corner or edge:
     outside of the image, not seen, or no corner.
     """
     points = outline.points
     _check_inside(camera, outline)
+    before: list[SeenEdge] = []
     for turn in range(_ROUNDS):
         seen, bases = [], []
         for a, b in outline.edges:
             names = f"{outline.names[a]} to {outline.names[b]}"
             base, reach_px = _lay(camera, points[a], points[b], REACH_PX if turn == 0 else FINAL_REACH_PX, names)
-            seen.append(_line(camera, image, base, reach_px, names, printed, anywhere=turn == 0))
+            if printed is None:
+                seen.append(_line(camera, image, base, reach_px, names, anywhere=turn == 0))
+            else:
+                finger = _side(outline, a)
+                known_px = float(before[len(seen)].width_px[0]) if before else None
+                seen.append(_line_before(image, printed, base, reach_px, names, finger, known_px))
             bases.append(base)
+        before = seen
         found = _meet(camera, outline, points, bases, [edge.line.ends_px for edge in seen])
         moved_px = float(np.linalg.norm(found - points, axis=1).max())
         points = found
@@ -124,9 +128,7 @@ def _lay(camera: Camera, start: Array, end: Array, reach_px: float, names: str) 
     return _Base(uv_px, normal, np.linspace(0.0, 1.0, len(fraction))), reach_px
 
 
-def _line(
-    camera: Camera, image: Image, base: _Base, reach_px: float, names: str, printed: Printed | None, *, anywhere: bool
-) -> SeenEdge:
+def _line(camera: Camera, image: Image, base: _Base, reach_px: float, names: str, *, anywhere: bool) -> SeenEdge:
     offsets = profile_offsets_px(reach_px + 3.0)
     row = np.arange(-(ROWS // 2), ROWS // 2 + 1)[:, None, None]
     along = np.column_stack([base.normal[:, 1], -base.normal[:, 0]])
@@ -151,10 +153,6 @@ def _line(
         np.array([int(ok.sum())]),
     )
     worth = np.sqrt(np.abs(points.step))
-    if anywhere and printed is not None and len(sample):
-        worth *= np.where(
-            printed(base.uv_px[sample] + points.offset_px[:, None] * base.normal[sample]), PRINTED_WORTH, 1.0
-        )
     start = _start(points, worth, reach_px) if anywhere and len(sample) else np.zeros(2)
     line = settle_line(points, start) if len(sample) else None
     if line is None or line.seen < SEEN_SHARE:
@@ -164,6 +162,56 @@ def _line(
             f"{100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, an image in focus"
         )
     return SeenEdge(line, points, np.asarray(found.width_px[near]))
+
+
+def _side(outline: Outline, point: int) -> float:
+    """On which side of its edges the finger of a ``point`` lies: 1 to the right of who walks along them, or -1."""
+    inner = {name: outline.points[outline.names.index(name)] for name in INNERMOST}
+    own = outline.names[point].partition("_")[0]
+    other = "right" if own == "left" else "left"
+    near, far = inner[f"{own}_inner_near"], inner[f"{own}_inner_far"]
+    along, away = near - far, near + far - inner[f"{other}_inner_near"] - inner[f"{other}_inner_far"]
+    return 1.0 if along[0] * away[1] - along[1] * away[0] > 0.0 else -1.0
+
+
+def _line_before(
+    image: Image, printed: PlatePrint, base: _Base, reach_px: float, names: str, finger: float, known_px: float | None
+) -> SeenEdge:
+    """The edge of a finger on the side ``finger`` of the base before a known print: near it and with its blur, if that
+    is ``known_px``, or else anywhere within reach.
+    """
+    scene = look_at(image, printed, base.uv_px, base.normal, reach_px + 6.0, finger)
+    ends_px = rough_line(scene, base.way, reach_px) if known_px is None else np.zeros(2)
+    row = np.arange(len(base.way))
+    seen: SeenEdge | None = None
+    blur_px = 1.0 if known_px is None else known_px
+    for turn in range(_MOVES):
+        if known_px is None and turn < 2:
+            blur_px = sharpness(scene, base.way, ends_px)
+        wish = moves(scene, base.way, ends_px, blur_px)
+        telling = wish.worth > TELLING * np.quantile(wish.worth, 0.9)
+        worth = wish.worth[telling] / wish.worth[telling].mean()
+        points = EdgePoints(
+            base.way[telling], wish.offset_px[telling], worth, row[telling], np.zeros(int(telling.sum()), np.intp),
+            row[telling], np.array([int(telling.sum())]),
+        )  # fmt: skip
+        line = settle_line(points, ends_px, worth)
+        if line is None or np.abs(line.ends_px).max() > reach_px + 1.0:
+            seen = None
+            break
+        moved_px = float(np.abs(line.ends_px - ends_px).max())
+        ends_px = line.ends_px
+        seen = SeenEdge(line, points, np.full(len(worth), blur_px), worth)
+        if turn > 1 and moved_px < 0.01:
+            break
+    if seen is None or seen.line.seen < SEEN_SHARE:
+        share = 0.0 if seen is None else 100.0 * seen.line.seen
+        raise CalibrationError(
+            f"{names}: where it stands out from the plate's print, {share:.0f} % of it shows one straight edge within "
+            f"{reach_px:.0f} px; at least {100.0 * SEEN_SHARE:.0f} %: corners nearer to the real ones, the target as "
+            "it was described, fingers of another brightness than the print"
+        )
+    return seen
 
 
 def _start(points: EdgePoints, worth: Array, reach_px: float) -> Array:

@@ -80,29 +80,31 @@ def find_line(points: EdgePoints, expected_px: Array, reach_px: float) -> Line |
     return Line(line.ends_px, line.covariance_px2, line.inlier, line.rms_px, line.seen, rival_px)
 
 
-def settle_line(points: EdgePoints, start_px: Array) -> Line | None:
+def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None) -> Line | None:
     """Robust straight line (Tukey's biweight, its width from the points' own scatter) from a start (2,); None if too
-    few points lie there.
+    few points lie there.  ``worth`` (k,): the points' information, on average 1; all the same if None.
     """
+    given = np.ones(len(points.way)) if worth is None else worth
+    root = np.sqrt(given)
     design = np.column_stack([1.0 - points.way, points.way])
     ends_px, width, scale = start_px, _START_PX, _FLOOR_PX
     for _ in range(_ROUNDS):
-        residual = points.offset_px - design @ ends_px
+        residual = root * (points.offset_px - design @ ends_px)
         weight = np.square(np.maximum(1.0 - np.square(residual / width), 0.0))
         near = np.abs(residual) < width
         if np.count_nonzero(near) < _FEWEST:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
         width = min(_TUKEY * scale, _START_PX)
-        weighted = design * weight[:, None]
-        normal = weighted.T @ design
+        weighted = design * (root * weight)[:, None]
+        normal = weighted.T @ (design * root[:, None])
         if not np.linalg.cond(normal) < 1e6:
             return None
         step = np.linalg.solve(normal, weighted.T @ residual)
         ends_px = ends_px + step
         if np.abs(step).max() < _SETTLED_PX:
             break
-    residual = points.offset_px - design @ ends_px
+    residual = root * (points.offset_px - design @ ends_px)
     inlier = np.abs(residual) < width
     if np.count_nonzero(inlier) < _FEWEST:
         return None
