@@ -141,30 +141,10 @@ def calibrate_plane(
     and all are contact points.  Raises :class:`CalibrationError`.
     """
     _check_count(corners, known)
-    cam_T_plate, plate_covariance, bundle = plate_pose(camera.lens, sighting)
-    if bundle.rms_px > LARGEST_RMS_SHARE * camera.lens.width_px:
-        raise CalibrationError(
-            f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, "
-            "and the target as it is"
-        )
-    if sighting.disc_radius_m == 0.0 and bundle.scale < 1.0:
-        # Errors that a board's corners share go into the pose, not into its residuals: these don't make it surer than
-        # the corners' own uncertainties do.
-        plate_covariance = plate_covariance / bundle.scale**2
+    cam_T_plate, plate_covariance, bundle = _plate(camera.lens, sighting)
     made = make_camera(camera.lens)
     given = _Given(made, cam_T_plate, corners.uv_px)
-    each_px2 = corners.each_px2
-
-    free = corners.free if known is not None else None
-    known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
-
-    def solve(given: _Given) -> Standing:
-        found = stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
-        if free is None:
-            return found
-        through = free.cam_T_grip if given.camera is made else free.through(given.camera)
-        return replace(found, apart=off_plate(through, given.cam_T_plate, contact_m))
-
+    solve = _solver(made, corners, known)
     found = solve(given)
     # Residuals beyond what their covariances say are the print's: the same plate brings them into every image.
     print_share = 1.0 - 1.0 / max(bundle.scale, 1.0) ** 2
@@ -179,8 +159,8 @@ def calibrate_plane(
         raise CalibrationError(_no_rectangle(corners.names, found.residuals_m, p_value))
     enlarged = float(np.sqrt(size / freedom)) if p_value < DOUBTED else 1.0
     motion[:, len(own) - 2 * len(corners.names) : len(own)] *= enlarged
-    if free is not None:
-        apart = np.concatenate([apart, free.own_slopes(cam_T_plate, contact_m)], axis=1)
+    if known is not None and corners.free is not None:
+        apart = np.concatenate([apart, corners.free.own_slopes(cam_T_plate, known.contact_m)], axis=1)
     apart_covariance = apart @ apart.T
     points = found.corners_m @ found.cam_T_grip[:3, :3].T + found.cam_T_grip[:3, 3]
     known_apart = found.apart is not None
@@ -204,6 +184,36 @@ def calibrate_plane(
         plate=bundle,
         plate_xy_m=((points - cam_T_plate[:3, 3]) @ cam_T_plate[:3, :3])[:, :2],
     )
+
+
+def _plate(lens: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
+    """``cam_T_plate``, its covariance (6, 6) and how it was found.  Raises :class:`CalibrationError`."""
+    cam_T_plate, covariance, bundle = plate_pose(lens, sighting)
+    if bundle.rms_px > LARGEST_RMS_SHARE * lens.width_px:
+        raise CalibrationError(
+            f"the plate doesn't fit the camera: residuals of {bundle.rms_px:.3g} px; the camera that took the image, "
+            "and the target as it is"
+        )
+    if sighting.disc_radius_m == 0.0 and bundle.scale < 1.0:
+        # Errors that a board's corners share go into the pose, not into its residuals: these don't make it surer than
+        # the corners' own uncertainties do.
+        covariance = covariance / bundle.scale**2
+    return cam_T_plate, covariance, bundle
+
+
+def _solver(made: Camera, corners: FingerCorners, known: KnownCorners | None) -> Callable[[_Given], Standing]:
+    """The gripper's place from what a solution rests on; ``made`` is the camera as calibrated."""
+    each_px2, free = corners.each_px2, corners.free if known is not None else None
+    known_m, contact_m = (None, 0.0) if known is None else (known.corners_m, known.contact_m)
+
+    def solve(given: _Given) -> Standing:
+        found = stand(given.camera, given.cam_T_plate, given.uv_px, each_px2, known_m, contact_m)
+        if free is None:
+            return found
+        through = free.cam_T_grip if given.camera is made else free.through(given.camera)
+        return replace(found, apart=off_plate(through, given.cam_T_plate, contact_m))
+
+    return solve
 
 
 def _misfit(found: Standing) -> float:
