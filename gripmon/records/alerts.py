@@ -89,7 +89,10 @@ class Alert(msgspec.Struct, frozen=True):
     causes: Annotated[tuple[CauseWeight, ...], Meta(description="all that were weighed, the most probable first")] = ()
     tcp_shift_m: Annotated[
         tuple[float, float, float] | None,
-        Meta(description="of the TCP against the reference along the camera's x, y, z, m; null: not about a motion"),
+        Meta(
+            description="of the TCP against the reference along the camera's x, y, z, m; of a second camera: by how "
+            "much it now puts a spot elsewhere; null: not about a motion"
+        ),
     ] = None
     rotation_rad: Annotated[float | None, Meta(description="turn against the reference, rad; null likewise")] = None
     rate_m_per_min: Annotated[
