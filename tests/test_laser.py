@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laser_scenes import paper_setup, sampled
+from laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibration.laser import closed_form, common_plane
@@ -24,34 +24,9 @@ from gripmon.calibration.laser.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import invert, make_transform, perturb
 
-STEP = 1e-6
-
-
-def scene(seed=1, **options):
-    rng = np.random.default_rng(seed)
-    return sampled(paper_setup(rng), rng, **options)
-
 
 def ideal(data):
     return data.camera.undistort(data.uv_px)
-
-
-def numeric(function, count, step=STEP):
-    """Central differences of a function of a small change (count,), stacked behind."""
-    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(count)]
-    return np.stack(columns, axis=-1)
-
-
-def sides(setup):
-    """A laser line's moment and direction, which don't depend on which of its points is given."""
-    return np.concatenate([setup.direction_ee, np.cross(setup.point_ee_m, setup.direction_ee)])
-
-
-def assert_same(found, truth, tolerance=1e-9):
-    assert np.abs(found.cam_T_base - truth.cam_T_base).max() < tolerance
-    assert np.abs(found.normal_cam - truth.normal_cam).max() < tolerance
-    assert abs(found.distance_m - truth.distance_m) < tolerance
-    assert np.abs(sides(found) - sides(truth)).max() < tolerance
 
 
 # ---- the three predictions
@@ -225,11 +200,6 @@ def test_the_common_planes_start_is_exact_and_its_motions_give_rotation_beams_an
     for beam, orientation in zip(turn.beams_cam, orientations, strict=True):
         u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
         assert np.abs(np.cross(beam, u)).max() < 1e-9
-
-
-def translation_error(setup, truth):
-    found, right = invert(setup.cam_T_base)[:3, 3], invert(truth.cam_T_base)[:3, 3]
-    return np.linalg.norm(found - right) / np.linalg.norm(right)
 
 
 def test_with_noise_the_common_plane_is_far_better_than_the_printed_closed_form():

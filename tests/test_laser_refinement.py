@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laser_scenes import PAPER_LENS, paper_setup, sampled
+from laser_scenes import PAPER_LENS, assert_same, numeric, scene
 from scipy.stats import f as fisher_f
 
 from gripmon.calibration.laser import common_plane, refinement
@@ -18,37 +18,7 @@ from gripmon.calibration.laser.setup import (
 from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import invert, perturb, perturbation_between
-
-STEP = 1e-6
-
-
-def scene(seed=1, **options):
-    rng = np.random.default_rng(seed)
-    return sampled(paper_setup(rng), rng, **options)
-
-
-def numeric(function, count, step=STEP):
-    """Central differences of a function of a small change (count,), stacked behind."""
-    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(count)]
-    return np.stack(columns, axis=-1)
-
-
-def sides(setup):
-    """A laser line's moment and direction, which don't depend on which of its points is given."""
-    return np.concatenate([setup.direction_ee, np.cross(setup.point_ee_m, setup.direction_ee)])
-
-
-def assert_same(found, truth, tolerance=1e-9):
-    assert np.abs(found.cam_T_base - truth.cam_T_base).max() < tolerance
-    assert np.abs(found.normal_cam - truth.normal_cam).max() < tolerance
-    assert abs(found.distance_m - truth.distance_m) < tolerance
-    assert np.abs(sides(found) - sides(truth)).max() < tolerance
-
-
-def translation_error(setup, truth):
-    found, right = invert(setup.cam_T_base)[:3, 3], invert(truth.cam_T_base)[:3, 3]
-    return np.linalg.norm(found - right) / np.linalg.norm(right)
+from gripmon.geometry import perturb, perturbation_between
 
 
 def noisy(seed, sigma_px=0.5, **options):
