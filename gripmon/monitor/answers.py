@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
 from gripmon.geometry import invert, rotation_angle, to_record
+from gripmon.integrity import bounds
 from gripmon.policy import Evidence
 from gripmon.records import (
     Alert,
@@ -18,6 +19,7 @@ from gripmon.records import (
     CornerRecord,
     Drift,
     Explanation,
+    Protection,
     ReferenceRecord,
     Refusal,
     Severity,
@@ -43,6 +45,13 @@ def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     motion = cam_T_grip @ invert(ref_cam_T_grip)
     x, y, z = (cam_T_grip[:3, 3] - ref_cam_T_grip[:3, 3]).tolist()
     return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
+
+
+def protection_of(covariance: Array, risk: float) -> Protection:
+    """Bounds where nothing but the covariance (6, 6) is known of the error."""
+    both = np.stack([covariance[:3, :3], covariance[3:, 3:]])
+    position_m, rotation_rad = bounds(both, np.full(2, risk)).tolist()
+    return Protection(position_m, rotation_rad, risk, "nothing is wrong")
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:

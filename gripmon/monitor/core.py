@@ -25,6 +25,7 @@ from gripmon.monitor.answers import (
     frozen,
     gripper_astray,
     of_stream,
+    protection_of,
     smoothed_record,
     unmeasured_corners,
 )
@@ -52,6 +53,7 @@ from gripmon.records import (
     MonitorNotes,
     MonitorState,
     Origin,
+    Protection,
     ReferenceRecord,
     Refusal,
     State,
@@ -61,6 +63,8 @@ from gripmon.records import (
 from gripmon.references import CommandRefused
 from gripmon.smoothing import PoseAverage
 from gripmon.stream import StreamFault, StreamWatch
+
+RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
 
 DOUBTED_FRAMES = 5
 """Frames in a row in which the gripper contradicts its model, after which they tell of the camera all the same."""
@@ -97,6 +101,7 @@ class Monitor:
         self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
+        self._protection: Protection | None = None
         self._now_s = 0.0  # time that has passed since the first frame
         self._measured_s: float | None = None
         self._stamp_s: float | None = None
@@ -187,7 +192,7 @@ class Monitor:
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
             if evidence.motion.frames == 0:
-                judgement = replace(judgement, verdict=Verdict.SUSPECT)  # too few frames to say whether it fits
+                judgement = replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
             else:
                 self._restarted = False
                 alerts = (after_restart(self.reference, evidence), *alerts)
@@ -277,7 +282,9 @@ class Monitor:
         odd = self._watches.add(blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
-        return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful)
+        protection = protection_of(self._covariance, self._settings.policy.integrity_risk)
+        self._protection = protection
+        return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful, protection)
 
     def _since_start(self, shift: Array) -> Array | None:
         """The shift (6,) less the reference's error; None while that isn't known yet."""
@@ -360,6 +367,7 @@ class Monitor:
             covariance=flat(self._covariance + growth),
             smoothed=smoothed_record(self._average, self._tracker.floor + growth),
             drift=self._drift(),
+            protection=protection_of(self._covariance + growth, self._settings.policy.integrity_risk),
         )
 
     def _record(
@@ -388,7 +396,9 @@ class Monitor:
             jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
             corners=corner_records(measurement, self._gripper.corner_ids, taken),
             alerts=(*self._noted(), *alerts),
+            reason=judgement.reason,
             name=frame.name,
+            protection=self._protection,
         )
 
     def _noted(self) -> list[Alert]:

@@ -17,7 +17,18 @@ import numpy as np
 from gripmon.policy.alerts import AlertBook
 from gripmon.policy.limits import time_left_s
 from gripmon.policy.settings import PolicySettings
-from gripmon.records import Alert, AlertKind, Array, Cause, Explanation, Motion, Severity, State, Verdict
+from gripmon.records import (
+    Alert,
+    AlertKind,
+    Array,
+    Cause,
+    Explanation,
+    Motion,
+    Protection,
+    Severity,
+    State,
+    Verdict,
+)
 
 NOT_THE_CAMERA = (Cause.FINGER_BENT, Cause.JAW_OPENING, Cause.LENS)
 """Causes of a drift that the transform doesn't describe: it follows a finger, the jaw or the lens.  The camera may be
@@ -51,7 +62,7 @@ class Evidence:
     motion ``d_m`` and ``delta_rad`` of equation (14), what the frames so far make of the ``motion``, whether the pose
     jumped against the previous frame, what would explain it, and whether the gripper contradicts its model (a finger or
     the jaw is not where it should be), and whether the stream of frames is at fault (so that stamps or the camera's
-    calibration may not hold).
+    calibration may not hold).  ``protection``: bounds on the transform's error; None where there are none.
     """
 
     shift: Array
@@ -63,6 +74,7 @@ class Evidence:
     explanation: Explanation = NO_EXPLANATION
     gripper_astray: bool = False
     stream_at_fault: bool = False
+    protection: Protection | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +83,8 @@ class Judgement:
     verdict: Verdict
     alerts: tuple[Alert, ...]
     recalibrate: bool = False
+    reason: str | None = None
+    """Why the verdict isn't ``valid``; None when it is."""
 
 
 class Policy:
@@ -106,10 +120,21 @@ class Policy:
         else:
             state = State.TRACKING
         self.state = state
-        sure = float(evidence.sigma[:3].max()) <= settings.suspect_sigma_m
-        sure = sure and not (evidence.gripper_astray or unreliable or evidence.stream_at_fault)
-        verdict = Verdict.VALID if confirmed and sure else Verdict.SUSPECT
-        return Judgement(state, verdict, self._alerts_of(evidence, now_s, stamp_ns), recalibrate)
+        reason = self._doubt(evidence, confirmed)
+        verdict = Verdict.VALID if reason is None else Verdict.SUSPECT
+        return Judgement(state, verdict, self._alerts_of(evidence, now_s, stamp_ns), recalibrate, reason)
+
+    def _doubt(self, evidence: Evidence, confirmed: bool) -> str | None:
+        """Why a measured transform isn't valid; None where it is."""
+        if not confirmed:
+            return "not yet confirmed by a second frame"
+        if evidence.stream_at_fault:
+            return "the stream of frames is at fault"
+        if evidence.explanation.probable.cause in NO_REFERENCE:
+            return evidence.explanation.text or str(evidence.explanation.probable.cause)
+        if evidence.gripper_astray:
+            return "the gripper contradicts its model: a finger or the jaw is not where it should be"
+        return past_alert_limit(evidence.protection, self._settings)
 
     def unmeasured(
         self,
@@ -300,6 +325,21 @@ class Policy:
             rate_m_per_min=rate,
             time_left_s=left_s,
         )
+
+
+def past_alert_limit(protection: Protection | None, settings: PolicySettings) -> str | None:
+    """Which bound is above its alert limit, in words; None where neither is."""
+    if protection is None:
+        return "no bound on the error is known"
+    hypothesis = f" ({protection.hypothesis})" if protection.hypothesis else ""
+    if protection.position_m > settings.alert_limit_m:
+        limit_mm = 1e3 * settings.alert_limit_m
+        return f"the TCP may be {1e3 * protection.position_m:.2g} mm off, alert limit {limit_mm:g} mm{hypothesis}"
+    if protection.rotation_rad > settings.alert_limit_rad:
+        limit = math.degrees(settings.alert_limit_rad)
+        may = math.degrees(protection.rotation_rad)
+        return f"the rotation may be {may:.2g} degrees off, alert limit {limit:.2g} degrees{hypothesis}"
+    return None
 
 
 def _severity(past_warning: float, past_limit: float, before: Alert | None) -> Severity:

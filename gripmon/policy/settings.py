@@ -68,6 +68,40 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     image_alert_after_s: Annotated[
         float, Meta(ge=0.0, le=3600.0, description="refused frames for so long give an alert (s)")
     ] = 1.0
+    alert_limit_m: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=1.0,
+            description="error of the TCP's position that the task bears: a transform is valid while its protection "
+            "level is not above this (m)",
+        ),
+    ] = 5e-4
+    alert_limit_rad: Annotated[
+        float, Meta(gt=0.0, le=3.0, description="error of the rotation that the task bears, likewise (rad)")
+    ] = 0.02
+    integrity_risk: Annotated[
+        float,
+        Meta(
+            ge=1e-9,
+            le=0.1,
+            description="probability a frame that the error exceeds the protection level (no unit)",
+        ),
+    ] = 1e-5
+    mount_jumps_per_month: Annotated[
+        float,
+        Meta(
+            ge=1e-3,
+            le=1e5,
+            description="how often the camera's mount is knocked or slips (1/month)",
+        ),
+    ] = 1.0
     suspect_sigma_m: Annotated[
-        float, Meta(gt=0.0, le=1.0, description="a transform whose TCP is less certain than this is suspect (m)")
-    ] = 1e-4
+        float | None,
+        Meta(
+            gt=0.0,
+            le=1.0,
+            description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
+            "transform is suspect (m)",
+        ),
+    ] = None

@@ -44,7 +44,7 @@ from gripmon.records.notes import Limits, MonitorNotes
 from gripmon.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
 from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
 from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
-from gripmon.records.values import Array, Drift, Image, Smoothed, Transform, to_json
+from gripmon.records.values import Array, Drift, Image, Protection, Smoothed, Transform, to_json
 
 __all__ = [
     "MESSAGES",
@@ -85,6 +85,7 @@ __all__ = [
     "Motion",
     "OpenAlert",
     "Origin",
+    "Protection",
     "PulseFault",
     "RecordedCommand",
     "RecordedConfiguration",

@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from gripmon.records.alerts import Alert
 from gripmon.records.references import ReferenceRecord
-from gripmon.records.values import Array, Covariance, Drift, Image, OpenEnum, Smoothed, Transform
+from gripmon.records.values import Array, Covariance, Drift, Image, OpenEnum, Protection, Smoothed, Transform
 
 if TYPE_CHECKING:
     import numpy as np
@@ -132,8 +132,11 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     corners: Annotated[tuple[CornerRecord, ...], Meta(description="all of the gripper file, in its order")]
     alerts: Annotated[tuple[Alert, ...], Meta(description="what this frame raised, updated or cleared")]
     latency_ns: Annotated[int, Meta(description="from handed over to judged, ns")] = 0
-    reason: Annotated[str | None, Meta(description="why nothing was measured; null when all is well")] = None
+    reason: Annotated[str | None, Meta(description="why the verdict isn't valid; null when it is")] = None
     name: Annotated[str, Meta(description="file or stream that the frame came from")] = ""
+    protection: Annotated[
+        Protection | None, Meta(description="bounds on the error of cam_T_grip, null with it; a held one's grow")
+    ] = None
 
 
 @dataclass(frozen=True, slots=True)

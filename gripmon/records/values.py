@@ -71,6 +71,15 @@ class Smoothed(msgspec.Struct, frozen=True):
     covariance: Covariance
 
 
+class Protection(msgspec.Struct, frozen=True):
+    """Bounds on the error of a transform: it lies beyond either with at most the stated probability."""
+
+    position_m: Annotated[float, Meta(description="protection level: bound on the TCP's position error, m")]
+    rotation_rad: Annotated[float, Meta(description="bound on the angle of the rotation error, rad")]
+    risk: Annotated[float, Meta(description="integrity risk: probability a frame that the error exceeds a bound")]
+    hypothesis: Annotated[str, Meta(description="what could be wrong that makes the position's bound as large")] = ""
+
+
 _encoder = msgspec.json.Encoder()
 
 
