@@ -29,7 +29,8 @@ _CORRELATED = 0.8  # of the first images, until it is
 @dataclass(frozen=True, slots=True)
 class Fused:
     """``xi`` (6,) what has to be added to the pose's perturbation, ``covariance`` (6, 6) of the pose then, the opening
-    with its standard deviation, and by how many standard deviations the image contradicted what was known.
+    with its standard deviation, by how many standard deviations the image contradicted what was known, and what was
+    known before it: an opening with its standard deviation.
     """
 
     xi: Array
@@ -37,6 +38,8 @@ class Fused:
     jaw_opening_m: float
     sigma_m: float
     surprise: float
+    known_m: float
+    known_sigma_m: float
 
 
 class JawKnowledge:
@@ -53,6 +56,7 @@ class JawKnowledge:
         self._reported_m: float | None = None
         self._correlation = _CORRELATED
         self._seen: tuple[float, float] | None = None
+        self._pending: tuple[float, float] | None = None
         self._forget()
 
     @property
@@ -61,15 +65,25 @@ class JawKnowledge:
         return math.hypot(self._sigma_m, self._offset_sigma_m)
 
     def fuse(self, reported_m: float, jaw_opening_m: float, covariance: Array) -> Fused:
-        """Replace the report's prior in an estimate by what is known about its error, and learn from it.
+        """Replace the report's prior in an estimate by what is known about its error; :meth:`learn` from it if the
+        estimate is believed.
 
         ``covariance`` (7, 7) of pose and opening, from a fit with a prior of :attr:`report_sigma_m` about the report.
         """
+        self._pending = None
         prior = self.report_sigma_m**2
         variance = float(covariance[6, 6])
         image = 0.0 if self.exact else 1.0 / variance - 1.0 / prior
         if image * prior <= _NOTHING:
-            return Fused(np.zeros(6), covariance[:6, :6], jaw_opening_m, math.sqrt(variance), 0.0)
+            return Fused(
+                np.zeros(6),
+                covariance[:6, :6],
+                jaw_opening_m,
+                math.sqrt(variance),
+                0.0,
+                reported_m,
+                self.report_sigma_m,
+            )
         seen_variance = 1.0 / image
         error_m = seen_variance * (jaw_opening_m - reported_m) / variance  # of the report, by this image alone
         self._travel(reported_m)
@@ -81,9 +95,17 @@ class JawKnowledge:
         opening_m = reported_m + fused * (image * error_m + known_m / known)
         gain = covariance[:6, 6] / variance
         conditioned = covariance[:6, :6] + np.outer(gain, gain) * (fused - variance)
-        self._learn(error_m, seen_variance)
+        self._pending = error_m, seen_variance
         xi = gain * (opening_m - jaw_opening_m)
-        return Fused(xi, 0.5 * (conditioned + conditioned.T), opening_m, math.sqrt(fused), surprise)
+        return Fused(
+            xi,
+            0.5 * (conditioned + conditioned.T),
+            opening_m,
+            math.sqrt(fused),
+            surprise,
+            reported_m + known_m,
+            math.sqrt(known),
+        )
 
     @property
     def _known_variance(self) -> float:
@@ -102,10 +124,16 @@ class JawKnowledge:
             self._covariance[1, 1] += (1.0 - kept**2) * self._sigma_m**2
         self._reported_m = reported_m
 
-    def _learn(self, error_m: float, variance: float) -> None:
-        """Kalman update.  Images err alike while the background stands still: how much less than independent ones
-        their errors differ from one to the next tells how many of them count as one.
+    def learn(self) -> None:
+        """Believe what the newest estimate showed of the report's error: a Kalman update.
+
+        Images err alike while the background stands still: how much less than independent ones their errors differ from
+        one to the next tells how many of them count as one.
         """
+        if self._pending is None:
+            return
+        error_m, variance = self._pending
+        self._pending = None
         if self._seen is not None:
             before_m, before = self._seen
             differing = (error_m - before_m) ** 2 / (variance + before)

@@ -38,6 +38,7 @@ def run(
     for true, reported in zip(true_m, reported_m, strict=True):
         error, opening_m, covariance = estimate(rng, true, reported)
         out.append(knowledge.fuse(reported, opening_m, covariance))
+        knowledge.learn()
         errors.append(error + out[-1].xi)
     return np.array(errors), out, np.array([f.jaw_opening_m for f in out]) - np.array(true_m)
 

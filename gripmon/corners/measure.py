@@ -10,18 +10,24 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gripmon.camera import Camera
 from gripmon.corners.consensus import (
     Consensus,
     agree,
     agree_from_grid,
     grid_of_starts,
 )
+from gripmon.corners.ends import FingerEnds, FingerEndsSeen
 from gripmon.corners.evidence import FingerMeter
 from gripmon.corners.look import unevenness
 from gripmon.corners.prediction import EdgeLayout, Prediction
 from gripmon.corners.search import search_poses
-from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement
+from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement, MeasurementSettings
+from gripmon.corners.taught import TaughtEdges
+from gripmon.geometry import perturbation_between
+from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
 
 FOUND_EDGES = 0.85
@@ -70,6 +76,22 @@ class _Place:
 class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
 
+    def __init__(
+        self,
+        camera: Camera,
+        gripper: Gripper,
+        settings: MeasurementSettings,
+        jaw_sigma_m: float,
+        taught: TaughtEdges | None = None,
+    ):
+        super().__init__(camera, gripper, settings, jaw_sigma_m, taught)
+        self._ends = FingerEnds(gripper, settings.edges)
+
+    @property
+    def along(self) -> NDArray[np.bool_]:
+        """(e,) which edges run along the fingers."""
+        return self._ends.along
+
     def measure(
         self,
         image: Image,
@@ -78,12 +100,14 @@ class FingertipMeter(FingerMeter):
         usual_share: float,
         patience: Patience,
         jaw_reported: bool = True,
+        rivals: tuple[Array, ...] = (),
     ) -> Measurement:
         """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to
         start from).
 
-        ``usual_share`` of the profiles agree when all is well.  With clearly less, and where ``patience`` allows, the
-        gripper is looked for elsewhere, and the place with the largest share is returned.
+        ``usual_share`` of the profiles agree when all is well.  With clearly less the ``rivals`` (4, 4) are looked at:
+        poses at which the gripper was.  If it is not there either, and where ``patience`` allows, it is looked for
+        elsewhere: another place than one that may be true must show the fingers' ends.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         # Encoders report a little beyond the end at which a jaw stands.
@@ -95,6 +119,8 @@ class FingertipMeter(FingerMeter):
             best = self._from_openings(image, expected, satisfied, best)
         if best.consensus.share < satisfied:
             best = self._at_other_zooms(image, expected, best)
+        if best.consensus.share < satisfied:
+            best = self._at_rivals(image, expected, rivals, best)
         if best.consensus.share >= self._settings.consensus.trusted_share:
             self._zoom_to(self._fitting_zoom(best))
         if best.consensus.share >= satisfied:
@@ -105,6 +131,14 @@ class FingertipMeter(FingerMeter):
             return best
         best = self._from_elsewhere(image, expected, best, usual_share)
         best.looked_far = True
+        return best
+
+    def _at_rivals(self, image: Image, expected: Expected, rivals: tuple[Array, ...], best: Measurement) -> Measurement:
+        """The best of the expected place and of others at which the gripper was."""
+        for rival in rivals:
+            if best.prediction.moved_px(perturbation_between(best.cam_T_grip, rival)) > self._settings.relinearise_px:
+                other = self._settle(image, replace(expected, cam_T_grip=rival))
+                best = max(best, other, key=lambda m: m.consensus.share)
         return best
 
     def _from_elsewhere(self, image: Image, expected: Expected, best: Measurement, usual_share: float) -> Measurement:
@@ -118,11 +152,17 @@ class FingertipMeter(FingerMeter):
             for place in _promising(again, PROMISING * max(beat, least)):
                 other = replace(self._settle(image, place.expected), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
+                if best.trusted and not self.ends(image, other).sure:
+                    continue
                 if other.consensus.share > beat and other.trusted >= best.trusted:
                     best, beat = other, other.consensus.share
             if best.trusted and best.consensus.share >= SATISFIED * usual_share:
                 break
         return best
+
+    def ends(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
+        """Whether the fingers' ends are seen as such where they were measured."""
+        return self._ends.seen(image, measurement)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
         """The best of the zooms: the image may have lost, or found, its focus."""

@@ -37,7 +37,7 @@ from gripmon.corners.profiles import (
 )
 from gripmon.corners.search import SearchSettings
 from gripmon.corners.taught import TaughtEdges
-from gripmon.corners.uncertainty import CONTRADICTION, Uncertainty, assess, without_one_edge
+from gripmon.corners.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
@@ -86,7 +86,9 @@ class Measurement:
     ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_surprise``: the seen jaw opening against the
     reported one (``jaw_reported_m``), in standard deviations of the latter.
 
-    ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
+    ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far as
+    it is known without the image; ``contradiction``: how much stretches of edges contradict each
+    other, about 1 where they don't.  ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
 
@@ -100,6 +102,10 @@ class Measurement:
     jaw_reported_m: float
     jaw_surprise: float
     effort: Effort
+    normal: NormalEquations
+    jaw_known_m: float
+    jaw_known_sigma_m: float
+    contradiction: float = 1.0
     trusted: bool = False
     looked_far: bool = False
 
@@ -196,6 +202,10 @@ class Settler:
             expected.jaw_reported_m,
             self._jaw_surprise(consensus.xi, prior),
             Effort.NARROW,
+            uncertainty.normal,
+            expected.jaw_reported_m,
+            float(self._prior[6] ** -0.5) if len(self._prior) == 7 else 0.0,
+            uncertainty.contradiction,
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:

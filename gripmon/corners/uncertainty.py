@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from gripmon.corners.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
@@ -19,17 +20,33 @@ _FEWEST_FREE = 3
 
 
 @dataclass(frozen=True, slots=True)
+class NormalEquations:
+    """What each edge adds to the fit's normal equations; v edges with agreed points, m unknowns.
+
+    ``edge`` (v,) of the gripper; ``pull`` (v, m): sum of weight times Jacobian times residual at the fit;
+    ``information`` (v, m, m): by how much that grows with a step; ``middle`` (v, m, m): its covariance.  A fit without
+    some of them is these sums without theirs.
+    """
+
+    edge: NDArray[np.intp]
+    pull: Array
+    information: Array
+    middle: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Uncertainty:
     """``covariance`` (m, m) of the fit's unknowns; ``line_weight`` (k,) what each candidate is worth for the line of
     its edge alone, 1/px², zero for those that don't belong; ``shared_px`` standard deviation that the points of a
     stretch share; ``contradiction``: the weighted squares of the stretches' means over what independent errors of the
-    assumed size would give, about 1.
+    assumed size would give, about 1; ``normal``: what the covariance was made of.
     """
 
     covariance: Array
     line_weight: Array
     shared_px: float
     contradiction: float
+    normal: NormalEquations
 
 
 def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Uncertainty:
@@ -55,8 +72,12 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     _, inverse, failed = dposv(stiff, np.eye(len(stiff)))
     if failed:
         raise FloatingPointError("the normal matrix of the joint fit is not positive definite")
+    unknowns = len(consensus.xi)
     if not len(inlier):
-        return Uncertainty(0.5 * (inverse + inverse.T), np.zeros(len(consensus.weight)), 0.0, 1.0)
+        nothing = NormalEquations(
+            np.zeros(0, dtype=np.intp), np.zeros((0, unknowns)), *np.zeros((2, 0, unknowns, unknowns))
+        )
+        return Uncertainty(0.5 * (inverse + inverse.T), np.zeros(len(consensus.weight)), 0.0, 1.0, nothing)
     prediction = votes.prediction
     sample, weight = votes.candidates.sample[inlier], consensus.weight[inlier]
     edge, stretch = prediction.layout.edge[sample], prediction.layout.stretch[sample]
@@ -65,29 +86,39 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     alone = weight / worth[edge]
     first = np.flatnonzero(np.diff(stretch, prepend=-1))
     total = np.add.reduceat(alone, first)
-    moment = np.add.reduceat(alone * consensus.residual_px[inlier], first)
-    freedom = len(total) - len(consensus.xi)
+    residual_px = consensus.residual_px[inlier]
+    moment = np.add.reduceat(alone * residual_px, first)
+    freedom = len(total) - unknowns
     contradiction = _contradiction(total, moment, freedom)
     scatter, shared = max(min(contradiction, 1.0), _SMALLEST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
     jacobian = prediction.jacobian_by_unknown[:, sample]
-    pulls = np.add.reduceat(jacobian * weight, first, axis=1)
-    middle = scatter * ((jacobian * (weight * worth[edge])) @ jacobian.T) + shared * (pulls @ pulls.T)
-    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)
+    weighted = jacobian * weight
+    pulls = np.add.reduceat(weighted, first, axis=1)
     of_stretch = edge[first]
     begin = np.flatnonzero(np.diff(of_stretch, prepend=-1))
-    pulls = np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[of_stretch[begin]])
-    middle += pulls @ pulls.T
+    at_edge = first[begin]
+    seen = of_stretch[begin]
+    # Sums over each edge: of points, of stretches, and of the edge as a whole.
+    information = np.add.reduceat(weighted[:, None] * jacobian, at_edge, axis=2).transpose(2, 0, 1)
+    by_stretch = np.add.reduceat(pulls[:, None] * pulls, begin, axis=2).transpose(2, 0, 1)
+    spread_px = np.hypot(votes.edge_spread_px, votes.cut_off_px)
+    whole = (np.add.reduceat(pulls, begin, axis=1) * (stiffness * spread_px[seen])).T
+    middles = scatter * worth[seen][:, None, None] * information + shared * by_stretch
+    middles += whole[:, :, None] * whole[:, None, :]
     # A scatter that is itself estimated from few stretches makes Student's distribution, with this variance.
-    middle *= freedom / (freedom - 2.0) if freedom >= _FEWEST_FREE else _FEWEST_FREE
+    middles *= freedom / (freedom - 2.0) if freedom >= _FEWEST_FREE else _FEWEST_FREE
+    middle = middles.sum(axis=0)
     middle.flat[:: len(middle) + 1] += prior_information
     covariance = inverse @ middle @ inverse
+    pull = np.add.reduceat(weighted * residual_px, at_edge, axis=1).T
+    normal = NormalEquations(seen, pull, stiffness * information, middles)
     line_weight = np.zeros(len(consensus.weight))
     counts = np.diff(np.append(first, len(inlier)))
     line_weight[inlier] = alone * np.repeat(stiffness**2 / (scatter + shared * total), counts)
     shared_px = float(np.sqrt(shared)) / stiffness
-    return Uncertainty(0.5 * (covariance + covariance.T), line_weight, shared_px, contradiction)
+    return Uncertainty(0.5 * (covariance + covariance.T), line_weight, shared_px, contradiction, normal)
 
 
 def _contradiction(total: Array, moment: Array, freedom: int) -> float:

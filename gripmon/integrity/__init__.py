@@ -1,5 +1,7 @@
 """What may be promised of a transform: bounds on its error under everything that may be wrong, at a stated risk."""
 
+from gripmon.integrity.hypotheses import Hypotheses, hypotheses_of
 from gripmon.integrity.quantiles import bounds
+from gripmon.integrity.separation import Separation, levels, separate
 
-__all__ = ["bounds"]
+__all__ = ["Hypotheses", "Separation", "bounds", "hypotheses_of", "levels", "separate"]

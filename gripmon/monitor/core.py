@@ -35,6 +35,7 @@ from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
+from gripmon.monitor.trust import Integrity, Standing
 from gripmon.policy import Evidence, Judgement, Policy
 from gripmon.recalibrate import Proposal
 from gripmon.recalibrate import Refusal as Refused
@@ -53,7 +54,6 @@ from gripmon.records import (
     MonitorNotes,
     MonitorState,
     Origin,
-    Protection,
     ReferenceRecord,
     Refusal,
     State,
@@ -101,7 +101,8 @@ class Monitor:
         self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
-        self._protection: Protection | None = None
+        self._trust = Integrity(self._tracker, gripper, settings)
+        self._standing: Standing | None = None
         self._now_s = 0.0  # time that has passed since the first frame
         self._measured_s: float | None = None
         self._stamp_s: float | None = None
@@ -170,7 +171,7 @@ class Monitor:
                 refusal=refusal[0],
                 explanation=of_stream(faults),
             )
-        measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip)
+        measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip, self._rivals())
         if not measurement.trusted:
             explanation = self._explain(frame, measurement, wrong=True)
             return self._unmeasured(
@@ -179,15 +180,21 @@ class Monitor:
         before_T = self._cam_T_grip
         measurement = self._newest = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
         self._cam_T_grip, self._covariance = self._tracker.update(measurement)
+        standing = self._standing = self._trust.judge(
+            frame, measurement, self._cam_T_grip, self._covariance, self._now_s
+        )
+        self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
-        if evidence.jumped:
-            self._average.forget()
         motion = evidence.motion
-        quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
-        self._average.add(self._cam_T_grip, self._covariance, quiet)
-        if motion.stepped and not evidence.jumped:
-            self._average.step(motion.step_frames)
+        if standing.believed:
+            self._tracker.learn(measurement)
+            if evidence.jumped:
+                self._average.forget()
+            quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
+            self._average.add(self._cam_T_grip, self._covariance, quiet)
+            if motion.stepped and not evidence.jumped:
+                self._average.step(motion.step_frames)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
@@ -200,6 +207,11 @@ class Monitor:
         alerts += self._renew(frame, measurement, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
         return self._record(frame, judgement, origin, alerts, measurement)
+
+    def _rivals(self) -> tuple[Array, ...]:
+        """Where else the gripper may be: where it proved to be last, and where the reference has it."""
+        anchor = self._trust.anchor
+        return (self._ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, self._ref_cam_T_grip)
 
     def _renew(
         self, frame: Frame, measurement: Measurement, evidence: Evidence, judgement: Judgement
@@ -259,7 +271,7 @@ class Monitor:
         return faults
 
     def _evidence(self, frame: Frame, measurement: Measurement, before_T: Array, doubtful: bool) -> Evidence:
-        assert self._covariance is not None
+        assert self._covariance is not None and self._standing is not None
         drift = self._drift()
         # Motion that the profiles can follow from frame to frame is no jump.
         looked_far = measurement.effort is not Effort.NARROW
@@ -271,7 +283,7 @@ class Monitor:
         astray = gripper_astray(measurement, shares)
         self._astray = self._astray + 1 if astray else 0
         # Few doubtful frames tell nothing; many are how it is now.
-        if 0 < self._astray < DOUBTED_FRAMES:
+        if 0 < self._astray < DOUBTED_FRAMES or not self._standing.believed:
             motion = self._watch.skip()
         else:
             motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
@@ -282,9 +294,9 @@ class Monitor:
         odd = self._watches.add(blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
-        protection = protection_of(self._covariance, self._settings.policy.integrity_risk)
-        self._protection = protection
-        return Evidence(shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful, protection)
+        return Evidence(
+            shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful, self._standing.protection
+        )
 
     def _since_start(self, shift: Array) -> Array | None:
         """The shift (6,) less the reference's error; None while that isn't known yet."""
@@ -398,7 +410,7 @@ class Monitor:
             alerts=(*self._noted(), *alerts),
             reason=judgement.reason,
             name=frame.name,
-            protection=self._protection,
+            protection=None if self._standing is None else self._standing.protection,
         )
 
     def _noted(self) -> list[Alert]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.camera import Camera
-from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.corners import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.differential import DegenerateGeometry, Update, differential_update
 from gripmon.geometry import perturb
 from gripmon.gripper import Gripper
@@ -45,9 +45,9 @@ class Tracker:
         """(6, 6) covariance of the systematic error that no averaging removes."""
         return self._floor
 
-    def measure(self, frame: Frame, cam_T_grip: Array) -> Measurement:
+    def measure(self, frame: Frame, cam_T_grip: Array, rivals: tuple[Array, ...] = ()) -> Measurement:
         """Measure about ``cam_T_grip`` (4, 4), where the gripper is expected, and look further when clearly fewer edge
-        points agree than usually.
+        points agree than usually: at the ``rivals`` (4, 4) first.
 
         A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is
         searched for in the first frames, then in one of several.
@@ -65,14 +65,28 @@ class Tracker:
                 when_lost=self._untrusted < search.eager_frames or self._untrusted % search.patient_every == 0,
             ),
             jaw_reported=reported_m is not None,
+            rivals=rivals,
         )
-        share = measurement.consensus.share
         earned = -1.0 if measurement.looked_far else 1.0 / search.refill_frames
         self._credit = min(max(self._credit + earned, 0.0), float(search.eager_frames))
         self._untrusted = 0 if measurement.trusted else self._untrusted + 1
-        if measurement.trusted:
-            self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         return measurement
+
+    def learn(self, measurement: Measurement) -> None:
+        """The gripper was where it was measured: that is what it usually shows, and the report's error."""
+        share = measurement.consensus.share
+        self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
+        self._jaw.learn()
+
+    def ends(self, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
+        """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""
+        assert frame.image is not None
+        return self._meter.ends(frame.image, measurement)
+
+    @property
+    def along(self) -> NDArray[np.bool_]:
+        """(e,) which edges run along the fingers."""
+        return self._meter.along
 
     def with_known_jaw(self, measurement: Measurement, reported_m: float | None) -> Measurement:
         """The same with the opening's error as earlier frames have shown it."""
@@ -87,6 +101,8 @@ class Tracker:
             cam_T_grip=perturb(measurement.cam_T_grip, fused.xi),
             jaw_opening_m=min(max(fused.jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m),
             covariance=covariance,
+            jaw_known_m=fused.known_m,
+            jaw_known_sigma_m=fused.known_sigma_m,
             jaw_surprise=max(measurement.jaw_surprise, fused.surprise, key=abs),
         )
 

@@ -6,7 +6,7 @@ standard deviation: what comes out is the covariance that the geometry gives, wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
-from gripmon.corners.uncertainty import Uncertainty
+from gripmon.corners.uncertainty import Uncertainty, assess
 from gripmon.geometry import from_record, invert
 from gripmon.gripper import Gripper
 from gripmon.monitor import MonitorSettings, Tracker
@@ -181,5 +181,6 @@ class ForeseeingMeter(FingertipMeter):
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         """As assumed: nothing scatters here."""
+        scatters = assess(votes, consensus, self._prior)
         normal = consensus.information + np.diag(self._prior)
-        return Uncertainty(np.linalg.inv(normal), consensus.weight, 0.0, 1.0)
+        return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)

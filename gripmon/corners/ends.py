@@ -1,0 +1,191 @@
+"""Whether the ends of the fingers are seen as ends: edges that meet in a corner, and none that goes on beyond it.
+
+Edges along a finger say nothing about a motion along it; only its ends do, and a rim, a fold or a plate's border
+parallel to them looks like them.  But such a border goes on beside the finger, and a finger that reaches farther goes on
+beyond it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.corners.prediction import STEP_PX, Prediction
+from gripmon.corners.profiles import EdgeSettings, find_candidates, read_profiles
+from gripmon.corners.settling import Measurement
+from gripmon.gripper import Gripper
+from gripmon.records import Array, Image
+
+ALONG_COSINE = 0.87
+"""Edges within 30 degrees of the fingers' direction run along them."""
+
+MAJORITY = 0.5
+"""Part of the edges' length that has to run one way for the fingers to have a direction at all."""
+
+BEYOND_PX = (5.0, 17.0)
+"""Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and about as long as the stretch of an
+edge that makes a corner seen (``corners.neighbourhood_px``).
+"""
+
+PROBES = 7
+"""Profiles on it."""
+
+REACH_PX = 4.0
+"""How far they reach to both sides, px: the shortest that the edge filter takes and that shows the response's decline."""
+
+NEAR_PX = 1.0
+"""An edge this near to the continued line is its continuation, px."""
+
+AS_STRONG = 0.4
+"""Step of a continuation over the edge's own, from which it is one."""
+
+END_CORNERS = 2
+"""Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
+
+GOES_ON = 0.5
+"""Share of the probes that must show it: half of them, as for an edge beside a corner."""
+
+
+def along_fingers(gripper: Gripper) -> NDArray[np.bool_]:
+    """(e,) which edges run along the fingers: the way that most of the edges' length has; all True, so that nothing is
+    an end, where no way has most of it.
+    """
+    points_m = gripper.points_grip_m()
+    way = points_m[gripper.edge_points[:, 1]] - points_m[gripper.edge_points[:, 0]]
+    length = np.linalg.norm(way, axis=1)
+    direction = way / length[:, None]
+    near = np.abs(direction @ direction.T) > ALONG_COSINE
+    together = near @ length
+    best = int(np.argmax(together))
+    if together[best] < MAJORITY * length.sum():
+        return np.ones(len(length), dtype=bool)
+    return np.asarray(near[best])
+
+
+@dataclass(frozen=True, slots=True)
+class FingerEndsSeen:
+    """(f,) corners at the end of each finger: ``seen`` with nothing that goes on beyond them, and those that ``might`` be
+    seen in this view.
+    """
+
+    seen: NDArray[np.intp]
+    might: NDArray[np.intp]
+
+    @property
+    def proven(self) -> int:
+        """How many fingers show their end."""
+        return int(np.count_nonzero(self.seen >= END_CORNERS))
+
+    @property
+    def provable(self) -> int:
+        """How many have to, so that the ends are sure: two that might, one where the view has no more."""
+        return min(int(np.count_nonzero(self.might >= END_CORNERS)), 2)
+
+    @property
+    def sure(self) -> bool:
+        """Whether as many show it as have to."""
+        return 0 < self.provable <= self.proven
+
+
+@dataclass(frozen=True, slots=True)
+class _Probes:
+    """Profiles beyond corners, for one prediction; c extensions of :data:`PROBES` each.
+
+    ``corner`` (c,) of the gripper, ``sample`` (c,) the edge's profile next to the corner, ``ok`` (c * PROBES,).
+    """
+
+    corner: NDArray[np.intp]
+    sample: NDArray[np.intp]
+    map_x: NDArray[np.float32]
+    map_y: NDArray[np.float32]
+    ok: NDArray[np.bool_]
+
+
+class FingerEnds:
+    """Looks beyond the corners at the ends of one gripper's fingers."""
+
+    def __init__(self, gripper: Gripper, settings: EdgeSettings):
+        self._gripper, self._settings = gripper, settings
+        self.along = along_fingers(gripper)
+        at_corner = [self.along[gripper.edges_at_corner(i)] for i in range(len(gripper.corner_ids))]
+        # Without a direction of the fingers every corner is an end.
+        self._at_end = np.array([self.along.all() or (a.any() and not a.all()) for a in at_corner], dtype=bool)
+        self._kept: tuple[Prediction, _Probes] | None = None
+
+    def seen(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
+        """Look beyond the measured corners; takes as long as a fourth of a measurement."""
+        gripper, prediction, corners = self._gripper, measurement.prediction, measurement.corners
+        if self._kept is None or self._kept[0] is not prediction:
+            self._kept = prediction, self._lay_out(prediction)
+        probes = self._kept[1]
+        measured = self._at_end & corners.usable
+        goes_on = np.zeros(len(measured), dtype=bool)
+        if len(probes.corner) and measured.any():
+            goes_on[probes.corner[self._going_on(image, measurement, probes)]] = True
+        finger = gripper.point_finger[gripper.corner_points]
+        fingers = len(gripper.finger_ids)
+        return FingerEndsSeen(
+            np.bincount(finger[measured & ~goes_on], minlength=fingers),
+            np.bincount(finger[self._at_end & prediction.corners.visible], minlength=fingers),
+        )
+
+    def _going_on(self, image: Image, measurement: Measurement, probes: _Probes) -> NDArray[np.bool_]:
+        """(c,) which of the extended edges go on."""
+        prediction, candidates = measurement.prediction, measurement.candidates
+        profiles = read_profiles(image, probes.map_x, probes.map_y)
+        found = find_candidates(profiles, probes.ok, candidates.noise, candidates.full_scale, self._settings)
+        step = _own_step(measurement)[prediction.layout.edge[probes.sample]]
+        offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
+        of = found.sample // PROBES
+        near = np.abs(found.offset_px - offset_px[of]) < NEAR_PX
+        near &= found.step * np.sign(step[of]) > AS_STRONG * np.abs(step[of])
+        shown = np.zeros(len(probes.ok), dtype=bool)
+        shown[found.sample[near]] = True
+        return np.asarray(shown.reshape(-1, PROBES).mean(axis=1) > GOES_ON)
+
+    def _lay_out(self, prediction: Prediction) -> _Probes:
+        gripper, layout, uv_px = self._gripper, prediction.layout, prediction.corners.uv_px
+        bounds = [*layout.first.tolist(), len(layout.edge)]
+        corner, sample, place, normal = [], [], [], []
+        for slot, edge in enumerate(layout.edges.tolist()):
+            ends = (bounds[slot], bounds[slot + 1] - 1)
+            for point, here, there in zip(gripper.edge_points[edge].tolist(), ends, ends[::-1], strict=True):
+                number = np.flatnonzero(gripper.corner_points == point)
+                if not len(number) or not self._at_end[number[0]]:
+                    continue
+                way = prediction.uv_px[here] - prediction.uv_px[there]
+                length = float(np.linalg.norm(way))
+                if not length > 1.0:
+                    continue
+                reach = np.linspace(*BEYOND_PX, PROBES)
+                corner.append(int(number[0]))
+                sample.append(here)
+                place.append(uv_px[number[0]] + reach[:, None] * (way / length))
+                normal.append(np.broadcast_to(prediction.normal[here], (PROBES, 2)))
+        if not corner:
+            nowhere = np.zeros((0, 3), dtype=np.float32)
+            none = np.zeros(0, dtype=np.intp)
+            return _Probes(none, none, nowhere, nowhere, np.zeros(0, dtype=bool))
+        half = round(REACH_PX / STEP_PX)
+        offsets = np.arange(-half, half + 1) * STEP_PX
+        at, across = np.concatenate(place), np.concatenate(normal)
+        maps = at[:, :, None] + across[:, :, None] * offsets
+        inside = np.isfinite(at).all(axis=1)
+        return _Probes(
+            np.array(corner, dtype=np.intp),
+            np.array(sample, dtype=np.intp),
+            np.nan_to_num(maps[:, 0]).astype(np.float32),
+            np.nan_to_num(maps[:, 1]).astype(np.float32),
+            inside,
+        )
+
+
+def _own_step(measurement: Measurement) -> Array:
+    """(e,) mean step of each edge's agreed points; zero where there are none."""
+    weight, candidates = measurement.consensus.weight, measurement.candidates
+    edges = len(measurement.prediction.line_origin)
+    edge = measurement.prediction.layout.edge[candidates.sample]
+    total = np.bincount(edge, weight, edges)
+    return np.asarray(np.bincount(edge, weight * candidates.step, edges) / np.maximum(total, 1e-12))

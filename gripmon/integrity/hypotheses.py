@@ -1,0 +1,70 @@
+"""What may be wrong with a fit of a gripper's edges, and how probable that is in a frame before anything is seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records import Array
+
+EDGE = 1e-2
+"""Probability a frame that an edge that agrees belongs to something else: a border parallel to it, a pad, a shadow."""
+
+ONE_FINGERS_ENDS = 1e-2
+"""That the ends of one finger do, though corners are seen there; and that a finger that shows such corners has others."""
+
+FINGER = 1e-3
+"""That a finger isn't where the model has it: bent, shifted in its holder, exchanged."""
+
+OPENING = 1e-3
+"""That the reported jaw opening is wrong by more than its stated standard deviation allows."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hypotheses:
+    """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
+    ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
+    the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
+    end of a finger is what it seems.
+    """
+
+    name: tuple[str, ...]
+    prior: Array
+    keep: Array
+    opening: NDArray[np.bool_]
+    sudden: NDArray[np.bool_]
+    ends: int
+
+
+def hypotheses_of(
+    edge_names: tuple[str, ...],
+    finger: NDArray[np.intp],
+    finger_names: tuple[str, ...],
+    along: NDArray[np.bool_],
+    has_opening: bool,
+) -> Hypotheses:
+    """All that a fit of these edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end."""
+    count = len(edge_names)
+    rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
+    whole = np.ones(count)
+    rows.append(("nothing is wrong", 1.0, whole, False, False))
+    for number, name in enumerate(edge_names):
+        rows.append((f"edge {name} belongs to something else", EDGE, np.arange(count) != number, False, False))
+    for number, name in enumerate(finger_names):
+        own = finger == number
+        if (own & ~along).sum() > 1:
+            what = f"the ends of finger {name} belong to something else"
+            rows.append((what, ONE_FINGERS_ENDS, ~(own & ~along), False, False))
+        if own.any() and not own.all():
+            rows.append((f"finger {name} is not where its model says", FINGER, ~own, False, True))
+    if has_opening:
+        rows.append(("the jaw opening is wrong", OPENING, whole, True, False))
+    ends = len(rows)
+    rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
+    names, prior, keep, opening, sudden = zip(*rows, strict=True)
+    return Hypotheses(
+        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends
+    )

@@ -1,0 +1,190 @@
+"""How far a measured transform may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+
+Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
+looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
+creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.corners import Effort, FingerEndsSeen, Measurement
+from gripmon.geometry import perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Refits, larger
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.records import Array, Frame, Protection
+
+SECONDS_A_MONTH = 30.0 * 86400.0
+
+PROOF_EVERY = 4
+"""While the gripper is where it was, its ends are looked at in one of so many frames."""
+
+SWINGS = 20.0
+"""Proven frames over which the mount's vibration is learnt."""
+
+DISPLACED = 33.1
+"""Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
+
+UNCONFIRMED_ENDS = {0: 1.0, 1: 1e-2}
+"""Probability that what looks like the fingers' ends is none, by how many fingers show theirs; nil from two on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """A pose (4, 4) that has proved itself, the ``covariance`` (6, 6) of its error, bounds of position and rotation that
+    rest on its frame alone, and when.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    position_m: float
+    rotation_rad: float
+    now_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What one measurement is worth.
+
+    ``protection`` of the pose that was asked about, ``alone`` what the frame by itself bounds; ``proven``: the fingers' ends are seen as such; ``displaced``: the
+    pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
+    ``instead``: pose and covariance without the ends, where the anchor explains the rest; None where it doesn't.
+    """
+
+    protection: Protection
+    alone: Protection
+    proven: bool
+    displaced: bool = False
+    ambiguous: bool = False
+    instead: tuple[Array, Array] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """What is published: pose (4, 4), covariance (6, 6) and ``protection``; ``believed``: the gripper may be taken to be
+    there, so that averages, the drift test and what is learnt may rest on it.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    protection: Protection
+    believed: bool
+
+
+class Integrity:
+    """Bounds for one monitor's frames, and the anchor that they rest on."""
+
+    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings):
+        self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
+        self._floor = np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+        creep = settings.smoothing
+        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
+        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
+        self._swing: Array = np.zeros(6)
+        self._kept: tuple[bytes, Hypotheses] | None = None
+        self._frames = 0
+        self._moved = 0
+        self.anchor: Anchor | None = None
+
+    def forget(self) -> None:
+        """Nothing is known of where the gripper is."""
+        self.anchor = None
+
+    def judge(
+        self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
+    ) -> Standing:
+        """What to publish of a measured pose (4, 4) with its covariance (6, 6), and what may rest on it."""
+        trust = self.weigh(measurement, cam_T_grip, None, now_s)
+        due = self._frames % PROOF_EVERY == 0
+        self._frames += 1
+        if due or trust.displaced or self.anchor is None:
+            trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+        if trust.displaced and trust.instead is not None and not trust.proven:
+            cam_T_grip, covariance = trust.instead
+            trust = replace(self.weigh(measurement, cam_T_grip, None, now_s), displaced=True)
+        # A knock is rare: it must be seen, twice where the gripper had to be looked for.
+        self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
+        near = measurement.effort is Effort.NARROW
+        moved = self._moved >= (1 if near else self._policy.confirm_frames)
+        if trust.proven and (moved or not trust.displaced):
+            self._settle(trust, cam_T_grip, covariance, now_s)
+        believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
+        return Standing(cam_T_grip, covariance, trust.protection, believed)
+
+    def weigh(self, measurement: Measurement, cam_T_grip: Array, ends: FingerEndsSeen | None, now_s: float) -> Trust:
+        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
+
+        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.
+        """
+        risk, edges = self._policy.integrity_risk, measurement.normal.edge
+        if not len(edges):
+            nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
+            return Trust(nothing, nothing, False)
+        hypotheses = self._hypotheses(edges)
+        proven = ends is not None and ends.sure
+        misread = 0.0 if proven else UNCONFIRMED_ENDS[0 if ends is None else min(ends.proven, 1)]
+        prior = hypotheses.prior.copy()
+        prior[hypotheses.ends] = misread
+        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor)
+        lasting = np.where(hypotheses.sudden, 0.0, prior)
+        lasting[hypotheses.ends] = misread
+        alone = now = fits.bound(fits.free, lasting, risk)
+        anchor = self.anchor
+        if anchor is None:
+            return Trust(now, now, proven)
+        wander = self._wander(now_s)
+        anchored = fits.anchored(anchor.cam_T_grip, anchor.covariance + np.diag(wander))
+        # What would need a knock of the mount besides is not what happened.
+        holds = anchored.surprise <= DISPLACED
+        displaced = not holds[0]
+        jumped = self._jumps_per_s * (now_s - anchor.now_s) * misread > risk
+        sudden = fits.bound(anchored, np.where(holds, prior, 0.0), risk)
+        if not (displaced or jumped):
+            now = min(now, self._as_then(fits, anchor, wander), key=lambda bound: bound.position_m)
+        instead = fits.solution(anchored, hypotheses.ends) if displaced and holds[hypotheses.ends] else None
+        ambiguous = bool(holds[1:][prior[1:] > 0.0].any())
+        return Trust(larger(now, sudden), alone, proven, displaced, displaced and ambiguous, instead)
+
+    def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
+        """The anchor's own bounds for a pose near it."""
+        away = perturbation_between(anchor.cam_T_grip, fits.cam_T_grip)
+        risk = self._policy.integrity_risk
+        crept = np.stack([np.diag(wander[:3]), np.diag(wander[3:])])
+        crept_m, crept_rad = bounds(crept, np.full(2, risk)).tolist()
+        return Protection(
+            anchor.position_m + float(np.linalg.norm(away[:3])) + crept_m,
+            anchor.rotation_rad + float(np.linalg.norm(away[3:])) + crept_rad,
+            risk,
+            "where it was is as uncertain",
+        )
+
+    def _settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
+        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one, bounded by itself."""
+        if self.anchor is not None:
+            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
+            self._swing = self._swing + (way * way - self._swing) / SWINGS
+        bound = trust.alone
+        self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
+
+    def _wander(self, now_s: float) -> Array:
+        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
+        assert self.anchor is not None
+        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self._swing
+
+    def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
+        key = edges.tobytes()
+        if self._kept is None or self._kept[0] != key:
+            gripper = self._gripper
+            names = tuple(gripper.edge_ids[edge] for edge in edges)
+            made = hypotheses_of(
+                names, gripper.edge_finger[edges], gripper.finger_ids, self._tracker.along[edges], gripper.has_jaw
+            )
+            self._kept = key, made
+        return self._kept[1]
