@@ -89,6 +89,7 @@ class Integrity:
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
         self._swing: Array = np.zeros(6)
         self._kept: tuple[bytes, Hypotheses] | None = None
+        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
         self._frames = 0
         self._moved = 0
         self.anchor: Anchor | None = None
@@ -147,6 +148,9 @@ class Integrity:
         jumped = self._jumps_per_s * (now_s - anchor.now_s) * misread > risk
         sudden = fits.bound(anchored, np.where(holds, prior, 0.0), risk)
         if not (displaced or jumped):
+            # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
+            lasting[hypotheses.ends] = 0.0
+            now = fits.bound(fits.free, lasting, risk)
             now = min(now, self._as_then(fits, anchor, wander), key=lambda bound: bound.position_m)
         instead = fits.solution(anchored, hypotheses.ends) if displaced and holds[hypotheses.ends] else None
         ambiguous = bool(holds[1:][prior[1:] > 0.0].any())
@@ -184,7 +188,7 @@ class Integrity:
             gripper = self._gripper
             names = tuple(gripper.edge_ids[edge] for edge in edges)
             made = hypotheses_of(
-                names, gripper.edge_finger[edges], gripper.finger_ids, self._tracker.along[edges], gripper.has_jaw
+                names, gripper.edge_finger[edges], gripper.finger_ids, self._tracker.along[edges], self._may_open
             )
             self._kept = key, made
         return self._kept[1]
