@@ -56,10 +56,20 @@ class Bodies:
             reason, own = self._reason(body.solid)
             for k in np.flatnonzero(hidden_by(body, corners_cam_m) & ~own).tolist():
                 out[k] = reason
-        for _, outline in self.placed_covers(state):
-            for k in np.flatnonzero(_behind(outline, corners_cam_m)).tolist():
-                out[k] = Hidden.COVER
+        for k in np.flatnonzero(self.covered(state, corners_cam_m)).tolist():
+            out[k] = Hidden.COVER
         return out
+
+    def covered(self, state: SceneState, points_cam_m: Array) -> NDArray[np.bool_]:
+        """(n,) which of the points (n, 3) in the camera frame a cover hides."""
+        covered = np.zeros(len(points_cam_m), dtype=bool)
+        for _, outline in self.placed_covers(state):
+            covered |= _behind(outline, points_cam_m)
+        return covered
+
+    def is_gripper(self, solid: Solid) -> bool:
+        """Whether a solid is a finger or carries one."""
+        return any(solid is own for own in (*self.fingers, *self.carriers))
 
     def _reason(self, solid: Solid) -> tuple[Hidden, NDArray[np.bool_]]:
         """What a body's hiding is called, and which corners are its own."""

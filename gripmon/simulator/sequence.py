@@ -10,6 +10,7 @@ from gripmon.gripper import Gripper
 from gripmon.records import Array, Frame
 from gripmon.simulator import disturbance
 from gripmon.simulator.bodies import Bodies
+from gripmon.simulator.outline import Outline, OutlineSeen
 from gripmon.simulator.render import Backdrop, Renderer
 from gripmon.simulator.scenario import Scenario
 from gripmon.simulator.scene import Scene
@@ -39,6 +40,7 @@ class Simulator:
         self.nominal_cam_T_grip = np.array(nominal_cam_T_grip, dtype=float)
         self._scene = Scene(camera, gripper, self.nominal_cam_T_grip, scenario, seed)
         self._bodies = Bodies(gripper, scenario, self._scene.view_half[1])
+        self._outline = Outline(gripper)
         self._painting: tuple[Renderer, SensorModel] | None = None
 
     @property
@@ -79,6 +81,10 @@ class Simulator:
             exposure=disturbance.exposure(scenario.light, time_s),
             defocus_px=disturbance.defocus_sigma_px(scenario.defocus, time_s),
         )
+
+    def outline_seen(self, index: int) -> OutlineSeen:
+        """How much of each finger's outline can be seen in a frame."""
+        return self._outline.seen(self.camera, self._bodies, self._scene.at(self.time_s(index)))
 
     def render(self, index: int) -> NDArray[np.uint8]:
         """Image (height, width) of a frame."""

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.jumps import rigs
-from benchmarks.scenes import _look, _models, bevelled
+from benchmarks.scenes import _look, bevelled, gripper_models
 from gripmon.camera import LensSettings, make_camera
 from gripmon.geometry import exp_rotation, make_transform, perturb
 from gripmon.gripper import Gripper, GripperModel
@@ -55,7 +55,7 @@ class Rig:
 def draw_rig(rng: Rng, reported: bool) -> Rig:
     """Everything that is drawn before what goes wrong; ``reported``: the robot has to report the opening."""
     lens = _lenses()[int(rng.integers(3))]
-    model = [*_models(), rigs()["wedges"].gripper.model][int(rng.integers(4))]
+    model = [*gripper_models(), rigs()["wedges"].gripper.model][int(rng.integers(4))]
     if isinstance(model, dict):
         model = bevelled(model, float(rng.uniform(0.0, 3e-4))) if rng.random() < 0.5 else model
         model = msgspec.convert(model, GripperModel)

@@ -6,6 +6,7 @@ import datetime
 import os
 import platform
 import subprocess
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,14 +19,19 @@ def description() -> dict[str, Any]:
     """Machine, versions, commit and date, as plain values."""
     return {
         "cpu": _cpu_name(),
-        "cpus": len(os.sched_getaffinity(0)),
+        "cpus": cores(),
         "system": platform.platform(),
         "python": platform.python_version(),
         "packages": {name: _version(name) for name in _PACKAGES},
-        "commit": _commit(),
+        "commit": commit(),
         "date": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d %H:%M UTC"),
         "load_before": load(),
     }
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 def load() -> float:
@@ -52,7 +58,8 @@ def _version(package: str) -> str:
         return "unknown"
 
 
-def _commit() -> str:
+@cache
+def commit() -> str:
     """Hash of the checkout, with a + if the product's files differ from it."""
 
     def git(*arguments: str) -> str:

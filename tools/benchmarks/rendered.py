@@ -1,6 +1,7 @@
-"""Sequences of an independent renderer beside the checkout (``../shared/data/rendered``), as the benchmark takes them.
+"""Sequences of an independent renderer beside the checkout (``../shared/data/rendered*``), as the benchmarks take them.
 
-Each runs twice: as a robot would report its jaws (rounded; the monitor's default sigma), and with the true opening.
+A row is named by folder and sequence.  Each runs twice: as a robot would report its jaws (rounded; the monitor's
+default sigma), and with the true opening.
 """
 
 from __future__ import annotations
@@ -38,6 +39,12 @@ _JUDGED_FROM = {"bump_y": 50}
 def row_names() -> list[str]:
     """Two rows a sequence, whether it is there or not."""
     return [_PREFIX + name + jaw for jaw in ("", _TRUE_JAW) for name in _NAMES]
+
+
+def all_row_names() -> list[str]:
+    """Two rows for each sequence that is there, in all folders beside each other."""
+    found = sorted(FOLDER.parent.glob(f"{FOLDER.name}*/*/truth.json"))
+    return [f"{path.parts[-3]} {path.parts[-2]}{jaw}" for jaw in ("", _TRUE_JAW) for path in found]
 
 
 @dataclass(frozen=True)
@@ -81,8 +88,8 @@ def sequences(row: str) -> list[Rendered]:
     is never valid.
     """
     true_jaw = row.endswith(_TRUE_JAW)
-    name = row.removeprefix(_PREFIX).removesuffix(_TRUE_JAW)
-    folder = FOLDER / name
+    family, _, name = row.removesuffix(_TRUE_JAW).partition(" ")
+    folder = (FOLDER if family == _PREFIX.strip() else FOLDER.with_name(family)) / name
     if not folder.is_dir():
         return []
     camera, gripper, truth = (json.loads((folder / f"{n}.json").read_text()) for n in ("camera", "gripper", "truth"))

@@ -134,7 +134,7 @@ def make_scene(condition: Condition, seed: int, number: int, frames: int) -> Sce
     """Scene ``number`` of a condition."""
     rng = np.random.default_rng([seed, zlib.crc32(condition.name.encode()), number])
     camera = make_camera(CAMERA)
-    models = _models()
+    models = gripper_models()
     model = models[number % len(models)]
     if condition.bevel_m is not None:
         model = bevelled(model, float(rng.uniform(*condition.bevel_m)))
@@ -228,7 +228,7 @@ def _look(rng: np.random.Generator) -> tuple[Background, FingerLook, Sensor]:
 
 
 @cache
-def _models() -> tuple[dict[str, Any], ...]:
+def gripper_models() -> tuple[dict[str, Any], ...]:
     """Models of the grippers that scenes take in turn."""
     folder = ROOT / "configs" / "grippers"
     box, arc = (

@@ -1,0 +1,210 @@
+"""``tools/bench integrity``: does ``valid`` keep its promise, in random scenes that are made to mislead?"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import multiprocessing
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks import options
+
+_DESCRIPTION = """\
+Runs the monitor over random scenes of every condition (free view, clutter, light, grasps, covers, things whose borders
+run like the fingers', jumps, wrong models ...) and over the rendered sequences beside the checkout, if they are there.
+Counts misleading frames (valid and the error exceeds the alert limit, or the frame's own protection level), and how
+often the transform is valid where the gripper shows enough. The worst frames are named so that exactly their scenes
+can be run again: --only NAME --seed S --scene N prints each frame of one scene."""
+SCENES, FRAMES, QUICK_SCENES = 30, 96, 2
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is run: scenes of each condition, frames of each scene; ``scene``: only the one with this number."""
+
+    only: tuple[str, ...] = ()
+    scenes: int = SCENES
+    frames: int = FRAMES
+    seed: int = 1
+    jobs: int = 1
+    scene: int | None = None
+    state: Path | None = None
+
+
+def add_parser(commands: Any) -> None:
+    """Add the benchmark to ``tools/bench``."""
+    from benchmarks.machine import cores
+
+    parser = options.add_command(
+        commands,
+        "integrity",
+        run,
+        "whether a valid transform can be relied on, in scenes made to mislead",
+        _DESCRIPTION,
+        quick=f"{QUICK_SCENES} scenes of each condition",
+        seed=True,
+    )
+    parser.add_argument("--only", nargs="+", metavar="NAME", default=[], help="conditions with these names")
+    parser.add_argument("--list", action="store_true", help="print the names of all conditions and end")
+    parser.add_argument(
+        "--scenes", type=options.positive, metavar="N", help=f"scenes of each condition (default {SCENES})"
+    )
+    parser.add_argument(
+        "--frames", type=options.positive, default=FRAMES, metavar="N", help=f"frames of each scene (default {FRAMES})"
+    )
+    parser.add_argument(
+        "--scene", type=options.count, metavar="N", help="only scene N of each condition, frame by frame"
+    )
+    parser.add_argument(
+        "--jobs",
+        type=options.positive,
+        default=cores(),
+        metavar="J",
+        help="scenes at the same time (default: all cores)",
+    )
+    parser.add_argument(
+        "--resume",
+        type=Path,
+        metavar="FILE",
+        help="each finished scene is appended there as a line of JSON; those that are there are not run again",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write integrity.md, integrity.json and integrity/*.png there"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Handle ``tools/bench integrity``."""
+    from benchmarks import integrity_report, integrity_table
+    from benchmarks.integrity_runs import names
+
+    if arguments.list:
+        print("\n".join(names()))
+        return 0
+    unknown = [name for name in arguments.only if name not in names()]
+    if unknown:
+        print(f"integrity: --only {unknown[0]}: no such condition; one of {', '.join(names())}", file=sys.stderr)
+        return 2
+    if arguments.out is not None and importlib.util.find_spec("matplotlib") is None:
+        print("integrity: --out: matplotlib is not installed; tools/bench, or pip install '.[bench]'", file=sys.stderr)
+        return 2
+    scenes = arguments.scenes or (QUICK_SCENES if arguments.quick else SCENES)
+    plan = Plan(
+        tuple(arguments.only),
+        scenes,
+        arguments.frames,
+        arguments.seed,
+        arguments.jobs,
+        arguments.scene,
+        arguments.resume,
+    )
+    try:
+        if arguments.out is not None:
+            (arguments.out / integrity_report.PICTURES).mkdir(parents=True, exist_ok=True)
+        lines = measure(plan)
+    except OSError as error:
+        print(f"integrity: {error.filename}: {error.strerror}; a place that can be written to", file=sys.stderr)
+        return 2
+    results = integrity_report.summarize(plan, lines)
+    if plan.scene is not None:
+        print("\n".join(text for line in lines for text in integrity_table.frame_lines(line)))
+    print(integrity_table.as_text(results))
+    if arguments.out is not None:
+        integrity_report.write(results, lines, arguments.out)
+    return 0
+
+
+def measure(plan: Plan) -> list[dict[str, Any]]:
+    """The lines of all scenes, by condition and number; those that the state file has are not run again."""
+    from benchmarks.integrity_runs import names
+
+    wanted = [name for name in names() if not plan.only or name in plan.only]
+    tasks = list(_tasks(plan, wanted))
+    done = read_lines(plan.state)
+    lines = {task: done[_key(task, plan)] for task in tasks if _key(task, plan) in done}
+    missing = [task for task in tasks if task not in lines]
+    print(
+        f"integrity: seed {plan.seed}, {len(tasks)} scenes, {len(lines)} of them done, {plan.jobs} at a time",
+        file=sys.stderr,
+    )
+    for task, line in _in_processes(missing, plan):
+        lines[task] = line
+        if plan.state is not None:
+            append_line(plan.state, line)
+    return [lines[task] for task in sorted(tasks, key=lambda task: (wanted.index(task[0]), task[1]))]
+
+
+def _tasks(plan: Plan, wanted: list[str]) -> Iterator[tuple[str, int]]:
+    """Condition and number of each scene, the first of each condition first: so an interrupted run is balanced."""
+    from benchmarks.integrity_runs import scene_numbers
+
+    numbers = {name: scene_numbers(name, plan.scenes) for name in wanted}
+    if plan.scene is not None:
+        numbers = {name: scene_numbers(name, plan.scene + 1)[plan.scene :][:1] for name in wanted}
+    for number in sorted({number for each in numbers.values() for number in each}):
+        yield from ((name, number) for name in wanted if number in numbers[name])
+
+
+def _key(task: tuple[str, int], plan: Plan) -> tuple[Any, ...]:
+    return (*task, plan.seed, plan.frames)
+
+
+def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
+    """Finished scenes by condition, number, seed and frames.  A last line that was cut off doesn't count."""
+    if file is None or not file.exists():
+        return {}
+    out = {}
+    for text in file.read_text(encoding="utf-8").splitlines():
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        out[line["condition"], line["scene"], line["seed"], line["asked"]] = line
+    return out
+
+
+def append_line(file: Path, line: dict[str, Any]) -> None:
+    """Add a finished scene; a line that was cut off before stays by itself."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    torn = file.exists() and file.stat().st_size > 0 and not file.read_bytes().endswith(b"\n")
+    with file.open("a", encoding="utf-8") as out:
+        out.write(("\n" if torn else "") + json.dumps(line) + "\n")
+
+
+def _in_processes(tasks: list[tuple[str, int]], plan: Plan) -> Iterator[tuple[tuple[str, int], dict[str, Any]]]:
+    """Scenes one by one in new processes of one thread each, as they are finished."""
+    from tqdm import tqdm
+
+    if not tasks:
+        return
+    context = multiprocessing.get_context("spawn")
+    jobs = min(plan.jobs, len(tasks))
+    with (
+        ProcessPoolExecutor(max_workers=jobs, mp_context=context, initializer=_prepare) as pool,
+        tqdm(total=len(tasks), desc="integrity", unit="scene", file=sys.stderr, disable=None) as bar,
+    ):
+        waiting = {pool.submit(_scene, *task, plan.seed, plan.frames): task for task in tasks}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+            bar.update()
+
+
+def _prepare() -> None:
+    """One thread for everybody; everything imported before a checkout that changes meanwhile does harm."""
+    import cv2
+
+    from benchmarks import integrity_runs  # noqa: F401
+
+    cv2.setNumThreads(1)
+
+
+def _scene(name: str, number: int, seed: int, frames: int) -> dict[str, Any]:
+    from benchmarks.integrity_runs import run_scene
+
+    return run_scene(name, seed, number, frames)

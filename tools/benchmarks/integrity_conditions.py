@@ -1,0 +1,334 @@
+"""The conditions of ``tools/bench integrity`` as data: what each changes in an ordinary scene.
+
+Most scenes begin with the gripper free, as in practice; then something happens, and at the end the view is free again.
+Some begin in the midst of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from gripmon.gripper import Gripper
+from gripmon.records import Array
+from gripmon.simulator.scenario import (
+    Background,
+    BentFinger,
+    Bump,
+    Cover,
+    Creep,
+    Defocus,
+    FingerLook,
+    GraspedObject,
+    JawScript,
+    Light,
+    LightStep,
+    Sensor,
+    Shadow,
+    Vibration,
+)
+
+Changes = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """What is drawn before the condition.
+
+    ``start_s`` and ``end_s``: between them things happen; before and after, the gripper is free.
+    """
+
+    rng: np.random.Generator
+    frames: int
+    fps: float
+    start_s: float
+    end_s: float
+    gripper: Gripper
+    cam_T_grip: Array
+    opening_m: float
+    background: Background
+    fingers: FingerLook
+    sensor: Sensor
+    jaw: JawScript
+
+    def at_s(self, share: float) -> float:
+        """A time between start and end."""
+        return self.start_s + share * (self.end_s - self.start_s)
+
+    def uniform(self, low: float, high: float) -> float:
+        return float(self.rng.uniform(low, high))
+
+    def sign(self) -> float:
+        return float(self.rng.choice((-1.0, 1.0)))
+
+    def chance(self, probability: float) -> bool:
+        return bool(self.rng.random() < probability)
+
+    def one_of(self, *values: Any) -> Any:
+        return values[int(self.rng.integers(len(values)))]
+
+    def between_frames_s(self, share: float) -> float:
+        """Near a share of the time, between two frames: a jump there is in no frame's exposure."""
+        return (round(self.at_s(share) * self.fps) + 0.5) / self.fps
+
+    @property
+    def tip_size_m(self) -> Array:
+        """Extent (3,) of the first finger, gripper axes."""
+        own = self.gripper.points_grip_m(None)[self.gripper.point_finger == 0]
+        return np.asarray(np.ptp(own, axis=0))
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A kind of scene.
+
+    ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``moves``:
+    the mount moves, so that an alert which says so is true; ``inside``: a scene may begin in the midst of it;
+    ``truth``: what the true gripper is instead of the one that the monitor knows.
+    """
+
+    name: str
+    what: str
+    changes: Callable[[Draft], Changes]
+    enough: bool = True
+    moves: bool = False
+    inside: bool = True
+    truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
+
+
+def with_(settings: Any, **changes: Any) -> Any:
+    return msgspec.structs.replace(settings, **changes)
+
+
+def both(*parts: Callable[[Draft], Changes]) -> Callable[[Draft], Changes]:
+    """Several changes together; a later one wins where they meet."""
+
+    def changes(draft: Draft) -> Changes:
+        out: Changes = {}
+        for part in parts:
+            out |= part(draft)
+        return out
+
+    return changes
+
+
+def ordinary(draft: Draft) -> Changes:
+    return {}
+
+
+def clutter(draft: Draft) -> Changes:
+    return {
+        "background": with_(
+            draft.background,
+            kind=draft.one_of("printed", "chequer", "stripes", "blobs"),
+            boxes=45,
+            cables=14,
+            contrast=0.9,
+            motion=draft.one_of("wander", "linear", "stop_and_go"),
+            speed_m_per_s=draft.uniform(0.06, 0.15),
+        )
+    }
+
+
+def clutter_still(draft: Draft) -> Changes:
+    return {"background": with_(clutter(draft)["background"], motion="still")}
+
+
+def light(draft: Draft) -> Changes:
+    """Steps, a soft shadow, slow exposure; up to over-exposed or dark."""
+    shadow = Shadow(
+        start_s=draft.at_s(0.0),
+        end_s=draft.at_s(0.9),
+        depth=draft.uniform(0.3, 0.6),
+        width=draft.uniform(0.3, 0.6),
+        softness=draft.uniform(0.02, 0.08),
+        angle_deg=draft.uniform(-90.0, 90.0),
+    )
+    steps = (
+        LightStep(at_s=draft.between_frames_s(0.3), factor=draft.uniform(0.4, 0.8)),
+        LightStep(at_s=draft.between_frames_s(0.6), factor=draft.uniform(1.3, 2.5)),
+    )
+    return {"light": Light(exposure=draft.uniform(0.6, 1.4), steps=steps, shadows=(shadow,), auto_exposure_s=0.3)}
+
+
+def blur(draft: Draft) -> Changes:
+    return {"defocus": (Defocus(sigma_px=draft.uniform(0.7, 2.5)),)}
+
+
+def noise(draft: Draft) -> Changes:
+    return {
+        "sensor": with_(draft.sensor, read_noise_dn=draft.uniform(3.0, 6.0), shot_noise_dn=draft.uniform(0.1, 0.3)),
+    }
+
+
+def flicker(draft: Draft) -> Changes:
+    return {"light": Light(flicker=draft.uniform(0.2, 0.4), flicker_hz=draft.uniform(96.0, 104.0))}
+
+
+def jpeg(draft: Draft) -> Changes:
+    return {"sensor": with_(draft.sensor, jpeg_quality=int(draft.rng.integers(55, 85)))}
+
+
+def jaw_cycle(draft: Draft) -> Changes:
+    low, high = draft.gripper.jaw_min_m + 1e-3, draft.gripper.jaw_max_m - 1e-3
+    ends = [min(max(draft.opening_m + way * draft.uniform(3e-3, 9e-3), low), high) for way in (-1.0, 0.3)]
+    times = (draft.at_s(0.0), draft.at_s(0.4), draft.at_s(0.95))
+    return {"jaw": with_(draft.jaw, knots=tuple(zip(times, (draft.opening_m, *ends), strict=True)))}
+
+
+def grasp(draft: Draft) -> Changes:
+    """An object comes, the jaws close on it, hold it, open, and it goes."""
+    width_m = max(draft.opening_m - draft.uniform(0.004, 0.012), 0.004)
+    thick_m = float(draft.tip_size_m[1])
+    size = (width_m, draft.uniform(0.6, 1.6) * thick_m, draft.uniform(0.02, 0.05))
+    grasped = GraspedObject(
+        size_m=size,
+        depth_m=draft.uniform(0.004, 0.024),
+        side_m=draft.uniform(-0.3, 0.3) * thick_m,
+        arrive_s=(draft.at_s(0.0), draft.at_s(0.12)),
+        leave_s=(draft.at_s(0.86), draft.at_s(1.0)),
+    )
+    return {"grasped": grasped, "jaw": closing(draft, width_m)}
+
+
+def closing(draft: Draft, width_m: float) -> JawScript:
+    """Jaws that close to a width while something is there, and open again."""
+    knots = ((0.13, draft.opening_m), (0.24, width_m), (0.74, width_m), (0.85, draft.opening_m))
+    return with_(draft.jaw, knots=tuple((draft.at_s(share), opening_m) for share, opening_m in knots))
+
+
+def _cover(draft: Draft, kind: str, reach: float) -> Changes:
+    cover = Cover(
+        kind=kind,  # type: ignore[arg-type]
+        side=draft.one_of("left", "right", "top", "bottom"),
+        start_s=draft.at_s(0.0),
+        end_s=draft.at_s(1.0),
+        move_s=draft.uniform(0.1, 0.35) * (draft.end_s - draft.start_s),
+        reach=reach,
+        distance_m=draft.uniform(0.03, 0.06),
+    )
+    return {"covers": (cover,)}
+
+
+def hand(draft: Draft) -> Changes:
+    return _cover(draft, "hand", draft.uniform(0.35, 1.0))
+
+
+def sheet(draft: Draft) -> Changes:
+    return _cover(draft, "sheet", draft.uniform(0.3, 1.0))
+
+
+def cover_one(draft: Draft) -> Changes:
+    """A hand or sheet from the side hides one finger and stays."""
+    changes = _cover(draft, draft.one_of("hand", "sheet"), draft.uniform(0.3, 0.46))
+    cover = with_(changes["covers"][0], side=draft.one_of("left", "right"))
+    return {"covers": (cover,)}
+
+
+def covered_run(draft: Draft) -> Changes:
+    """Nothing of the gripper is seen for some frames, then all of it."""
+    cover = Cover(
+        kind="sheet",
+        side=draft.one_of("left", "right", "top", "bottom"),
+        start_s=draft.between_frames_s(0.2),
+        end_s=draft.between_frames_s(draft.uniform(0.25, 0.6)),
+        move_s=1.0 / draft.fps,
+        distance_m=0.04,
+    )
+    return {"covers": (cover,)}
+
+
+def shadow_lines(draft: Draft) -> Changes:
+    """Shadows whose sharp borders run parallel to the tips pass slowly."""
+    shadows = tuple(
+        Shadow(
+            start_s=draft.at_s(draft.uniform(-0.3, 0.0)) if draft.start_s > 1.0 else draft.start_s,
+            end_s=draft.at_s(1.0),
+            depth=draft.uniform(0.3, 0.75),
+            width=draft.uniform(0.05, 0.5),
+            softness=draft.uniform(0.001, 0.006),
+            angle_deg=draft.sign() * 90.0 + draft.uniform(-4.0, 4.0),
+        )
+        for _ in range(int(draft.rng.integers(1, 3)))
+    )
+    return {"light": Light(shadows=shadows)}
+
+
+def vibration(draft: Draft) -> Changes:
+    shift = (draft.sign() * draft.uniform(1e-4, 3e-4), draft.sign() * draft.uniform(1e-4, 3e-4))
+    return {"mount": (Vibration(frequency_hz=draft.uniform(5.0, 17.0), tcp_shift_m=shift, start_s=draft.start_s),)}
+
+
+def creep(draft: Draft) -> Changes:
+    shift = (draft.sign() * draft.uniform(2e-4, 1.5e-3), draft.sign() * draft.uniform(2e-4, 1.5e-3))
+    return {
+        "mount": (Creep(start_s=draft.start_s, time_s=draft.end_s - draft.start_s, law="linear", tcp_shift_m=shift),)
+    }
+
+
+def bump(draft: Draft) -> Changes:
+    """0.3 to 8 mm in any direction; a third of them along the fingers."""
+    size_m = float(np.exp(draft.uniform(np.log(3e-4), np.log(8e-3))))
+    ring = draft.one_of(0.0, 0.3)
+    at_s = draft.between_frames_s(draft.uniform(0.3, 0.6))
+    if draft.chance(0.33):
+        x, y, z = (draft.sign() * size_m * draft.cam_T_grip[:3, 2]).tolist()
+        return {"mount": (Bump(at_s=at_s, ring_fraction=ring, translation_m=(x, y, z)),)}
+    angle = draft.uniform(0.0, 2.0 * np.pi)
+    shift = (size_m * float(np.cos(angle)), size_m * float(np.sin(angle)))
+    return {"mount": (Bump(at_s=at_s, ring_fraction=ring, tcp_shift_m=shift),)}
+
+
+def bent(draft: Draft) -> Changes:
+    shift = [draft.sign() * draft.uniform(2e-4, 1.5e-3), draft.sign() * draft.uniform(2e-4, 1.5e-3), 0.0]
+    finger = draft.one_of(*draft.gripper.finger_ids)
+    bend = BentFinger(finger=finger, tip_shift_m=tuple(shift), start_s=draft.between_frames_s(0.1))  # type: ignore[arg-type]
+    return {"bent_fingers": (bend,)}
+
+
+def opening_wrong(draft: Draft) -> Changes:
+    offset_m = draft.sign() * draft.uniform(3e-4, 2e-3)
+    return {"jaw": with_(jaw_cycle(draft)["jaw"], reported_offset_m=offset_m)}
+
+
+def mismeasured(rng: np.random.Generator, model: dict[str, Any]) -> dict[str, Any]:
+    """One finger's tip, or both, 0.1 to 0.3 mm shorter or longer than the model says."""
+    fingers = list(model["fingers"])
+    wrong = {str(rng.choice(fingers))} if rng.random() < 0.7 else set(fingers)
+    change_m = float(rng.choice((-1.0, 1.0)) * rng.uniform(1e-4, 3e-4))
+    points = {}
+    for name, point in model["points"].items():
+        x, y, z = point["xyz_m"]
+        moved = point["finger"] in wrong and point.get("corner", False)
+        points[name] = {**point, "xyz_m": [x, y, z + change_m if moved else z]}
+    return {**model, "points": points}
+
+
+CONDITIONS: tuple[Condition, ...] = (
+    Condition("ordinary", "some clutter moves, usual noise", ordinary),
+    Condition("clutter", "boxes, cables, print, chequers move", clutter),
+    Condition("clutter still", "the same, standing still", clutter_still),
+    Condition("light", "steps of the light, a soft shadow", light),
+    Condition("blur", "Gaussian blur of 0.7 to 2.5 px added", blur),
+    Condition("noise", "read noise 3 to 6 DN, strong shot noise", noise),
+    Condition("flicker", "light flickers by 20 to 40 %", flicker),
+    Condition("jpeg", "quality 55 to 85", jpeg),
+    Condition("jaw cycle", "the jaws close and open", jaw_cycle),
+    Condition("grasp", "an object between the fingers, held", grasp),
+    Condition("cover one", "a hand or sheet hides one finger", cover_one),
+    Condition("hand", "a hand passes, up to all of the view", hand),
+    Condition("sheet", "a printed sheet passes, up to all of the view", sheet),
+    Condition("covered run", "some frames show nothing of the gripper", covered_run),
+    Condition("shadow lines", "sharp shadows parallel to the tips", shadow_lines),
+    Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, moves=True, inside=False),
+    Condition("bump in grasp", "the same while an object is held", both(grasp, bump), moves=True, inside=False),
+    Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, moves=True),
+    Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, moves=True, inside=False),
+    Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False),
+    Condition("opening wrong", "report off by 0.3 to 2 mm", opening_wrong, enough=False),
+    Condition("model off", "tips 0.1 to 0.3 mm other than the model", ordinary, enough=False, truth=mismeasured),
+)

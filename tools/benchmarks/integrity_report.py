@@ -1,0 +1,45 @@
+"""``tools/bench integrity``: the lines of all scenes become figures, a report, and pictures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks import integrity_table, machine
+from benchmarks.integrity_runs import about
+from benchmarks.integrity_stats import figures, targets, worst
+
+if TYPE_CHECKING:
+    from benchmarks.integrity import Plan
+
+PICTURES = "integrity"
+
+
+def summarize(plan: Plan, lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Figures of each condition and of all, as plain values."""
+    by_name: dict[str, list[dict[str, Any]]] = {}
+    for line in lines:
+        by_name.setdefault(line["condition"], []).append(line)
+    total = figures(lines)
+    return {
+        "machine": machine.description(),
+        "commits": sorted({line["commit"] for line in lines}),
+        "plan": {"seed": plan.seed, "scenes": plan.scenes, "frames": plan.frames},
+        "limit_m": lines[0]["limit_m"],
+        "limit_rad": lines[0]["limit_rad"],
+        "rows": {name: {"what": about(name), **figures(own)} for name, own in by_name.items()},
+        "total": total,
+        "targets": [{"target": what, "reached": reached, "met": met} for what, reached, met in targets(total)],
+        "worst": worst(lines),
+    }
+
+
+def write(results: dict[str, Any], lines: list[dict[str, Any]], folder: Path) -> None:
+    """``integrity.md``, ``integrity.json`` and ``integrity/*.png`` in a folder that is there."""
+    from benchmarks import integrity_plots
+
+    pictures = integrity_plots.draw(lines, folder / PICTURES)
+    text = integrity_table.as_markdown(results, [picture.name for picture in pictures])
+    (folder / "integrity.md").write_text(text, encoding="utf-8")
+    (folder / "integrity.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")

@@ -1,0 +1,260 @@
+"""The monitor over one scene of ``tools/bench integrity``: what it published in each frame against the truth.
+
+The result of a scene is a dictionary of plain values, one line of JSON: lists have an element a frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from benchmarks import rendered
+from benchmarks.integrity_conditions import CONDITIONS
+from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
+from benchmarks.machine import commit
+from benchmarks.rendered import Rendered
+from gripmon.camera import Camera
+from gripmon.drift import DriftSettings
+from gripmon.geometry import from_record, perturbation_between, rotation_angle, to_record
+from gripmon.gripper import Gripper
+from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.records import (
+    Alert,
+    AlertEvent,
+    AlertKind,
+    Array,
+    Cause,
+    Frame,
+    FrameRecord,
+    Origin,
+    ReferenceRecord,
+    Verdict,
+)
+from gripmon.simulator import Scenario
+from gripmon.simulator.scenario import Bump
+
+TIP_SEEN = 0.5
+"""Share of the visible edges of a fingertip from which its outline counts as seen."""
+_WHOLE = 0.995
+_CONFIRMED_FRAMES = 3
+_BENT_MM = 0.05
+_BY_NAME = {condition.name: condition for condition in CONDITIONS}
+
+
+class View(IntEnum):
+    """What is seen of the gripper in a frame."""
+
+    FREE = 0
+    BOTH_TIPS = 1
+    ONE_TIP = 2
+    NO_TIP = 3
+
+
+@dataclass(frozen=True)
+class Look:
+    """A frame with its truth.  ``enough``: ``valid`` may be asked for as far as the view allows."""
+
+    frame: Frame
+    cam_T_grip: Array
+    view: View
+    enough: bool
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A sequence and what the monitor is told before it."""
+
+    camera: Camera
+    gripper: Gripper
+    start_cam_T_grip: Array
+    start_covariance: Array
+    jaw_sigma_m: float | None
+    fps: float
+    moves: bool
+    inside: bool
+    looks: Iterable[Look]
+
+
+def names() -> list[str]:
+    """Names of all conditions, and of the rendered sequences that are there."""
+    return [*_BY_NAME, *rendered.all_row_names()]
+
+
+def is_rendered(name: str) -> bool:
+    return name not in _BY_NAME
+
+
+def about(name: str) -> str:
+    """What happens in a condition."""
+    return "independent renderer" if is_rendered(name) else _BY_NAME[name].what
+
+
+def scene_numbers(name: str, scenes: int) -> range:
+    """Scenes of a condition; of a rendered sequence there are as many as there are."""
+    return range(len(rendered.sequences(name)) if is_rendered(name) else scenes)
+
+
+def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
+    """One scene, judged."""
+    start_s = time.perf_counter()
+    if is_rendered(name):
+        watched = _rendered(rendered.sequences(name)[number])
+    else:
+        watched = _simulated(make_integrity_scene(_BY_NAME[name], seed, number, frames))
+    settings = _settings(watched)
+    monitor = Monitor(watched.camera, watched.gripper, settings, _reference(watched), None)
+    rows: list[dict[str, Any]] = []
+    alerts: list[list[Any]] = []
+    for index, look in enumerate(watched.looks):
+        record = monitor.process(look.frame)
+        rows.append(_judged(record, look))
+        if not watched.moves:
+            alerts += [[index, alert.text] for alert in record.alerts if _says_camera(alert)]
+    policy = settings.policy
+    return {
+        "condition": name,
+        "seed": seed,
+        "scene": number,
+        "asked": frames,
+        "commit": commit(),
+        "gripper": watched.gripper.name,
+        "fps": watched.fps,
+        "depth_m": _short(watched.start_cam_T_grip[2, 3]),
+        "focal_px": _short(watched.camera.fx_px),
+        "jaw_exact": watched.jaw_sigma_m == 0.0,
+        "inside": watched.inside,
+        "moves": watched.moves,
+        "limit_m": policy.alert_limit_m,
+        "limit_rad": policy.alert_limit_rad,
+        "camera_alerts": alerts,
+        "seconds": round(time.perf_counter() - start_s, 2),
+        **{key: [row[key] for row in rows] for key in rows[0]},
+    }
+
+
+def _says_camera(alert: Alert) -> bool:
+    """Whether an alert newly says that the camera's mount moved."""
+    kinds = (AlertKind.STEP, AlertKind.DRIFT, AlertKind.CREEP)
+    new = alert.event in (AlertEvent.RAISED, AlertEvent.UPDATED)
+    return alert.kind in kinds and alert.cause is Cause.CAMERA_MOUNT and new
+
+
+def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
+    """A record against the truth: errors and bounds in m and rad, None where nothing was published."""
+    out: dict[str, Any] = {
+        "view": int(look.view),
+        "enough": look.enough,
+        "valid": record.verdict is Verdict.VALID,
+        "error_m": None,
+        "error_rad": None,
+        "level_m": None,
+        "level_rad": None,
+        "nees": None,
+        "why": "",
+    }
+    if record.cam_T_grip is None or record.covariance is None:
+        return out
+    cam_T_grip = from_record(record.cam_T_grip)
+    error = perturbation_between(cam_T_grip, look.cam_T_grip)
+    out["error_m"] = _short(np.linalg.norm(error[:3]))
+    out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ look.cam_T_grip[:3, :3]))
+    if record.source is not Origin.HELD:
+        out["nees"] = _short(error @ np.linalg.solve(np.reshape(record.covariance, (6, 6)), error))
+    if record.protection is not None:
+        out["level_m"] = _short(record.protection.position_m)
+        out["level_rad"] = _short(record.protection.rotation_rad)
+        out["why"] = record.protection.hypothesis
+    return out
+
+
+def _short(value: float) -> float:
+    """Four digits: what pictures and counts need."""
+    return float(f"{value:.4g}")
+
+
+def _settings(watched: Watched) -> MonitorSettings:
+    known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
+    return MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
+
+
+def _reference(watched: Watched) -> ReferenceRecord:
+    covariance = tuple(watched.start_covariance.ravel().tolist())
+    return ReferenceRecord("start", 0, 0, "configuration", to_record(watched.start_cam_T_grip), covariance)
+
+
+def _simulated(scene: IntegrityScene) -> Watched:
+    simulator, condition = scene.simulator, scene.condition
+
+    def looks() -> Iterator[Look]:
+        for index in scene.indices:
+            truth = simulator.truth(index)
+            enough = condition.enough and not _just_bumped(simulator.scenario, truth.time_s)
+            yield Look(simulator.frame(index), truth.cam_T_grip, _view(scene, index), enough)
+
+    return Watched(
+        simulator.camera,
+        scene.gripper,
+        scene.start_cam_T_grip,
+        scene.start_covariance,
+        scene.jaw_sigma_m,
+        simulator.scenario.fps,
+        condition.moves,
+        scene.first > 0,
+        looks(),
+    )
+
+
+def _just_bumped(scenario: Scenario, time_s: float) -> bool:
+    """Whether the mount has jumped a moment ago: what jumped has to be confirmed, or still rings."""
+    settled_s = _CONFIRMED_FRAMES / scenario.fps
+    return any(
+        0.0 <= time_s - bump.at_s < (5.0 * bump.ring_decay_s if bump.ring_fraction > 0.0 else 0.0) + settled_s
+        for bump in scenario.mount
+        if isinstance(bump, Bump)
+    )
+
+
+def _view(scene: IntegrityScene, index: int) -> View:
+    seen = scene.simulator.outline_seen(index)
+    if (seen.tips > _WHOLE).all() and (seen.edges > _WHOLE).all():
+        return View.FREE
+    return _by_tips(int((seen.tips >= TIP_SEEN).sum()))
+
+
+def _by_tips(tips: int) -> View:
+    return View.BOTH_TIPS if tips >= 2 else View.ONE_TIP if tips == 1 else View.NO_TIP
+
+
+def _rendered(sequence: Rendered) -> Watched:
+    """The truth there names the corners that something hides; a tip with none left counts as hidden."""
+    first = np.array(sequence.frames[0]["camera_T_gripper"])
+    moves = any(not np.allclose(frame["camera_T_gripper"], first, atol=1e-9) for frame in sequence.frames)
+    offsets_mm = [
+        frame["finger_offset_mm"][finger] for frame in sequence.frames for finger in frame["finger_offset_mm"]
+    ]
+    bent = bool(np.abs(offsets_mm).max() > _BENT_MM)
+
+    def looks() -> Iterator[Look]:
+        for shot in sequence.shots():
+            truth = sequence.frames[shot.frame.seq // sequence.repeat]
+            hidden = {*truth["occluded"], *truth["outside"]}
+            tips = {name[0] for name in truth["corners"] if name not in hidden}
+            free = not hidden and not truth["conditions"]["held"] and not truth["conditions"]["hand"]
+            yield Look(shot.frame, shot.cam_T_grip, View.FREE if free else _by_tips(len(tips)), not bent)
+
+    return Watched(
+        sequence.camera,
+        sequence.gripper,
+        sequence.start_cam_T_grip,
+        sequence.start_covariance,
+        sequence.jaw_sigma_m,
+        sequence.fps,
+        moves,
+        False,
+        looks(),
+    )

@@ -1,0 +1,169 @@
+"""Scenes of ``tools/bench integrity``: a condition with a drawn camera, gripper, pose, opening, light and frame rate.
+
+Every scene is a pure function of the condition's name, the seed, the scene's number and its number of frames.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from benchmarks.integrity_conditions import Condition, Draft
+from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
+from gripmon.camera import Camera, PaperLens, make_camera
+from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.gripper import Gripper, GripperModel
+from gripmon.records import Array
+from gripmon.simulator import Scenario, Simulator
+from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+
+LEAD_FRAMES = (15, 20)
+"""Frames at the start of a scene in which the gripper is seen free."""
+INSIDE_SHARE = 0.1
+"""Share of scenes that start in the midst of what their condition does."""
+_INSIDE_AT = (0.3, 0.6)
+_BORDER_PX = 14.0
+_KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
+_JAW_NOISE_M = 3e-5
+
+
+@dataclass(frozen=True)
+class IntegrityScene:
+    """A simulated sequence and what the monitor is told before it.
+
+    The sequence begins at frame ``first`` of the simulator; ``jaw_sigma_m`` None: the product's default.
+    """
+
+    condition: Condition
+    simulator: Simulator
+    gripper: Gripper
+    start_cam_T_grip: Array
+    start_covariance: Array
+    jaw_sigma_m: float | None
+    first: int
+    frames: int
+
+    @property
+    def indices(self) -> Iterator[int]:
+        """The simulator's frames in order."""
+        yield from range(self.first, self.first + self.frames)
+
+
+def make_integrity_scene(condition: Condition, seed: int, number: int, frames: int) -> IntegrityScene:
+    """Scene ``number`` of a condition."""
+    rng = np.random.default_rng([seed, zlib.crc32(b"integrity " + condition.name.encode()), number])
+    camera = _camera(rng)
+    model = gripper_models()[number % len(gripper_models())]
+    gripper = Gripper(msgspec.convert(model, GripperModel))
+    cam_T_grip, opening_m = _placed(rng, camera, gripper)
+    draft = _draft(rng, frames, gripper, cam_T_grip, opening_m)
+    shown = gripper
+    if condition.truth is not None:
+        shown = Gripper(msgspec.convert(condition.truth(rng, model), GripperModel))
+    scenario = _scenario(condition, draft)
+    simulator = Simulator(camera, shown, cam_T_grip, scenario, seed=int(rng.integers(2**31)))
+    sigma = np.array([START_SIGMA_M] * 3 + [START_SIGMA_RAD] * 3)
+    inside = condition.inside and rng.random() < INSIDE_SHARE
+    first = round(draft.at_s(float(rng.uniform(*_INSIDE_AT))) * draft.fps) if inside else 0
+    return IntegrityScene(
+        condition=condition,
+        simulator=simulator,
+        gripper=gripper,
+        start_cam_T_grip=perturb(simulator.truth(first).cam_T_grip, rng.normal(0.0, sigma)),
+        start_covariance=np.diag(sigma**2),
+        jaw_sigma_m=0.0 if scenario.jaw.reported_noise_m == 0.0 and not scenario.jaw.reported_offset_m else None,
+        first=first,
+        frames=frames,
+    )
+
+
+def _scenario(condition: Condition, draft: Draft) -> Scenario:
+    """An ordinary scene with the condition's changes."""
+    sections: dict[str, Any] = {
+        "name": condition.name,
+        "fps": draft.fps,
+        "duration_s": draft.frames / draft.fps,
+        "background": draft.background,
+        "fingers": draft.fingers,
+        "sensor": draft.sensor,
+        "jaw": draft.jaw,
+    }
+    return Scenario(**{**sections, **condition.changes(draft)})
+
+
+def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: Array, opening_m: float) -> Draft:
+    """Times and looks of an ordinary scene."""
+    fps = float(rng.integers(15, 31))
+    lead = int(rng.integers(LEAD_FRAMES[0], LEAD_FRAMES[1] + 1)) if frames >= 60 else max(frames // 4, 1)
+    background = Background(
+        kind=_KINDS[rng.integers(len(_KINDS))],  # type: ignore[arg-type]
+        level_dn=float(rng.uniform(40.0, 200.0)),
+        contrast=float(rng.uniform(0.3, 0.9)),
+        distance_m=float(rng.uniform(0.06, 0.3)),
+        speed_m_per_s=float(rng.uniform(0.03, 0.12)),
+        motion=str(rng.choice(("wander", "linear", "stop_and_go"))),  # type: ignore[arg-type]
+    )
+    fingers = FingerLook(
+        level_dn=float(rng.uniform(50.0, 170.0)),
+        ambient=float(rng.uniform(0.25, 0.5)),
+        lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
+        texture=float(rng.uniform(0.03, 0.2)),
+        highlights=float(rng.uniform(0.0, 2.0)) if rng.random() < 0.2 else 0.0,
+    )
+    noise_m = _JAW_NOISE_M if rng.random() < 0.5 else 0.0
+    return Draft(
+        rng=rng,
+        frames=frames,
+        fps=fps,
+        start_s=lead / fps,
+        end_s=(frames - lead) / fps,
+        gripper=gripper,
+        cam_T_grip=cam_T_grip,
+        opening_m=opening_m,
+        background=background,
+        fingers=fingers,
+        sensor=Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)), exposure_time_s=float(rng.uniform(0.001, 0.006))),
+        jaw=JawScript(knots=((0.0, opening_m),), reported_noise_m=noise_m),
+    )
+
+
+def _camera(rng: np.random.Generator) -> Camera:
+    """Mostly that of the paper; some smaller ones, and other focal lengths."""
+    kind = rng.random()
+    if kind < 0.6:
+        return make_camera(CAMERA)
+    width, height = (640, 480) if kind < 0.8 else (768, 576)
+    focal_px = float(rng.uniform(0.75, 1.35)) * width
+    middle = (0.5 * np.array([width, height]) - 0.5 + rng.uniform(-8.0, 8.0, 2)).tolist()
+    kappa = float(rng.uniform(-0.5, 1.5)) * 1.9e-7 * (768 / width) ** 2
+    lens = PaperLens(
+        width_px=width,
+        height_px=height,
+        fx_px=focal_px,
+        fy_px=focal_px * float(rng.uniform(0.99, 1.01)),
+        cx_px=middle[0],
+        cy_px=middle[1],
+        kappa_per_px2=kappa,
+    )
+    return make_camera(lens)
+
+
+def _placed(rng: np.random.Generator, camera: Camera, gripper: Gripper) -> tuple[Array, float]:
+    """A pose and an opening at which all of the fingertips are in the image, also some millimetres wider."""
+    for _ in range(10000):
+        turn = exp_rotation(np.deg2rad([rng.uniform(20.0, 45.0), rng.uniform(-5.0, 5.0), rng.uniform(-5.0, 5.0)]))
+        depth_m = rng.uniform(0.08, 0.2)
+        tcp_m = np.array([*rng.uniform(-0.06, 0.06, 2) * depth_m, depth_m])
+        opening_m = gripper.jaw_nominal_m + float(rng.uniform(-14e-3, 10e-3))
+        opening_m = min(max(opening_m, 10e-3), gripper.jaw_max_m - 4e-3)
+        corners = gripper.points_grip_m(opening_m + 4e-3)[gripper.corner_points]
+        uv = camera.project(corners @ turn.T + tcp_m)
+        limit = np.array([camera.width_px, camera.height_px]) - 1.0 - _BORDER_PX
+        if (uv > _BORDER_PX).all() and (uv < limit).all():
+            return make_transform(turn, tcp_m), opening_m
+    raise ValueError(f"gripper {gripper.name} does not fit into the image")

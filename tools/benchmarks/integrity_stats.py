@@ -1,0 +1,224 @@
+"""Figures of ``tools/bench integrity`` from the lines of its scenes: misleading frames, availability, levels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+BACK_FRAMES = 3
+"""Within so many frames after the view is free the transform has to be valid."""
+LEVEL_OVER_ERROR = 12.0
+NEES_RANGE = (4.5, 7.5)
+AVAILABLE = (0.99, 0.95, 0.80)
+"""Least share of valid frames where nothing is hidden, both tips are seen, and one is."""
+BACK_SHARE = 0.999
+VIEWS = ("nothing hidden", "both tips seen", "one tip hidden", "no tip seen")
+WORST = 10
+_CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Frames:
+    """All frames of some scenes, an array element a frame; NaN where nothing was published or bounded.
+
+    ``line`` is the scene's number in the list; ``asked``: availability is judged there.  ``back``: for each time that
+    the view became free, the frames until the transform was valid (inf: not before the end).
+    """
+
+    line: NDArray[np.intp]
+    index: NDArray[np.intp]
+    view: NDArray[np.intp]
+    valid: NDArray[np.bool_]
+    asked: NDArray[np.bool_]
+    error_m: NDArray[np.float64]
+    level_m: NDArray[np.float64]
+    excess: NDArray[np.float64]
+    """Error over protection level, the larger of position's and rotation's."""
+    over_limit: NDArray[np.float64]
+    """Error over alert limit, likewise."""
+    nees: NDArray[np.float64]
+    back: NDArray[np.float64]
+
+    @property
+    def lies(self) -> NDArray[np.bool_]:
+        """Valid and beyond the alert limit."""
+        return self.valid & (self.over_limit > 1.0)
+
+    @property
+    def unbounded(self) -> NDArray[np.bool_]:
+        """Valid and beyond the protection level, or without one."""
+        return self.valid & ~(self.excess <= 1.0)
+
+    @property
+    def suspect_unbounded(self) -> NDArray[np.bool_]:
+        """Published with a bound, not valid, and beyond it."""
+        return ~self.valid & (self.excess > 1.0)
+
+
+def collect(lines: list[dict[str, Any]]) -> Frames:
+    """The judged frames of scenes: all but each scene's first, which a second has to confirm."""
+    parts = [_columns(number, line) for number, line in enumerate(lines)]
+    columns = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    back = np.array([frames for line in lines for frames in _back(line)], dtype=float)
+    return Frames(**columns, back=back)
+
+
+def _columns(number: int, line: dict[str, Any]) -> dict[str, NDArray[Any]]:
+    values = {key: np.array(line[key], dtype=float) for key in ("error_m", "error_rad", "level_m", "level_rad", "nees")}
+    view = np.array(line["view"], dtype=np.intp)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        excess = np.fmax(values["error_m"] / values["level_m"], values["error_rad"] / values["level_rad"])
+        over_limit = np.fmax(values["error_m"] / line["limit_m"], values["error_rad"] / line["limit_rad"])
+    columns = {
+        "line": np.full(len(view), number, dtype=np.intp),
+        "index": np.arange(len(view)),
+        "view": view,
+        "valid": np.array(line["valid"], dtype=bool),
+        "asked": np.array(line["enough"], dtype=bool) & ~_just_freed(view),
+        "error_m": values["error_m"],
+        "level_m": values["level_m"],
+        "excess": excess,
+        "over_limit": over_limit,
+        "nees": values["nees"],
+    }
+    return {key: column[1:] for key, column in columns.items()}
+
+
+def _freed(view: NDArray[np.intp]) -> list[int]:
+    """Frames in which the whole gripper is seen, the first after a tip was hidden."""
+    out, hidden = [], False
+    for index, what in enumerate(view.tolist()):
+        if what >= 2:
+            hidden = True
+        elif what == 0 and hidden:
+            out.append(index)
+            hidden = False
+    return out
+
+
+def _just_freed(view: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Frames that :data:`BACK_FRAMES` is about: they don't count as unavailable, too."""
+    out = np.zeros(len(view), dtype=bool)
+    for index in _freed(view):
+        out[index : index + BACK_FRAMES - 1] = True
+    return out
+
+
+def _back(line: dict[str, Any]) -> list[float]:
+    """Frames from the first with a free view to the first valid one, both counted; only where that may be asked for."""
+    view, out = np.array(line["view"], dtype=np.intp), []
+    for index in _freed(view):
+        valid, enough = line["valid"][index:], line["enough"][index:]
+        if len(valid) < BACK_FRAMES or not all(enough[:BACK_FRAMES]):
+            continue
+        out.append(float(valid.index(True) + 1) if True in valid else np.inf)
+    return out
+
+
+def upper_bound(events: int, trials: int) -> float:
+    """Exact upper bound (Clopper and Pearson 1934) on a probability, one-sided, for independent trials."""
+    return 1.0 if events >= trials else float(stats.beta.ppf(_CONFIDENCE, events + 1, trials - events))
+
+
+def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Everything that the table shows of some scenes."""
+    frames = collect(lines)
+    count, lies, unbounded = len(frames.view), int(frames.lies.sum()), int(frames.unbounded.sum())
+    good = frames.valid & np.isfinite(frames.level_m)
+    error, level = (float(np.median(x[good])) if good.any() else None for x in (frames.error_m, frames.level_m))
+    nees = frames.nees[frames.valid & np.isfinite(frames.nees)]
+    return {
+        "scenes": len(lines),
+        "frames": count,
+        "lies": lies,
+        "lies_at_most": upper_bound(lies, count),
+        "unbounded": unbounded,
+        "unbounded_at_most": upper_bound(unbounded, count),
+        "suspect_unbounded": int(frames.suspect_unbounded.sum()),
+        "misleading_scenes": len(set(frames.line[frames.lies | frames.unbounded].tolist())),
+        "available": [_share(frames.valid[frames.asked & (frames.view == view)]) for view in range(4)],
+        "asked": [int((frames.asked & (frames.view == view)).sum()) for view in range(4)],
+        "median_error_m": error,
+        "median_level_m": level,
+        "level_over_error": level / error if error and level else None,
+        "nees": float(nees.mean()) if len(nees) else None,
+        "median_nees": float(np.median(nees)) if len(nees) else None,
+        "freed": len(frames.back),
+        "back": _share(frames.back <= BACK_FRAMES),
+        "latest_back": float(frames.back.max()) if len(frames.back) else None,
+        "camera_alerts": sum(len(line["camera_alerts"]) for line in lines),
+        "alert_scenes": sum(bool(line["camera_alerts"]) for line in lines),
+        "seconds": float(sum(line["seconds"] for line in lines)),
+    }
+
+
+def _share(what: NDArray[np.bool_]) -> float | None:
+    return float(what.mean()) if len(what) else None
+
+
+def worst(lines: list[dict[str, Any]], count: int = WORST) -> list[dict[str, Any]]:
+    """The worst frames, one of each scene: by how far a valid one misled, then by the errors of the bounded ones."""
+    found = []
+    frames = collect(lines)
+    badness = np.where(frames.valid, np.fmax(frames.over_limit, frames.excess), 1e-3 * frames.excess)
+    for number, line in enumerate(lines):
+        own = np.flatnonzero((frames.line == number) & np.isfinite(badness))
+        if not len(own):
+            continue
+        at = int(own[np.argmax(badness[own])])
+        found.append(
+            {
+                "badness": float(badness[at]),
+                "condition": line["condition"],
+                "seed": line["seed"],
+                "scene": line["scene"],
+                "frame": int(frames.index[at]),
+                "valid": bool(frames.valid[at]),
+                "error_m": float(frames.error_m[at]),
+                "level_m": None if np.isnan(frames.level_m[at]) else float(frames.level_m[at]),
+                "view": VIEWS[int(frames.view[at])],
+                "why": line["why"][int(frames.index[at])],
+                "misleading": int((frames.lies | frames.unbounded)[own].sum()),
+            }
+        )
+    return sorted(found, key=lambda item: -item["badness"])[:count]
+
+
+def targets(total: dict[str, Any]) -> list[tuple[str, str, bool | None]]:
+    """Each target, what was reached, and whether it is met (None: nothing to judge it by)."""
+
+    def share(value: float | None) -> str:
+        return "–" if value is None else f"{100.0 * value:.2f} %"
+
+    out: list[tuple[str, str, bool | None]] = [
+        ("no valid frame beyond the alert limit", str(total["lies"]), total["lies"] == 0),
+        ("no valid frame beyond its protection level", str(total["unbounded"]), total["unbounded"] == 0),
+    ]
+    for view, least in enumerate(AVAILABLE):
+        reached = total["available"][view]
+        met = None if reached is None else reached >= least
+        out.append((f"valid where {VIEWS[view]}: at least {100.0 * least:g} %", share(reached), met))
+    ratio, nees, back = total["level_over_error"], total["nees"], total["back"]
+    out += [
+        (
+            f"median protection level at most {LEVEL_OVER_ERROR:g} x the median error",
+            "–" if ratio is None else f"{ratio:.1f}",
+            None if ratio is None else ratio <= LEVEL_OVER_ERROR,
+        ),
+        (
+            f"valid again within {BACK_FRAMES} frames: at least {100.0 * BACK_SHARE:g} %",
+            f"{share(back)} of {total['freed']}",
+            None if back is None else back >= BACK_SHARE,
+        ),
+        (
+            "mean NEES of valid frames 6 ± 25 %",
+            "–" if nees is None else f"{nees:.1f}",
+            None if nees is None else NEES_RANGE[0] <= nees <= NEES_RANGE[1],
+        ),
+        ("no false alert that the camera moved", str(total["camera_alerts"]), total["camera_alerts"] == 0),
+    ]
+    return out

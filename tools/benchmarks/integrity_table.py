@@ -1,0 +1,186 @@
+"""The results of ``tools/bench integrity`` in words: a table, the targets, the worst frames."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from benchmarks.integrity_stats import VIEWS, targets
+
+HEAD = (
+    "condition",
+    "scenes",
+    "frames",
+    "> AL",
+    "at most",
+    "> PL",
+    "at most",
+    "suspect > PL",
+    "in scenes",
+    "valid: free %",
+    "both tips %",
+    "one tip %",
+    "no tip %",
+    "PL µm",
+    "error µm",
+    "PL/error",
+    "NEES",
+    "back %",
+    "latest",
+    "alerts",
+)
+LEGEND = tuple(
+    """\
+> AL, > PL: valid frames whose error (TCP position, or rotation) exceeds the alert limit, or the frame's own \
+protection level; at most: exact 95 % upper bound on the rate, as if frames were independent; in scenes: with at least \
+one of either
+suspect > PL: published with a bound but not valid, and beyond the bound
+valid: share where the whole gripper is seen, where something hides part of it but both tips' outlines are seen, where \
+one tip is hidden, and where both are; without conditions in which the gripper isn't as told, without the frames just \
+after a jump or after the view became free
+PL µm, error µm: medians of valid frames; NEES: mean of valid frames
+back: valid within 3 frames after the view is free again; latest: the most frames that it took
+alerts: that the camera's mount moved, where it never did""".splitlines()
+)
+
+
+def cells(name: str, row: dict[str, Any]) -> list[str]:
+    """A condition's line."""
+    return [
+        name,
+        str(row["scenes"]),
+        str(row["frames"]),
+        str(row["lies"]),
+        f"{row['lies_at_most']:.1g}",
+        str(row["unbounded"]),
+        f"{row['unbounded_at_most']:.1g}",
+        str(row["suspect_unbounded"]),
+        str(row["misleading_scenes"]),
+        *(percent(share) for share in row["available"]),
+        microns(row["median_level_m"]),
+        microns(row["median_error_m"]),
+        number(row["level_over_error"]),
+        number(row["nees"]),
+        percent(row["back"]),
+        number(row["latest_back"]),
+        str(row["camera_alerts"]),
+    ]
+
+
+def percent(share: float | None) -> str:
+    return "–" if share is None else f"{100.0 * share:.1f}"
+
+
+def microns(length_m: float | None) -> str:
+    return "–" if length_m is None else f"{1e6 * length_m:.3g}"
+
+
+def number(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return "never" if math.isinf(value) else f"{value:.3g}" if abs(value) < 1e4 else f"{value:.0f}"
+
+
+def table(results: dict[str, Any]) -> list[list[str]]:
+    """Head, a line for each condition, and one for all together."""
+    rows = [cells(name, row) for name, row in results["rows"].items()]
+    return [list(HEAD), *rows, cells("all", results["total"])]
+
+
+def target_lines(total: dict[str, Any]) -> list[str]:
+    words = {True: "met", False: "MISSED", None: "not judged"}
+    return [f"{what}: {reached} - {words[met]}" for what, reached, met in targets(total)]
+
+
+def worst_lines(worst: list[dict[str, Any]]) -> list[str]:
+    """How to see each of the worst frames again, and what it was."""
+    lines = []
+    for item in worst:
+        level = "no" if item["level_m"] is None else f"{1e3 * item['level_m']:.3g} mm"
+        verdict = "valid" if item["valid"] else "suspect"
+        lines.append(
+            f'--only "{item["condition"]}" --seed {item["seed"]} --scene {item["scene"]}: frame {item["frame"]}, '
+            f"{verdict}, error {1e3 * item['error_m']:.3g} mm, protection level {level}, {item['view']}"
+            f"{'; ' + item['why'] if item['why'] else ''}; {item['misleading']} misleading frames in this scene"
+        )
+    return lines
+
+
+def frame_lines(line: dict[str, Any]) -> list[str]:
+    """One scene frame by frame."""
+    rows = [["frame", "view", "verdict", "error mm", "PL mm", "error mrad", "PL mrad", "NEES", "hypothesis"]]
+    for index, view in enumerate(line["view"]):
+        values = [line[key][index] for key in ("error_m", "level_m", "error_rad", "level_rad")]
+        scaled = ["–" if value is None else f"{1e3 * value:.3g}" for value in values]
+        verdict = "valid" if line["valid"][index] else "suspect" if values[0] is not None else "unknown"
+        rows.append([str(index), VIEWS[view], verdict, *scaled, number(line["nees"][index]), line["why"][index]])
+    title = (
+        f"{line['condition']}, seed {line['seed']}, scene {line['scene']}: {line['gripper']}, {line['fps']:g} frames/s"
+    )
+    alerts = [f"frame {frame}: false alert: {text}" for frame, text in line["camera_alerts"]]
+    return [title, aligned(rows), *alerts, ""]
+
+
+def aligned(rows: list[list[str]]) -> str:
+    """Columns of equal width; the first to the left."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        padded = [
+            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(padded))
+    return "\n".join(lines)
+
+
+def as_text(results: dict[str, Any]) -> str:
+    """The report on the terminal."""
+    parts = [
+        *about(results),
+        "",
+        aligned(table(results)),
+        "",
+        *LEGEND,
+        "",
+        *target_lines(results["total"]),
+        "",
+        "worst frames, one of each scene:",
+        *worst_lines(results["worst"]),
+    ]
+    return "\n".join(parts)
+
+
+def as_markdown(results: dict[str, Any], pictures: list[str]) -> str:
+    """The report as a file."""
+    head, *rows = table(results)
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in rows)]
+    parts = [
+        "# Integrity",
+        "Written by `tools/bench integrity --out docs`. Figures behind it: [integrity.json](integrity.json).",
+        "\n".join(f"- {line}" for line in about(results)),
+        "\n".join(lines),
+        "\n".join(f"- {line}" for line in LEGEND),
+        "## Targets",
+        "\n".join(f"- {line}" for line in target_lines(results["total"])),
+        "## Worst frames",
+        "\n".join(
+            f"- `{line.partition(': ')[0]}`: {line.partition(': ')[2]}" for line in worst_lines(results["worst"])
+        ),
+        *(f"![Stanford diagram](integrity/{name})" for name in pictures),
+        "## Conditions",
+        "\n".join(f"- {name}: {row['what']}" for name, row in results["rows"].items()),
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def about(results: dict[str, Any]) -> list[str]:
+    """Where, when and on what this was measured."""
+    machine, plan = results["machine"], results["plan"]
+    seconds = results["total"]["seconds"]
+    each_s = seconds / max(results["total"]["scenes"], 1)
+    limits = f"{1e3 * results['limit_m']:g} mm and {math.degrees(results['limit_rad']):.2g} degrees"
+    return [
+        f"commit {', '.join(results['commits'])}, {machine['date']}, {machine['cpu']}",
+        f"seed {plan['seed']}, {plan['scenes']} scenes a condition, {plan['frames']} frames a scene",
+        f"alert limit {limits}; {each_s:.1f} s a scene on one core, {seconds / 60.0:.1f} min in all",
+    ]
