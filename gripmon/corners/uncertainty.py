@@ -49,7 +49,9 @@ class Uncertainty:
     normal: NormalEquations
 
 
-def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Uncertainty:
+def assess(
+    votes: Votes, consensus: Consensus, prior_information: Array, expected_shared_px: float = 0.0
+) -> Uncertainty:
     """Covariance of a fit whose points err together.
 
     Texture on and behind an edge moves it, and neighbours with it.  That shows in the weighted means of the residuals
@@ -63,7 +65,7 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
         H^-1 (c N + tau² sum_stretches g g' + k² sum_edges spread² g g' + P) H^-1,   H = k N + P
 
     c and tau² come from the biweight's pulls, which are smaller than the residuals, so that only the edges' spread,
-    which is given in px, has to be multiplied by k.
+    which is given in px, has to be multiplied by k.  ``expected_shared_px``: at least this much of tau is assumed.
     """
     inlier = np.flatnonzero(consensus.weight)
     stiffness = consensus.stiffness
@@ -93,6 +95,7 @@ def assess(votes: Votes, consensus: Consensus, prior_information: Array) -> Unce
     scatter, shared = max(min(contradiction, 1.0), _SMALLEST_SCATTER), 0.0
     if contradiction > 1.0:
         shared = (contradiction - 1.0) * len(total) / float(total.sum())
+    shared = max(shared, (stiffness * expected_shared_px) ** 2)
     jacobian = prediction.jacobian_by_unknown[:, sample]
     weighted = jacobian * weight
     pulls = np.add.reduceat(weighted, first, axis=1)

@@ -3,5 +3,6 @@
 from gripmon.monitor.core import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS, Tracker
+from gripmon.monitor.trust import foresee_protection
 
-__all__ = ["CORNER_COUNTS", "Monitor", "MonitorSettings", "Tracker"]
+__all__ = ["CORNER_COUNTS", "Monitor", "MonitorSettings", "Tracker", "foresee_protection"]

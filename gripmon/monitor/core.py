@@ -101,7 +101,7 @@ class Monitor:
         self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
-        self._trust = Integrity(self._tracker, gripper, settings)
+        self._trust = Integrity(self._tracker, gripper, settings, reference)
         self._standing: Standing | None = None
         self._now_s = 0.0  # time that has passed since the first frame
         self._measured_s: float | None = None

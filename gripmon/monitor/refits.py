@@ -11,7 +11,7 @@ from gripmon.geometry import perturb, perturbation_between
 from gripmon.integrity import Hypotheses, Separation, levels, separate
 from gripmon.records import Array, Protection
 
-INFLATION = 1.5
+INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""
 
 UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0

@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners import Effort, FingerEndsSeen, Measurement
-from gripmon.geometry import perturbation_between
+from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.integrity import Hypotheses, bounds, hypotheses_of
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Refits, larger
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
-from gripmon.records import Array, Frame, Protection
+from gripmon.policy import past_alert_limit
+from gripmon.records import Array, Frame, Protection, ReferenceRecord
 
 SECONDS_A_MONTH = 30.0 * 86400.0
 
@@ -32,8 +33,11 @@ SWINGS = 20.0
 DISPLACED = 33.1
 """Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
 
-UNCONFIRMED_ENDS = {0: 1.0, 1: 1e-2}
-"""Probability that what looks like the fingers' ends is none, by how many fingers show theirs; nil from two on."""
+MISREAD_CORNER = 0.1
+"""Probability that a corner at a finger's end that is seen as such belongs to something else, a border that crosses it."""
+
+CORNERS_WHERE_EXPECTED = 3
+"""Such corners that prove a pose where the gripper is expected: two fingers' four do anywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +85,8 @@ class Standing:
 class Integrity:
     """Bounds for one monitor's frames, and the anchor that they rest on."""
 
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings):
+    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+        self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._floor = np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
         creep = settings.smoothing
@@ -105,7 +110,8 @@ class Integrity:
         trust = self.weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY == 0
         self._frames += 1
-        if due or trust.displaced or self.anchor is None:
+        short = past_alert_limit(trust.protection, self._policy) is not None
+        if due or short or trust.displaced or self.anchor is None:
             trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
         if trust.displaced and trust.instead is not None and not trust.proven:
             cam_T_grip, covariance = trust.instead
@@ -129,22 +135,24 @@ class Integrity:
             nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
             return Trust(nothing, nothing, False)
         hypotheses = self._hypotheses(edges)
-        proven = ends is not None and ends.sure
-        misread = 0.0 if proven else UNCONFIRMED_ENDS[0 if ends is None else min(ends.proven, 1)]
-        prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread
         fits = Refits(measurement, cam_T_grip, hypotheses, self._floor)
-        lasting = np.where(hypotheses.sudden, 0.0, prior)
-        lasting[hypotheses.ends] = misread
-        alone = now = fits.bound(fits.free, lasting, risk)
         anchor = self.anchor
-        if anchor is None:
-            return Trust(now, now, proven)
         wander = self._wander(now_s)
-        anchored = fits.anchored(anchor.cam_T_grip, anchor.covariance + np.diag(wander))
+        expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
+        anchored = fits.anchored(expected_T, covariance + np.diag(wander))
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
         displaced = not holds[0]
+        corners = 0 if ends is None else int(ends.seen.sum())
+        proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
+        misread = 0.0 if proven else MISREAD_CORNER**corners
+        prior = hypotheses.prior.copy()
+        prior[hypotheses.ends] = misread
+        lasting = np.where(hypotheses.sudden, 0.0, prior)
+        lasting[hypotheses.ends] = misread
+        alone = now = fits.bound(fits.free, lasting, risk)
+        if anchor is None:
+            return Trust(now, now, proven)
         jumped = self._jumps_per_s * (now_s - anchor.now_s) * misread > risk
         sudden = fits.bound(anchored, np.where(holds, prior, 0.0), risk)
         if not (displaced or jumped):
@@ -172,23 +180,38 @@ class Integrity:
     def _settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one, bounded by itself."""
         if self.anchor is not None:
-            way = perturbation_between(self.anchor.cam_T_grip, cam_T_grip)
-            self._swing = self._swing + (way * way - self._swing) / SWINGS
+            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
+            # A knock is no vibration, but what rings after it is.
+            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self._swing
+            self._swing = self._swing + (np.minimum(square, DISPLACED * noise) - self._swing) / SWINGS
         bound = trust.alone
         self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
 
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
-        assert self.anchor is not None
+        if self.anchor is None:
+            return self._swing
         return self._creep * max(now_s - self.anchor.now_s, 0.0) + self._swing
 
     def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
         key = edges.tobytes()
         if self._kept is None or self._kept[0] != key:
-            gripper = self._gripper
-            names = tuple(gripper.edge_ids[edge] for edge in edges)
-            made = hypotheses_of(
-                names, gripper.edge_finger[edges], gripper.finger_ids, self._tracker.along[edges], self._may_open
-            )
-            self._kept = key, made
+            self._kept = key, _about(edges, self._gripper, self._tracker, self._may_open)
         return self._kept[1]
+
+
+def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
+    names = tuple(gripper.edge_ids[edge] for edge in edges)
+    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
+
+
+def foresee_protection(
+    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
+) -> Protection:
+    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
+    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
+    prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
+    fits = Refits(
+        measurement, measurement.cam_T_grip, hypotheses, np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+    )
+    return fits.bound(fits.free, prior, settings.policy.integrity_risk)

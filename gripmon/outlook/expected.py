@@ -20,12 +20,15 @@ from gripmon.corners.profiles import Candidates
 from gripmon.corners.uncertainty import Uncertainty, assess
 from gripmon.geometry import from_record, invert
 from gripmon.gripper import Gripper
-from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
 from gripmon.outlook.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
-from gripmon.records import Array, Image, ReferenceRecord
+from gripmon.records import Array, Image, Protection, ReferenceRecord
 
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
+
+CLUTTER_PX = 0.2
+"""What the background is assumed to shift a stretch of an edge by, beside that, for the protection level."""
 
 _STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0
 
@@ -103,12 +106,13 @@ def expect(
 
 class Foreseen(NamedTuple):
     """Of one frame with a reported opening: ``covariance`` (6, 6) as it would be published, ``usable`` (c,) corners,
-    and the lever, m, by which a turn counts.
+    the lever, m, by which a turn counts, and the ``protection`` level before clutter.
     """
 
     covariance: Array
     usable: NDArray[np.bool_]
     lever_m: float
+    protection: Protection
 
 
 def foresee_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Foreseen:
@@ -117,8 +121,10 @@ def foresee_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> F
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
     meter = ForeseeingMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
     measurement = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
-    covariance = Tracker(rig.camera, gripper, settings, rig.taught).update(measurement)[1]
-    return Foreseen(covariance, measurement.corners.usable, _lever_m(measurement.prediction))
+    tracker = Tracker(rig.camera, gripper, settings, rig.taught)
+    covariance = tracker.update(measurement)[1]
+    protection = foresee_protection(tracker, gripper, settings, measurement)
+    return Foreseen(covariance, measurement.corners.usable, _lever_m(measurement.prediction), protection)
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
@@ -181,6 +187,6 @@ class ForeseeingMeter(FingertipMeter):
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         """As assumed: nothing scatters here."""
-        scatters = assess(votes, consensus, self._prior)
+        scatters = assess(votes, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
         return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)

@@ -76,10 +76,10 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             description="error of the TCP's position that the task bears: a transform is valid while its protection "
             "level is not above this (m)",
         ),
-    ] = 5e-4
+    ] = 1e-3
     alert_limit_rad: Annotated[
         float, Meta(gt=0.0, le=3.0, description="error of the rotation that the task bears, likewise (rad)")
-    ] = 0.02
+    ] = 0.035
     integrity_risk: Annotated[
         float,
         Meta(
@@ -96,12 +96,15 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             description="how often the camera's mount is knocked or slips (1/month)",
         ),
     ] = 1.0
-    suspect_sigma_m: Annotated[
-        float | None,
-        Meta(
-            gt=0.0,
-            le=1.0,
-            description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
-            "transform is suspect (m)",
-        ),
-    ] = None
+    suspect_sigma_m: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=1.0,
+                description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
+                "transform is suspect (m)",
+            ),
+        ]
+        | None
+    ) = None
