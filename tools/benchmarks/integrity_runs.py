@@ -38,8 +38,8 @@ from gripmon.records import (
 from gripmon.simulator import Scenario
 from gripmon.simulator.scenario import Bump
 
-TIP_SEEN = 0.5
-"""Share of the visible edges of a fingertip from which its outline counts as seen."""
+TIP_SEEN = 0.4
+"""Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""
 _WHOLE = 0.995
 _CONFIRMED_FRAMES = 3
 _BENT_MM = 0.05
@@ -234,10 +234,9 @@ def _rendered(sequence: Rendered) -> Watched:
     """The truth there names the corners that something hides; a tip with none left counts as hidden."""
     first = np.array(sequence.frames[0]["camera_T_gripper"])
     moves = any(not np.allclose(frame["camera_T_gripper"], first, atol=1e-9) for frame in sequence.frames)
-    offsets_mm = [
-        frame["finger_offset_mm"][finger] for frame in sequence.frames for finger in frame["finger_offset_mm"]
-    ]
-    bent = bool(np.abs(offsets_mm).max() > _BENT_MM)
+    # The jaws move both fingers alike, to either side.
+    ways_mm = np.array([list(frame["finger_offset_mm"].values()) for frame in sequence.frames])
+    bent = bool(np.abs(ways_mm[:, 0] * (-1.0, 1.0, 1.0) - ways_mm[:, 1]).max() > _BENT_MM)
 
     def looks() -> Iterator[Look]:
         for shot in sequence.shots():
