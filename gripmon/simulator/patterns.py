@@ -16,6 +16,7 @@ from gripmon.simulator.textures import Factor, Rng
 
 _LENS_BLUR_PX = 0.6
 _ALONG = np.array([0.0, 0.0, 1.0])
+_FLAT_M = 1e-6
 _LONG_FACE = 0.5  # a face is long if its normal's part along the finger is smaller
 
 
@@ -56,11 +57,13 @@ def lines(rng: Rng, look: ObjectLook, solid: Solid, grid: Array, px_per_m: float
     out = np.ones(grid.shape[:2])
     if look.pattern == "plain":
         return out.astype(np.float32)
+    # Where a face has no extent along the fingers, a line parallel to the tips is at a place along y.
+    beyond = 2 if np.ptp(grid[..., 2]) > _FLAT_M else 1
     if look.pattern == "fold":
-        inside = solid.vertices_m[:, 2].max() - look.pitch_m - grid[..., 2]
+        inside = solid.vertices_m[:, beyond].max() - look.pitch_m - grid[..., beyond]
         return _blurred(out - look.contrast * _filled(inside, px_per_m))
     # Lines along the fingers are at places across them: on each face the axis that varies.
-    axis = 2 if look.pattern == "lines_along_tips" else int(np.ptp(grid[..., :2], axis=(0, 1)).argmax())
+    axis = beyond if look.pattern == "lines_along_tips" else int(np.ptp(grid[..., :2], axis=(0, 1)).argmax())
     place_m = grid[..., axis]
     start_m, end_m = float(place_m.min()), float(place_m.max())
     while start_m < end_m:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import rendered
-from benchmarks.integrity_conditions import CONDITIONS
+from benchmarks.integrity_misleading import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.rendered import Rendered
