@@ -32,6 +32,7 @@ def line(**columns: Any) -> dict[str, Any]:
         "error_rad": [1e-4] * n,
         "level_m": [1e-4] * n,
         "level_rad": [1e-3] * n,
+        "floor_m": [5e-5] * n,
         "nees": [6.0] * n,
         "why": [""] * n,
     }
@@ -90,6 +91,23 @@ def test_the_bound_on_a_rate_is_exact():
 
     assert upper_bound(0, 100_000) == pytest.approx(1.0 - 0.05 ** (1e-5), rel=1e-6)
     assert upper_bound(3, 3) == 1.0 and 0.0 < upper_bound(1, 100) < 0.05
+
+
+def test_the_least_possible_level_is_that_of_the_worst_axis():
+    from benchmarks.integrity_runs import normal_level_m
+
+    covariance = np.diag([1e-10, 4e-10, 1e-12, 1.0, 1.0, 1.0])
+    assert normal_level_m(covariance, 1e-5) == pytest.approx(4.417 * 2e-5, rel=1e-3)
+
+
+def test_scenes_are_told_apart_by_scale_and_jaw():
+    from benchmarks.integrity_stats import by_scale
+
+    near = {"focal_px": 960.0, "depth_m": 0.1, "jaw_exact": True}
+    far = line(focal_px=500.0, depth_m=0.2, jaw_exact=False, valid=[False] * 10, floor_m=[1e-3] * 10)
+    rows = by_scale([line(**near), far])
+    assert [(row["low"], row["jaw_exact"], row["scenes"]) for row in rows] == [(8.0, True, 1), (0.0, False, 1)]
+    assert [row["available"][0] for row in rows] == [row["possible"][0] for row in rows] == [1.0, 0.0]
 
 
 def test_targets_name_what_is_missed():

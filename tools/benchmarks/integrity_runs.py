@@ -12,6 +12,7 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks import rendered
 from benchmarks.integrity_misleading import CONDITIONS
@@ -112,7 +113,7 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
     alerts: list[list[Any]] = []
     for index, look in enumerate(watched.looks):
         record = monitor.process(look.frame)
-        rows.append(_judged(record, look))
+        rows.append(_judged(record, look, settings.policy.integrity_risk))
         if not watched.moves:
             alerts += [[index, alert.text] for alert in record.alerts if _says_camera(alert)]
     policy = settings.policy
@@ -144,7 +145,13 @@ def _says_camera(alert: Alert) -> bool:
     return alert.kind in kinds and alert.cause is Cause.CAMERA_MOUNT and new
 
 
-def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
+def normal_level_m(covariance: Array, risk: float) -> float:
+    """The least that a protection level can be with a covariance (6, 6) and normal errors: that of its worst axis."""
+    largest = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    return float(stats.norm.isf(0.5 * risk)) * largest**0.5
+
+
+def _judged(record: FrameRecord, look: Look, risk: float) -> dict[str, Any]:
     """A record against the truth: errors and bounds in m and rad, None where nothing was published."""
     out: dict[str, Any] = {
         "view": int(look.view),
@@ -154,6 +161,7 @@ def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
         "error_rad": None,
         "level_m": None,
         "level_rad": None,
+        "floor_m": None,
         "nees": None,
         "why": "",
     }
@@ -164,7 +172,9 @@ def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
     out["error_m"] = _short(np.linalg.norm(error[:3]))
     out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ look.cam_T_grip[:3, :3]))
     if record.source is not Origin.HELD:
-        out["nees"] = _short(error @ np.linalg.solve(np.reshape(record.covariance, (6, 6)), error))
+        covariance = np.reshape(record.covariance, (6, 6))
+        out["nees"] = _short(error @ np.linalg.solve(covariance, error))
+        out["floor_m"] = _short(normal_level_m(covariance, risk))
     if record.protection is not None:
         out["level_m"] = _short(record.protection.position_m)
         out["level_rad"] = _short(record.protection.rotation_rad)
