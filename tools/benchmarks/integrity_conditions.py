@@ -130,6 +130,25 @@ def covered_run(draft: Draft) -> Changes:
     return {"covers": (cover,)}
 
 
+def flash(draft: Draft) -> Changes:
+    """The light is far too bright, or nearly gone, for one to five frames, several times."""
+    steps = []
+    for share in (0.1, 0.45, 0.8):
+        factor = draft.uniform(5.0, 12.0) if draft.chance(0.6) else draft.uniform(0.02, 0.08)
+        start_s = draft.between_frames_s(share)
+        end_s = start_s + int(draft.rng.integers(1, 6)) / draft.fps
+        steps += [LightStep(at_s=start_s, factor=factor), LightStep(at_s=end_s, factor=1.0 / factor)]
+    return {"light": Light(steps=tuple(steps))}
+
+
+def low_contrast(draft: Draft) -> Changes:
+    """Fingers and table of nearly the same grey, little texture."""
+    fingers = with_(draft.fingers, texture=draft.uniform(0.02, 0.06), ambient=0.8, marks=())
+    level_dn = 0.85 * fingers.level_dn * draft.uniform(0.9, 1.1)
+    table = with_(draft.background, kind="plain", contrast=0.1, level_dn=level_dn, boxes=0, cables=0)
+    return {"fingers": fingers, "background": table}
+
+
 def vibration(draft: Draft) -> Changes:
     shift = (draft.sign() * draft.uniform(1e-4, 3e-4), draft.sign() * draft.uniform(1e-4, 3e-4))
     return {"mount": (Vibration(frequency_hz=draft.uniform(5.0, 17.0), tcp_shift_m=shift, start_s=draft.start_s),)}
@@ -207,6 +226,8 @@ ORDINARY: tuple[Condition, ...] = (
     Condition("sheet", "a printed sheet passes, up to all of the view", sheet),
     Condition("covered run", "some frames show nothing of the gripper", covered_run),
     Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, moves=True, inside=False),
+    Condition("flash", "far too bright, or dark, for some frames", flash),
+    Condition("low contrast", "fingers and table of nearly the same grey", low_contrast, enough=False),
     Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, moves=True),
     Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, moves=True, inside=False),
     Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False),

@@ -193,6 +193,22 @@ def shadow_lines(draft: Draft) -> Changes:
     return {"light": Light(shadows=shadows)}
 
 
+def misleading_run(draft: Draft) -> Changes:
+    """Some frames show lines where the tips were, from one frame to the next; then the view is free."""
+    shown = draft.one_of(rim_over_tips, box_over_one, _plate_over_all)(draft)["props"][0]
+    start_s = draft.between_frames_s(draft.uniform(0.1, 0.3))
+    end_s = start_s + int(draft.rng.integers(1, max(draft.frames // 3, 2))) / draft.fps
+    return {"props": (with_(shown, start_s=start_s, end_s=end_s, move_s=0.0),)}
+
+
+def _plate_over_all(draft: Draft) -> Changes:
+    """A plate with lines between camera and fingers."""
+    pattern = draft.one_of("lines_along_fingers", "lines_along_tips", "fold", "printed")
+    look = with_(_look(draft), pattern=pattern)
+    centre = (0.0, float(draft.tip_low_m[1]) - draft.uniform(0.012, 0.02), 0.0)
+    return {"props": (_prop(draft, size_m=(0.3, 0.002, 0.2), centre_m=centre, look=look),)}
+
+
 def _together(*choices: Callable[[Draft], Changes]) -> Callable[[Draft], Changes]:
     """One of several changes."""
     return lambda draft: draft.one_of(*choices)(draft)
@@ -211,6 +227,7 @@ MISLEADING: tuple[Condition, ...] = (
     Condition("copies", "copies of the fingers beside them", copies),
     Condition("mirror", "a mirror image of the fingers", mirror),
     Condition("cables", "cables before the fingers", cables),
+    Condition("misleading run", "some frames show other lines, then the view is free", misleading_run),
     Condition("shadow lines", "sharp shadows parallel to the tips", shadow_lines),
     Condition("bump in grasp", "the mount jumps while an object is held", both(grasp, bump), moves=True, inside=False),
     Condition(

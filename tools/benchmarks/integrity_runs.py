@@ -44,6 +44,7 @@ TIP_SEEN = 0.4
 _WHOLE = 0.995
 _CONFIRMED_FRAMES = 3
 _BENT_MM = 0.05
+_LIT = (0.15, 3.0)  # exposures between which an image isn't black or white
 _BY_NAME = {condition.name: condition for condition in CONDITIONS}
 
 
@@ -203,8 +204,10 @@ def _simulated(scene: IntegrityScene) -> Watched:
     def looks() -> Iterator[Look]:
         for index in scene.indices:
             truth = simulator.truth(index)
+            lit = _LIT[0] <= truth.exposure <= _LIT[1]
             enough = condition.enough and not _just_bumped(simulator.scenario, truth.time_s)
-            yield Look(simulator.frame(index), truth.cam_T_grip, _view(scene, index), enough)
+            view = _view(scene, index) if lit else View.NO_TIP
+            yield Look(simulator.frame(index), truth.cam_T_grip, view, enough)
 
     return Watched(
         simulator.camera,

@@ -202,6 +202,8 @@ def worst(lines: list[dict[str, Any]], count: int = WORST) -> list[dict[str, Any
                 "valid": bool(frames.valid[at]),
                 "error_m": float(frames.error_m[at]),
                 "level_m": None if np.isnan(frames.level_m[at]) else float(frames.level_m[at]),
+                "error_rad": line["error_rad"][int(frames.index[at])],
+                "level_rad": line["level_rad"][int(frames.index[at])],
                 "view": VIEWS[int(frames.view[at])],
                 "why": line["why"][int(frames.index[at])],
                 "misleading": int((frames.lies | frames.unbounded)[own].sum()),

@@ -118,11 +118,14 @@ def worst_lines(worst: list[dict[str, Any]]) -> list[str]:
     """How to see each of the worst frames again, and what it was."""
     lines = []
     for item in worst:
-        level = "no" if item["level_m"] is None else f"{1e3 * item['level_m']:.3g} mm"
+        level = "none"
+        if item["level_m"] is not None:
+            level = f"{1e3 * item['level_m']:.3g} mm and {1e3 * item['level_rad']:.3g} mrad"
         verdict = "valid" if item["valid"] else "suspect"
         lines.append(
             f'--only "{item["condition"]}" --seed {item["seed"]} --scene {item["scene"]}: frame {item["frame"]}, '
-            f"{verdict}, error {1e3 * item['error_m']:.3g} mm, protection level {level}, {item['view']}"
+            f"{verdict}, error {1e3 * item['error_m']:.3g} mm and {1e3 * item['error_rad']:.3g} mrad, "
+            f"protection level {level}, {item['view']}"
             f"{'; ' + item['why'] if item['why'] else ''}; {item['misleading']} misleading frames in this scene"
         )
     return lines
