@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,9 +10,9 @@ from numpy.typing import NDArray
 
 from gripmon.gripper import Gripper
 from gripmon.records import Array
-from gripmon.simulator.scenario import Cover, Scenario
+from gripmon.simulator.scenario import Cover, Prop, Scenario
 from gripmon.simulator.scene import COVER_TRAVEL, SceneState
-from gripmon.simulator.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, paint_order, place
+from gripmon.simulator.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place
 from gripmon.simulator.truth import Hidden
 
 # Half width of a cover over half the view's larger side.
@@ -23,12 +24,14 @@ class Bodies:
 
     def __init__(self, gripper: Gripper, scenario: Scenario, view_half: Array) -> None:
         self.gripper = gripper
-        self.fingers = finger_solids(gripper)
+        self.fingers = finger_solids(gripper, scenario.fingers.shape)
         self.carriers = tuple(_carrier(f) for f in self.fingers) if scenario.fingers.carriers else ()
         self.grasped: Solid | None = None
         if scenario.grasped is not None:
             half = 0.5 * np.array(scenario.grasped.size_m)
             self.grasped = box("object", -half, half)
+        self.props = tuple(_prop(number, prop, self.fingers) for number, prop in enumerate(scenario.props))
+        self._copies = tuple(prop.shape for prop in scenario.props)
         self.cover_outlines = tuple(_cover_outline(c, view_half) for c in scenario.covers)
         self._corner_finger = gripper.point_finger[gripper.corner_points]
 
@@ -39,7 +42,23 @@ class Bodies:
         placed += [place(c, cam_T_finger[k]) for k, c in enumerate(self.carriers)]
         if state.cam_T_object is not None and self.grasped is not None:
             placed.append(place(self.grasped, state.cam_T_object))
+        for index, grip_T_prop in state.props:
+            for k, solid in enumerate(self.props[index]):
+                placed.append(place(solid, state.cam_T_grip @ self._grip_T_body(state, index, k, grip_T_prop)))
         return paint_order(placed)
+
+    def _grip_T_body(self, state: SceneState, index: int, part: int, grip_T_prop: Array) -> Array:
+        """Pose of a part of a prop: copies move with the jaws, mirror images the other way along z."""
+        match self._copies[index]:
+            case "box":
+                return grip_T_prop
+            case "fingers":
+                return grip_T_prop @ state.grip_T_finger[part]
+            case _:
+                mirror = np.diag([1.0, 1.0, -1.0, 1.0])
+                there = mirror @ state.grip_T_finger[part] @ mirror
+                there[2, 3] += 2.0 * grip_T_prop[2, 3]
+                return there
 
     def placed_covers(self, state: SceneState) -> list[tuple[int, Array]]:
         """Index and outline (k, 3) in the camera frame of the covers in view."""
@@ -77,7 +96,7 @@ class Bodies:
             if finger is solid:
                 return Hidden.OTHER_FINGER, self._corner_finger == k
         nobody = np.zeros(len(self._corner_finger), dtype=bool)
-        return (Hidden.OBJECT if solid is self.grasped else Hidden.CARRIER), nobody
+        return (Hidden.CARRIER if any(solid is c for c in self.carriers) else Hidden.OBJECT), nobody
 
 
 def _behind(outline: Array, points_cam_m: Array) -> NDArray[np.bool_]:
@@ -106,6 +125,15 @@ def _carrier(finger: Solid) -> Solid:
         last[0] += 2.2 * size[0]
         first[0] += 0.25 * size[0]
     return box(f"{finger.name} carrier", first, last)
+
+
+def _prop(number: int, prop: Prop, fingers: tuple[Solid, ...]) -> tuple[Solid, ...]:
+    """The bodies of a prop, their names unlike all others."""
+    if prop.shape == "box":
+        half = 0.5 * np.array(prop.size_m)
+        return (box(f"prop {number}", -half, half),)
+    copies = fingers if prop.shape == "fingers" else tuple(mirrored(finger) for finger in fingers)
+    return tuple(dataclasses.replace(copy, name=f"prop {number} {copy.name}") for copy in copies)
 
 
 def _cover_outline(cover: Cover, view_half: Array) -> Array:

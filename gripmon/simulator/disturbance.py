@@ -19,6 +19,7 @@ from gripmon.simulator.scenario import (
     Light,
     MountMotion,
     MountScript,
+    Prop,
     Tilt,
     Vibration,
 )
@@ -138,6 +139,15 @@ def object_distance_m(script: GraspedObject, t_s: float) -> float:
     gone, away = script.leave_s
     here = smooth_step(t_s, start, end - start) - smooth_step(t_s, gone, away - gone)
     return (1.0 - here) * script.distance_m
+
+
+def prop_offset_m(script: Prop, t_s: float) -> Array | None:
+    """How far a prop is from its place (3,), gripper axes; None while it isn't there."""
+    if not script.start_s <= t_s < script.end_s:
+        return None
+    here = pulse(t_s, script.start_s, script.end_s, script.move_s)
+    sway = math.sin(2.0 * math.pi * script.sway_hz * t_s)
+    return (1.0 - here) * np.array(script.from_m) + sway * np.array(script.sway_m)
 
 
 def cover_share(script: Cover, t_s: float) -> float:

@@ -72,12 +72,19 @@ class Renderer:
         )
         rng = np.random.default_rng([seed, 5])
         painter = Painter(rng, scenario.fingers, nominal_cam_T_grip, camera.fx_px)
-        self._surfaces = {solid.name: painter.metal(solid, 1.0) for solid in bodies.fingers}
+        self._surfaces = {solid.name: painter.metal(solid, 1.0, marked=True) for solid in bodies.fingers}
         self._surfaces |= {solid.name: painter.metal(solid, _CARRIER_GAIN) for solid in bodies.carriers}
-        if bodies.grasped is not None:
-            self._surfaces[bodies.grasped.name] = painter.printed(bodies.grasped)
+        if bodies.grasped is not None and scenario.grasped is not None:
+            self._surfaces[bodies.grasped.name] = painter.object(bodies.grasped, scenario.grasped.look)
         outlines = zip(scenario.covers, bodies.cover_outlines, strict=True)
         self._cover_surfaces = [painter.cover(cover, outline) for cover, outline in outlines]
+        for prop, solids in zip(scenario.props, bodies.props, strict=True):
+            for k, solid in enumerate(solids):
+                if prop.shape == "box":
+                    self._surfaces[solid.name] = painter.object(solid, prop.look)
+                else:
+                    own = self._surfaces[bodies.fingers[k].name]
+                    self._surfaces[solid.name] = painter.copy(own, prop.shape == "mirrored_fingers")
         self._cache: tuple[bytes, list[_Layer]] = (b"", [])
 
     def render(self, time_s: float) -> NDArray[np.float32]:
@@ -126,6 +133,7 @@ class Renderer:
 
     def _body_layers(self, state: SceneState) -> list[_Layer]:
         poses = [state.cam_T_grip, state.grip_T_finger] + ([] if state.cam_T_object is None else [state.cam_T_object])
+        poses += [pose for _, pose in state.props]
         key = b"".join(pose.tobytes() for pose in poses)
         cached_key, layers = self._cache
         if cached_key == key:

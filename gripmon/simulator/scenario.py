@@ -104,6 +104,22 @@ class JawScript(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True
     ] = 0.0
 
 
+class ObjectLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """An object's surface.  Lines along the fingers run with gripper z, those along the tips across it."""
+
+    pattern: Annotated[
+        Literal["printed", "plain", "lines_along_fingers", "lines_along_tips", "fold"],
+        Meta(description="fold: two greys that meet in a line parallel to the tips"),
+    ] = "printed"
+    level_dn: Annotated[
+        float, Meta(ge=0.0, le=255.0, description="grey value of a face that looks at the lamp (DN)")
+    ] = 150.0
+    contrast: Annotated[Fraction, Meta(description="of the lines (0 to 1)")] = 0.6
+    pitch_m: Annotated[Positive, Meta(description="mean distance of the lines; of the fold from the far side (m)")] = (
+        0.006
+    )
+
+
 class GraspedObject(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A box that comes up between the fingers, is held, and goes again.
 
@@ -120,6 +136,42 @@ class GraspedObject(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=
     distance_m: Annotated[Positive, Meta(description="how far away it lies before and after (m)")] = 0.15
     arrive_s: Annotated[tuple[Time, Time], Meta(description="start and end of its approach (s)")] = (1.0, 2.0)
     leave_s: Annotated[tuple[Time, Time], Meta(description="start and end of its retreat (s)")] = (5.0, 6.0)
+    look: ObjectLook = ObjectLook()
+
+
+class Prop(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Something beside, behind or before the fingers whose borders run like theirs: bar, rim, plate, cable, a copy of
+    the fingers, their mirror image.  It comes, stays and goes.
+    """
+
+    shape: Annotated[
+        Literal["box", "fingers", "mirrored_fingers"],
+        Meta(
+            description="fingers: copies of them; mirrored: as a mirror across the gripper's z at centre_m shows them"
+        ),
+    ] = "box"
+    size_m: Annotated[
+        tuple[Positive, Positive, Positive], Meta(description="of a box: x across the jaws, y, z (m)")
+    ] = (
+        0.12,
+        0.01,
+        0.01,
+    )
+    centre_m: Annotated[
+        Shift, Meta(description="gripper frame: centre of a box, shift of the copies, place of the mirror (z) (m)")
+    ] = (0.0, 0.0, 0.03)
+    turn_deg: Annotated[tuple[Angle, Angle, Angle], Meta(description="rotation vector of a box (degrees)")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    look: ObjectLook = ObjectLook(pattern="plain")
+    start_s: Time = 0.0
+    end_s: Time = 1e7
+    move_s: Annotated[float, Meta(ge=0.0, le=1e4, description="time for coming, and for going; 0: at once (s)")] = 0.0
+    from_m: Annotated[Shift, Meta(description="where it comes from and goes to, from its place (m)")] = (0.0, 0.0, 0.0)
+    sway_m: Annotated[Shift, Meta(description="amplitude of a slow motion about its place (m)")] = (0.0, 0.0, 0.0)
+    sway_hz: Annotated[float, Meta(gt=0.0, le=100.0, description="its frequency (Hz)")] = 0.3
 
 
 class Cover(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -154,6 +206,32 @@ class Background(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     ] = 0.5
 
 
+class FingerMark(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A lighter or darker area on the long faces of the fingers: pad, step, slot, screw, another tone.
+
+    Its borders are parallel to the fingers' edges.
+    """
+
+    shape: Literal["rectangle", "disc"] = "rectangle"
+    from_tip_m: Annotated[
+        tuple[Length, Length], Meta(description="where it begins and ends, from the tip backwards (m)")
+    ] = (0.003, 0.012)
+    across: Annotated[
+        tuple[float, float],
+        Meta(description="where it begins and ends across the face, over its half width (-1 to 1); a disc: its centre"),
+    ] = (-0.7, 0.7)
+    gain: Annotated[float, Meta(ge=0.0, le=10.0, description="its brightness over the face's (no unit)")] = 0.5
+    finger: Annotated[str, Meta(description="name in the gripper file; empty: all fingers")] = ""
+
+
+class FingerShape(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """By what the true fingers differ from their model: facets that round the tip's edges, a tip that is worn."""
+
+    tip_bevel_m: Annotated[float, Meta(ge=0.0, le=0.005, description="width of facets on the tip's edges (m)")] = 0.0
+    wear_m: Annotated[float, Meta(ge=0.0, le=0.005, description="by which the tip is shorter (m)")] = 0.0
+    worn_finger: Annotated[str, Meta(description="name in the gripper file; empty: all fingers")] = ""
+
+
 class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Metal fingers: one shade a face by the lamp's direction, times a brushed texture that sticks to the face."""
 
@@ -181,6 +259,8 @@ class FingerLook(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=Tru
         ),
     ] = 0.0
     carriers: Annotated[bool, Meta(description="draw the bodies that carry the fingers")] = True
+    marks: tuple[FingerMark, ...] = ()
+    shape: FingerShape = FingerShape()
 
 
 class LightStep(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -201,6 +281,9 @@ class Shadow(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
         0.05
     )
     angle_deg: Angle = 20.0
+    still_at: Annotated[
+        Fraction | None, Meta(description="share of its way at which it stands still; null: it sweeps (0 to 1)")
+    ] = None
 
 
 class Light(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -270,6 +353,7 @@ class Scenario(_Settings, frozen=True, forbid_unknown_fields=True, kw_only=True)
     pairs: Pairs | None = None
     jaw: JawScript = JawScript()
     grasped: GraspedObject | None = None
+    props: tuple[Prop, ...] = ()
     covers: tuple[Cover, ...] = ()
     background: Background = Background()
     fingers: FingerLook = FingerLook()

@@ -21,7 +21,8 @@ _TIP_SHARE = 0.1  # of a finger's length: what counts as its tip, and as its roo
 @dataclass(frozen=True, slots=True)
 class SceneState:
     """All poses at one time.  ``grip_T_finger`` (f, 4, 4) maps a finger's points at nominal opening to where
-    they are, jaws and bends included; ``bend`` (f, 4, 4) is the bends alone.  ``covers``: index in the scenario, pose.
+    they are, jaws and bends included; ``bend`` (f, 4, 4) is the bends alone.  ``covers``: index in the scenario, pose;
+    ``props`` likewise, poses in the gripper frame.
     """
 
     time_s: float
@@ -33,6 +34,7 @@ class SceneState:
     points_grip_m: Array
     cam_T_object: Array | None
     covers: tuple[tuple[int, Array], ...]
+    props: tuple[tuple[int, Array], ...] = ()
 
 
 class Scene:
@@ -78,6 +80,7 @@ class Scene:
             points,
             self._object(cam_T_grip, time_s),
             self._covers(time_s),
+            self._props(time_s),
         )
 
     def events(self, time_s: float) -> tuple[str, ...]:
@@ -93,6 +96,7 @@ class Scene:
         if scenario.grasped is not None and scenario.grasped.arrive_s[0] < time_s < scenario.grasped.leave_s[1]:
             held = scenario.grasped.arrive_s[1] <= time_s <= scenario.grasped.leave_s[0]
             labels.append("object_between" if held else "object_moves")
+        labels += ["prop" for p in scenario.props if p.start_s <= time_s < p.end_s]
         labels += [c.kind for c in scenario.covers if disturbance.cover_share(c, time_s) > 0.0]
         labels += ["light_step" for s in scenario.light.steps if 0.0 <= time_s - s.at_s < 1.0]
         labels += ["shadow" for s in scenario.light.shadows if s.start_s < time_s < s.end_s]
@@ -169,6 +173,16 @@ class Scene:
                 start = np.array([*self.view_half[0], 1.0]) * cover.distance_m
                 offset = rotation @ np.array([0.26 * reach - share * cover.reach * reach, 0.0, 0.0])
                 out.append((index, make_transform(rotation, start + offset)))
+        return tuple(out)
+
+    def _props(self, time_s: float) -> tuple[tuple[int, Array], ...]:
+        """Props that are there, with their poses in the gripper frame."""
+        out = []
+        for index, prop in enumerate(self._scenario.props):
+            offset_m = disturbance.prop_offset_m(prop, time_s)
+            if offset_m is not None:
+                turn = exp_rotation(np.radians(prop.turn_deg))
+                out.append((index, make_transform(turn, np.array(prop.centre_m) + offset_m)))
         return tuple(out)
 
     def _check_jaw(self) -> None:

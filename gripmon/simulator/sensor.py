@@ -15,6 +15,7 @@ from gripmon.simulator.viewing import CELL_PX, RayGrid, enlarge_cells
 Light32 = NDArray[np.float32]
 _BANK_MARGIN_PX = 96
 _SAMPLED_FROM_PX = 0.8
+_COARSE_FROM_PX = 4.0  # a shadow with a softer border may be computed on coarse cells
 
 
 class SensorModel:
@@ -61,16 +62,18 @@ class SensorModel:
     def _shadow(self, shadow: Shadow, time_s: float) -> Light32:
         """Factor of all pixels: a band that travels across the view, its borders half cosine waves."""
         height, width = self._size
-        u = (np.arange(-(-width // CELL_PX)) + 0.5) * CELL_PX / width - 0.5
-        v = (np.arange(-(-height // CELL_PX)) + 0.5) * CELL_PX / width - 0.5 * height / width
+        cell_px = CELL_PX if shadow.softness * width > _COARSE_FROM_PX else 1
+        u = (np.arange(-(-width // cell_px)) + 0.5) * cell_px / width - 0.5
+        v = (np.arange(-(-height // cell_px)) + 0.5) * cell_px / width - 0.5 * height / width
         angle = math.radians(shadow.angle_deg)
         along = u[None, :] * math.cos(angle) + v[:, None] * math.sin(angle)
         travel = 1.2 + shadow.width + 2.0 * shadow.softness
-        centre = travel * ((time_s - shadow.start_s) / (shadow.end_s - shadow.start_s) - 0.5)
+        way = (time_s - shadow.start_s) / (shadow.end_s - shadow.start_s)
+        centre = travel * ((way if shadow.still_at is None else shadow.still_at) - 0.5)
         inside = (0.5 * shadow.width - np.abs(along - centre)) / shadow.softness
         depth = 0.5 + 0.5 * np.sin(0.5 * np.pi * np.clip(inside, -1.0, 1.0))
         coarse = (1.0 - shadow.depth * depth).astype(np.float32)
-        return np.ascontiguousarray(enlarge_cells(coarse)[:height, :width])
+        return coarse if cell_px == 1 else np.ascontiguousarray(enlarge_cells(coarse)[:height, :width])
 
     def _fall_off(self, rays: RayGrid) -> Light32:
         """1 at the middle, less by the square of the distance; nothing where the lens doesn't see."""

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from gripmon.gripper import Gripper
 from gripmon.records import Array
+from gripmon.simulator.scenario import FingerShape
 
 _TOUCH_M = 1e-5  # bodies that touch within this don't hide each other's surface
+_AS_MODELLED = FingerShape()
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,11 @@ def box(name: str, low_m: Array, high_m: Array) -> Solid:
     return make_solid(name, [corners[list(loop)] for loop in loops], [False] * 6)
 
 
-def finger_solids(gripper: Gripper) -> tuple[Solid, ...]:
-    """One solid a finger at nominal opening, its bevels cut.  Raises ValueError for a gripper without closed faces."""
+def finger_solids(gripper: Gripper, shape: FingerShape = _AS_MODELLED) -> tuple[Solid, ...]:
+    """One solid a finger at nominal opening, its bevels cut, worn as ``shape`` says.
+
+    Raises ValueError for a gripper without closed faces.
+    """
     points = gripper.points_grip_m(None)
     solids = []
     for finger, name in enumerate(gripper.finger_ids):
@@ -62,15 +67,31 @@ def finger_solids(gripper: Gripper) -> tuple[Solid, ...]:
         solid = make_solid(name, [points[loop] for loop in loops], [False] * len(loops))
         _check_closed(solid, loops, name)
         polygons, marks = [points[loop] for loop in loops], [False] * len(loops)
-        for edge in np.flatnonzero((gripper.edge_finger == finger) & (gripper.edge_bevel_m > 0.0)):
+        bevel_m = _bevel_widths_m(gripper, shape)
+        for edge in np.flatnonzero((gripper.edge_finger == finger) & (bevel_m > 0.0)):
             ends = set(gripper.edge_points[edge].tolist())
             sides = [k for k, loop in enumerate(loops) if ends <= set(loop.tolist())]
             if len(sides) == 2:
                 on_edge = points[gripper.edge_points[edge, 0]]
-                plane = _bevel_plane(solid, sides, on_edge, float(gripper.edge_bevel_m[edge]))
+                plane = _bevel_plane(solid, sides, on_edge, float(bevel_m[edge]))
                 polygons, marks = _cut(polygons, marks, *plane)
+        if shape.wear_m > 0.0 and shape.worn_finger in ("", name):
+            tip_m = max(float(polygon[:, 2].max()) for polygon in polygons)
+            polygons, marks = _cut(polygons, marks, np.array([0.0, 0.0, 1.0]), tip_m - shape.wear_m)
         solids.append(make_solid(name, polygons, marks))
     return tuple(solids)
+
+
+def _bevel_widths_m(gripper: Gripper, shape: FingerShape) -> Array:
+    """Of every edge: the model's, or the shape's on the edges between two corners of a tip."""
+    corner = np.isin(gripper.edge_points, gripper.corner_points).all(axis=1)
+    return np.where(corner, np.maximum(gripper.edge_bevel_m, shape.tip_bevel_m), gripper.edge_bevel_m)
+
+
+def mirrored(solid: Solid) -> Solid:
+    """A solid as a mirror at z = 0 shows it, in its body's frame."""
+    vertices = solid.vertices_m * (1.0, 1.0, -1.0)
+    return make_solid(f"{solid.name} mirrored", [vertices[loop[::-1]] for loop in solid.loops], list(solid.bevel))
 
 
 def _check_closed(solid: Solid, loops: list[NDArray[np.intp]], name: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -10,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.records import Array
-from gripmon.simulator import textures
-from gripmon.simulator.scenario import Cover, FingerLook
+from gripmon.simulator import patterns, textures
+from gripmon.simulator.scenario import Cover, FingerLook, ObjectLook
 from gripmon.simulator.solids import Solid
 from gripmon.simulator.textures import Factor
 
 _LARGEST_TEXTURE_PX = 1200
-_OBJECT_LEVEL_DN = 150.0
 _SKIN_LEVEL_DN = 150.0
 _SHEET_LEVEL_DN = 205.0
 _MOST_COMPRESSED = 12.0
@@ -40,8 +40,8 @@ class Painter:
         self._px_per_m = focal_px / float(cam_T_grip[2, 3])
         self._lamp_cam = np.array(look.lamp_cam) / np.linalg.norm(look.lamp_cam)
 
-    def metal(self, solid: Solid, gain: float) -> tuple[Surface, ...]:
-        """Surfaces of a metal body, one a face."""
+    def metal(self, solid: Solid, gain: float, *, marked: bool = False) -> tuple[Surface, ...]:
+        """Surfaces of a metal body, one a face; ``marked``: a finger, with the look's marks."""
         look, surfaces = self._look, []
         for face, bevel in enumerate(solid.bevel):
             level = gain * look.level_dn * self._shade(solid, face) * (look.bevel_gain if bevel else 1.0)
@@ -53,19 +53,33 @@ class Painter:
             if look.highlights > 0.0:
                 matt = np.full((rows, columns), level, np.float32) if texture is None else texture
                 texture = matt * textures.streak(self._rng, columns, look.highlights)
+            marks = [] if bevel or not marked else [m for m in look.marks if m.finger in ("", solid.name)]
+            if marks:
+                plain = np.full((rows, columns), level, np.float32) if texture is None else texture
+                grid = patterns.grid_m(rows, columns, px_per_m, body_T_plane)
+                texture = plain * patterns.marks(marks, solid, face, grid, px_per_m)
             surfaces.append(Surface(level, texture, px_per_m, body_T_plane))
         return tuple(surfaces)
 
-    def printed(self, solid: Solid) -> tuple[Surface, ...]:
-        """Surfaces of a printed box, one a face."""
+    def object(self, solid: Solid, look: ObjectLook) -> tuple[Surface, ...]:
+        """Surfaces of a box, one a face."""
         surfaces = []
         for face in range(len(solid.loops)):
-            level = _OBJECT_LEVEL_DN * self._shade(solid, face)
+            level = look.level_dn * self._shade(solid, face)
             body_T_plane, rows, columns, px_per_m = self._sheet(solid, face)
-            texture = textures.printed(self._rng, rows, columns, px_per_m)
+            if look.pattern == "printed":
+                texture = textures.printed(self._rng, rows, columns, px_per_m)
+            else:
+                grid = patterns.grid_m(rows, columns, px_per_m, body_T_plane)
+                texture = patterns.lines(self._rng, look, solid, grid, px_per_m)
             texture = level * self._foreshortened(texture, body_T_plane, px_per_m)
             surfaces.append(Surface(level, texture, px_per_m, body_T_plane))
         return tuple(surfaces)
+
+    def copy(self, surfaces: tuple[Surface, ...], mirrored: bool) -> tuple[Surface, ...]:
+        """Surfaces of a copy of a body, or of its mirror image across z = 0."""
+        mirror = np.diag([1.0, 1.0, -1.0 if mirrored else 1.0, 1.0])
+        return tuple(dataclasses.replace(s, body_T_plane=mirror @ s.body_T_plane) for s in surfaces)
 
     def cover(self, cover: Cover, outline: Array) -> Surface:
         """Skin, or a printed sheet; beyond its texture the border's grey goes on."""

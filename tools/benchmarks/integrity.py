@@ -6,6 +6,7 @@ import argparse
 import importlib.util
 import json
 import multiprocessing
+import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -172,9 +173,9 @@ def read_lines(file: Path | None) -> dict[tuple[Any, ...], dict[str, Any]]:
 def append_line(file: Path, line: dict[str, Any]) -> None:
     """Add a finished scene; a line that was cut off before stays by itself."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    torn = file.exists() and file.stat().st_size > 0 and not file.read_bytes().endswith(b"\n")
-    with file.open("a", encoding="utf-8") as out:
-        out.write(("\n" if torn else "") + json.dumps(line) + "\n")
+    with file.open("a+b") as out:
+        torn = out.seek(0, os.SEEK_END) > 0 and out.seek(-1, os.SEEK_END) >= 0 and out.read(1) != b"\n"
+        out.write((b"\n" if torn else b"") + json.dumps(line).encode() + b"\n")
 
 
 def _in_processes(tasks: list[tuple[str, int]], plan: Plan) -> Iterator[tuple[tuple[str, int], dict[str, Any]]]:

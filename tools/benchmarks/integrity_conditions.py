@@ -1,4 +1,4 @@
-"""The conditions of ``tools/bench integrity`` as data: what each changes in an ordinary scene.
+"""Conditions of ``tools/bench integrity`` with light, covers, motions and wrong models: what each changes in a scene.
 
 Most scenes begin with the gripper free, as in practice; then something happens, and at the end the view is free again.
 Some begin in the midst of it.
@@ -6,114 +6,23 @@ Some begin in the midst of it.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
-import msgspec
 import numpy as np
 
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from benchmarks.integrity_draft import Changes, Condition, Draft, with_
 from gripmon.simulator.scenario import (
-    Background,
     BentFinger,
     Bump,
     Cover,
     Creep,
     Defocus,
-    FingerLook,
-    GraspedObject,
-    JawScript,
+    FingerShape,
     Light,
     LightStep,
-    Sensor,
     Shadow,
     Vibration,
 )
-
-Changes = dict[str, Any]
-
-
-@dataclass(frozen=True)
-class Draft:
-    """What is drawn before the condition.
-
-    ``start_s`` and ``end_s``: between them things happen; before and after, the gripper is free.
-    """
-
-    rng: np.random.Generator
-    frames: int
-    fps: float
-    start_s: float
-    end_s: float
-    gripper: Gripper
-    cam_T_grip: Array
-    opening_m: float
-    background: Background
-    fingers: FingerLook
-    sensor: Sensor
-    jaw: JawScript
-
-    def at_s(self, share: float) -> float:
-        """A time between start and end."""
-        return self.start_s + share * (self.end_s - self.start_s)
-
-    def uniform(self, low: float, high: float) -> float:
-        return float(self.rng.uniform(low, high))
-
-    def sign(self) -> float:
-        return float(self.rng.choice((-1.0, 1.0)))
-
-    def chance(self, probability: float) -> bool:
-        return bool(self.rng.random() < probability)
-
-    def one_of(self, *values: Any) -> Any:
-        return values[int(self.rng.integers(len(values)))]
-
-    def between_frames_s(self, share: float) -> float:
-        """Near a share of the time, between two frames: a jump there is in no frame's exposure."""
-        return (round(self.at_s(share) * self.fps) + 0.5) / self.fps
-
-    @property
-    def tip_size_m(self) -> Array:
-        """Extent (3,) of the first finger, gripper axes."""
-        own = self.gripper.points_grip_m(None)[self.gripper.point_finger == 0]
-        return np.asarray(np.ptp(own, axis=0))
-
-
-@dataclass(frozen=True)
-class Condition:
-    """A kind of scene.
-
-    ``enough``: the gripper shows enough wherever its outline is seen, so that ``valid`` may be asked for; ``moves``:
-    the mount moves, so that an alert which says so is true; ``inside``: a scene may begin in the midst of it;
-    ``truth``: what the true gripper is instead of the one that the monitor knows.
-    """
-
-    name: str
-    what: str
-    changes: Callable[[Draft], Changes]
-    enough: bool = True
-    moves: bool = False
-    inside: bool = True
-    truth: Callable[[np.random.Generator, dict[str, Any]], dict[str, Any]] | None = None
-
-
-def with_(settings: Any, **changes: Any) -> Any:
-    return msgspec.structs.replace(settings, **changes)
-
-
-def both(*parts: Callable[[Draft], Changes]) -> Callable[[Draft], Changes]:
-    """Several changes together; a later one wins where they meet."""
-
-    def changes(draft: Draft) -> Changes:
-        out: Changes = {}
-        for part in parts:
-            out |= part(draft)
-        return out
-
-    return changes
 
 
 def ordinary(draft: Draft) -> Changes:
@@ -180,27 +89,6 @@ def jaw_cycle(draft: Draft) -> Changes:
     return {"jaw": with_(draft.jaw, knots=tuple(zip(times, (draft.opening_m, *ends), strict=True)))}
 
 
-def grasp(draft: Draft) -> Changes:
-    """An object comes, the jaws close on it, hold it, open, and it goes."""
-    width_m = max(draft.opening_m - draft.uniform(0.004, 0.012), 0.004)
-    thick_m = float(draft.tip_size_m[1])
-    size = (width_m, draft.uniform(0.6, 1.6) * thick_m, draft.uniform(0.02, 0.05))
-    grasped = GraspedObject(
-        size_m=size,
-        depth_m=draft.uniform(0.004, 0.024),
-        side_m=draft.uniform(-0.3, 0.3) * thick_m,
-        arrive_s=(draft.at_s(0.0), draft.at_s(0.12)),
-        leave_s=(draft.at_s(0.86), draft.at_s(1.0)),
-    )
-    return {"grasped": grasped, "jaw": closing(draft, width_m)}
-
-
-def closing(draft: Draft, width_m: float) -> JawScript:
-    """Jaws that close to a width while something is there, and open again."""
-    knots = ((0.13, draft.opening_m), (0.24, width_m), (0.74, width_m), (0.85, draft.opening_m))
-    return with_(draft.jaw, knots=tuple((draft.at_s(share), opening_m) for share, opening_m in knots))
-
-
 def _cover(draft: Draft, kind: str, reach: float) -> Changes:
     cover = Cover(
         kind=kind,  # type: ignore[arg-type]
@@ -242,20 +130,23 @@ def covered_run(draft: Draft) -> Changes:
     return {"covers": (cover,)}
 
 
-def shadow_lines(draft: Draft) -> Changes:
-    """Shadows whose sharp borders run parallel to the tips pass slowly."""
-    shadows = tuple(
-        Shadow(
-            start_s=draft.at_s(draft.uniform(-0.3, 0.0)) if draft.start_s > 1.0 else draft.start_s,
-            end_s=draft.at_s(1.0),
-            depth=draft.uniform(0.3, 0.75),
-            width=draft.uniform(0.05, 0.5),
-            softness=draft.uniform(0.001, 0.006),
-            angle_deg=draft.sign() * 90.0 + draft.uniform(-4.0, 4.0),
-        )
-        for _ in range(int(draft.rng.integers(1, 3)))
-    )
-    return {"light": Light(shadows=shadows)}
+def flash(draft: Draft) -> Changes:
+    """The light is far too bright, or nearly gone, for one to five frames, several times."""
+    steps = []
+    for share in (0.1, 0.45, 0.8):
+        factor = draft.uniform(5.0, 12.0) if draft.chance(0.6) else draft.uniform(0.02, 0.08)
+        start_s = draft.between_frames_s(share)
+        end_s = start_s + int(draft.rng.integers(1, 6)) / draft.fps
+        steps += [LightStep(at_s=start_s, factor=factor), LightStep(at_s=end_s, factor=1.0 / factor)]
+    return {"light": Light(steps=tuple(steps))}
+
+
+def low_contrast(draft: Draft) -> Changes:
+    """Fingers and table of nearly the same grey, little texture."""
+    fingers = with_(draft.fingers, texture=draft.uniform(0.02, 0.06), ambient=0.8, marks=())
+    level_dn = 0.85 * fingers.level_dn * draft.uniform(0.9, 1.1)
+    table = with_(draft.background, kind="plain", contrast=0.1, level_dn=level_dn, boxes=0, cables=0)
+    return {"fingers": fingers, "background": table}
 
 
 def vibration(draft: Draft) -> Changes:
@@ -308,7 +199,19 @@ def mismeasured(rng: np.random.Generator, model: dict[str, Any]) -> dict[str, An
     return {**model, "points": points}
 
 
-CONDITIONS: tuple[Condition, ...] = (
+def rounded(draft: Draft) -> Changes:
+    """Facets on the tips' edges that the model doesn't know."""
+    shape = FingerShape(tip_bevel_m=draft.uniform(2e-4, 6e-4))
+    return {"fingers": with_(draft.fingers, shape=shape)}
+
+
+def worn(draft: Draft) -> Changes:
+    """One finger, or both, shorter than the model by 0.1 to 0.3 mm."""
+    finger = "" if draft.chance(0.3) else draft.one_of(*draft.gripper.finger_ids)
+    return {"fingers": with_(draft.fingers, shape=FingerShape(wear_m=draft.uniform(1e-4, 3e-4), worn_finger=finger))}
+
+
+ORDINARY: tuple[Condition, ...] = (
     Condition("ordinary", "some clutter moves, usual noise", ordinary),
     Condition("clutter", "boxes, cables, print, chequers move", clutter),
     Condition("clutter still", "the same, standing still", clutter_still),
@@ -318,17 +221,18 @@ CONDITIONS: tuple[Condition, ...] = (
     Condition("flicker", "light flickers by 20 to 40 %", flicker),
     Condition("jpeg", "quality 55 to 85", jpeg),
     Condition("jaw cycle", "the jaws close and open", jaw_cycle),
-    Condition("grasp", "an object between the fingers, held", grasp),
     Condition("cover one", "a hand or sheet hides one finger", cover_one),
     Condition("hand", "a hand passes, up to all of the view", hand),
     Condition("sheet", "a printed sheet passes, up to all of the view", sheet),
     Condition("covered run", "some frames show nothing of the gripper", covered_run),
-    Condition("shadow lines", "sharp shadows parallel to the tips", shadow_lines),
     Condition("bump", "the mount jumps by 0.3 to 8 mm", bump, moves=True, inside=False),
-    Condition("bump in grasp", "the same while an object is held", both(grasp, bump), moves=True, inside=False),
+    Condition("flash", "far too bright, or dark, for some frames", flash),
+    Condition("low contrast", "fingers and table of nearly the same grey", low_contrast, enough=False),
     Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, moves=True),
     Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, moves=True, inside=False),
     Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False),
     Condition("opening wrong", "report off by 0.3 to 2 mm", opening_wrong, enough=False),
     Condition("model off", "tips 0.1 to 0.3 mm other than the model", ordinary, enough=False, truth=mismeasured),
+    Condition("tips worn", "tips 0.1 to 0.3 mm shorter than the model", worn, enough=False),
+    Condition("tips rounded", "facets of 0.2 to 0.6 mm on the tips' edges", rounded, enough=False),
 )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks import integrity_table, machine
 from benchmarks.integrity_runs import about
-from benchmarks.integrity_stats import figures, targets, worst
+from benchmarks.integrity_stats import by_scale, figures, targets, worst
 
 if TYPE_CHECKING:
     from benchmarks.integrity import Plan
@@ -30,6 +31,7 @@ def summarize(plan: Plan, lines: list[dict[str, Any]]) -> dict[str, Any]:
         "limit_rad": lines[0]["limit_rad"],
         "rows": {name: {"what": about(name), **figures(own)} for name, own in by_name.items()},
         "total": total,
+        "scales": by_scale(lines),
         "targets": [{"target": what, "reached": reached, "met": met} for what, reached, met in targets(total)],
         "worst": worst(lines),
     }
@@ -42,4 +44,13 @@ def write(results: dict[str, Any], lines: list[dict[str, Any]], folder: Path) ->
     pictures = integrity_plots.draw(lines, folder / PICTURES)
     text = integrity_table.as_markdown(results, [picture.name for picture in pictures])
     (folder / "integrity.md").write_text(text, encoding="utf-8")
-    (folder / "integrity.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    (folder / "integrity.json").write_text(json.dumps(_finite(results), indent=1) + "\n", encoding="utf-8")
+
+
+def _finite(value: Any) -> Any:
+    """The same with null for what is infinite: JSON has no word for it."""
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and math.isinf(value) else value

@@ -12,9 +12,10 @@ from enum import IntEnum
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 from benchmarks import rendered
-from benchmarks.integrity_conditions import CONDITIONS
+from benchmarks.integrity_misleading import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.rendered import Rendered
@@ -38,11 +39,12 @@ from gripmon.records import (
 from gripmon.simulator import Scenario
 from gripmon.simulator.scenario import Bump
 
-TIP_SEEN = 0.5
-"""Share of the visible edges of a fingertip from which its outline counts as seen."""
+TIP_SEEN = 0.4
+"""Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""
 _WHOLE = 0.995
 _CONFIRMED_FRAMES = 3
 _BENT_MM = 0.05
+_LIT = (0.15, 3.0)  # exposures between which an image isn't black or white
 _BY_NAME = {condition.name: condition for condition in CONDITIONS}
 
 
@@ -112,7 +114,7 @@ def run_scene(name: str, seed: int, number: int, frames: int) -> dict[str, Any]:
     alerts: list[list[Any]] = []
     for index, look in enumerate(watched.looks):
         record = monitor.process(look.frame)
-        rows.append(_judged(record, look))
+        rows.append(_judged(record, look, settings.policy.integrity_risk))
         if not watched.moves:
             alerts += [[index, alert.text] for alert in record.alerts if _says_camera(alert)]
     policy = settings.policy
@@ -144,7 +146,13 @@ def _says_camera(alert: Alert) -> bool:
     return alert.kind in kinds and alert.cause is Cause.CAMERA_MOUNT and new
 
 
-def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
+def normal_level_m(covariance: Array, risk: float) -> float:
+    """The least that a protection level can be with a covariance (6, 6) and normal errors: that of its worst axis."""
+    largest = float(np.linalg.eigvalsh(covariance[:3, :3])[-1])
+    return float(stats.norm.isf(0.5 * risk)) * largest**0.5
+
+
+def _judged(record: FrameRecord, look: Look, risk: float) -> dict[str, Any]:
     """A record against the truth: errors and bounds in m and rad, None where nothing was published."""
     out: dict[str, Any] = {
         "view": int(look.view),
@@ -154,6 +162,7 @@ def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
         "error_rad": None,
         "level_m": None,
         "level_rad": None,
+        "floor_m": None,
         "nees": None,
         "why": "",
     }
@@ -164,7 +173,9 @@ def _judged(record: FrameRecord, look: Look) -> dict[str, Any]:
     out["error_m"] = _short(np.linalg.norm(error[:3]))
     out["error_rad"] = _short(rotation_angle(cam_T_grip[:3, :3].T @ look.cam_T_grip[:3, :3]))
     if record.source is not Origin.HELD:
-        out["nees"] = _short(error @ np.linalg.solve(np.reshape(record.covariance, (6, 6)), error))
+        covariance = np.reshape(record.covariance, (6, 6))
+        out["nees"] = _short(error @ np.linalg.solve(covariance, error))
+        out["floor_m"] = _short(normal_level_m(covariance, risk))
     if record.protection is not None:
         out["level_m"] = _short(record.protection.position_m)
         out["level_rad"] = _short(record.protection.rotation_rad)
@@ -193,8 +204,10 @@ def _simulated(scene: IntegrityScene) -> Watched:
     def looks() -> Iterator[Look]:
         for index in scene.indices:
             truth = simulator.truth(index)
+            lit = _LIT[0] <= truth.exposure <= _LIT[1]
             enough = condition.enough and not _just_bumped(simulator.scenario, truth.time_s)
-            yield Look(simulator.frame(index), truth.cam_T_grip, _view(scene, index), enough)
+            view = _view(scene, index) if lit else View.NO_TIP
+            yield Look(simulator.frame(index), truth.cam_T_grip, view, enough)
 
     return Watched(
         simulator.camera,
@@ -234,10 +247,9 @@ def _rendered(sequence: Rendered) -> Watched:
     """The truth there names the corners that something hides; a tip with none left counts as hidden."""
     first = np.array(sequence.frames[0]["camera_T_gripper"])
     moves = any(not np.allclose(frame["camera_T_gripper"], first, atol=1e-9) for frame in sequence.frames)
-    offsets_mm = [
-        frame["finger_offset_mm"][finger] for frame in sequence.frames for finger in frame["finger_offset_mm"]
-    ]
-    bent = bool(np.abs(offsets_mm).max() > _BENT_MM)
+    # The jaws move both fingers alike, to either side.
+    ways_mm = np.array([list(frame["finger_offset_mm"].values()) for frame in sequence.frames])
+    bent = bool(np.abs(ways_mm[:, 0] * (-1.0, 1.0, 1.0) - ways_mm[:, 1]).max() > _BENT_MM)
 
     def looks() -> Iterator[Look]:
         for shot in sequence.shots():

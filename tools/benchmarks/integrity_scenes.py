@@ -13,19 +13,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from benchmarks.integrity_conditions import Condition, Draft
+from benchmarks.integrity_draft import Condition, Draft
 from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
 from gripmon.camera import Camera, PaperLens, make_camera
 from gripmon.geometry import exp_rotation, make_transform, perturb
 from gripmon.gripper import Gripper, GripperModel
 from gripmon.records import Array
 from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+from gripmon.simulator.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
 
 LEAD_FRAMES = (15, 20)
 """Frames at the start of a scene in which the gripper is seen free."""
 INSIDE_SHARE = 0.1
 """Share of scenes that start in the midst of what their condition does."""
+MARKED_SHARE = 0.35
+"""Share of scenes in which the fingers carry marks that the model doesn't know."""
 _INSIDE_AT = (0.3, 0.6)
 _BORDER_PX = 14.0
 _KINDS = ("blobs", "speckle", "stripes", "printed", "chequer")
@@ -114,6 +116,7 @@ def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: 
         lamp_cam=(float(rng.uniform(-0.6, 0.6)), float(rng.uniform(-0.8, 0.2)), -0.75),
         texture=float(rng.uniform(0.03, 0.2)),
         highlights=float(rng.uniform(0.0, 2.0)) if rng.random() < 0.2 else 0.0,
+        marks=_marks(rng) if rng.random() < MARKED_SHARE else (),
     )
     noise_m = _JAW_NOISE_M if rng.random() < 0.5 else 0.0
     return Draft(
@@ -130,6 +133,33 @@ def _draft(rng: np.random.Generator, frames: int, gripper: Gripper, cam_T_grip: 
         sensor=Sensor(psf_sigma_px=float(rng.uniform(0.5, 0.8)), exposure_time_s=float(rng.uniform(0.001, 0.006))),
         jaw=JawScript(knots=((0.0, opening_m),), reported_noise_m=noise_m),
     )
+
+
+def _marks(rng: np.random.Generator) -> tuple[FingerMark, ...]:
+    """A pad, two tones, a step across the fingers, a slot along them, or screws."""
+
+    def between(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    gain = between(0.25, 0.75) if rng.random() < 0.5 else between(1.3, 2.5)
+    start_m = between(0.002, 0.012)
+    match int(rng.integers(5)):
+        case 0:
+            half = between(0.4, 0.9)
+            return (FingerMark(from_tip_m=(start_m, start_m + between(5e-3, 15e-3)), across=(-half, half), gain=gain),)
+        case 1:
+            return (FingerMark(from_tip_m=(start_m, 0.3), across=(-2.0, 2.0), gain=gain),)
+        case 2:
+            return (FingerMark(from_tip_m=(start_m, start_m + between(3e-4, 1e-3)), across=(-2.0, 2.0), gain=gain),)
+        case 3:
+            left = between(-0.7, 0.5)
+            return (FingerMark(from_tip_m=(start_m, 0.3), across=(left, left + between(0.08, 0.3)), gain=gain),)
+        case _:
+            size_m, pitch_m = between(2e-3, 5e-3), between(6e-3, 12e-3)
+            places = (start_m + k * pitch_m for k in range(3))
+            return tuple(
+                FingerMark(shape="disc", from_tip_m=(m, m + size_m), across=(0.0, 0.0), gain=gain) for m in places
+            )
 
 
 def _camera(rng: np.random.Generator) -> Camera:

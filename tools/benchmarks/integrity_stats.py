@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,8 @@ AVAILABLE = (0.99, 0.95, 0.80)
 BACK_SHARE = 0.999
 VIEWS = ("nothing hidden", "both tips seen", "one tip hidden", "no tip seen")
 WORST = 10
+SCALES = (0.0, 4.0, 6.0, 8.0, np.inf)
+"""Limits between classes of scenes by their image scale at the TCP, px/mm."""
 _CONFIDENCE = 0.95
 
 
@@ -36,6 +39,8 @@ class Frames:
     asked: NDArray[np.bool_]
     error_m: NDArray[np.float64]
     level_m: NDArray[np.float64]
+    possible: NDArray[np.bool_]
+    """The published covariance alone would allow a protection level within the alert limit."""
     excess: NDArray[np.float64]
     """Error over protection level, the larger of position's and rotation's."""
     over_limit: NDArray[np.float64]
@@ -81,6 +86,7 @@ def _columns(number: int, line: dict[str, Any]) -> dict[str, NDArray[Any]]:
         "asked": np.array(line["enough"], dtype=bool) & ~_just_freed(view),
         "error_m": values["error_m"],
         "level_m": values["level_m"],
+        "possible": np.array(line["floor_m"], dtype=float) <= line["limit_m"],
         "excess": excess,
         "over_limit": over_limit,
         "nees": values["nees"],
@@ -141,6 +147,7 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "suspect_unbounded": int(frames.suspect_unbounded.sum()),
         "misleading_scenes": len(set(frames.line[frames.lies | frames.unbounded].tolist())),
         "available": [_share(frames.valid[frames.asked & (frames.view == view)]) for view in range(4)],
+        "possible": [_share(frames.possible[frames.asked & (frames.view == view)]) for view in range(4)],
         "asked": [int((frames.asked & (frames.view == view)).sum()) for view in range(4)],
         "median_error_m": error,
         "median_level_m": level,
@@ -154,6 +161,21 @@ def figures(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "alert_scenes": sum(bool(line["camera_alerts"]) for line in lines),
         "seconds": float(sum(line["seconds"] for line in lines)),
     }
+
+
+def by_scale(lines: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Figures of scenes by how large the fingertips are in the image, and by what is known of the jaw opening."""
+    out = []
+    for exact in (True, False):
+        for low, high in pairwise(SCALES):
+            own = [one for one in lines if one["jaw_exact"] is exact and low <= _px_per_mm(one) < high]
+            if own:
+                out.append({"low": low, "high": high, "jaw_exact": exact, **figures(own)})
+    return out
+
+
+def _px_per_mm(line: dict[str, Any]) -> float:
+    return 1e-3 * float(line["focal_px"]) / float(line["depth_m"])
 
 
 def _share(what: NDArray[np.bool_]) -> float | None:
@@ -180,6 +202,8 @@ def worst(lines: list[dict[str, Any]], count: int = WORST) -> list[dict[str, Any
                 "valid": bool(frames.valid[at]),
                 "error_m": float(frames.error_m[at]),
                 "level_m": None if np.isnan(frames.level_m[at]) else float(frames.level_m[at]),
+                "error_rad": line["error_rad"][int(frames.index[at])],
+                "level_rad": line["level_rad"][int(frames.index[at])],
                 "view": VIEWS[int(frames.view[at])],
                 "why": line["why"][int(frames.index[at])],
                 "misleading": int((frames.lies | frames.unbounded)[own].sum()),

@@ -43,6 +43,11 @@ back: valid within 3 frames after the view is free again; latest: the most frame
 alerts: that the camera's mount moved, where it never did""".splitlines()
 )
 
+_POSSIBLE = (
+    "possible: share of the same frames in which the published covariance alone, with normal errors, would allow a "
+    "protection level within the alert limit"
+)
+
 
 def cells(name: str, row: dict[str, Any]) -> list[str]:
     """A condition's line."""
@@ -87,6 +92,23 @@ def table(results: dict[str, Any]) -> list[list[str]]:
     return [list(HEAD), *rows, cells("all", results["total"])]
 
 
+SCALE_HEAD = ("scale at the TCP, jaw", "scenes", "free: valid %", "possible %", "both tips: valid %", "possible %")
+SCALE_HEAD += ("one tip: valid %", "possible %", "PL µm", "error µm", "misleading scenes")
+
+
+def scale_table(results: dict[str, Any]) -> list[list[str]]:
+    """Availability by image scale; possible: the covariance alone would allow a level within the alert limit."""
+    rows = [list(SCALE_HEAD)]
+    for row in results["scales"]:
+        end = "and more" if math.isinf(row["high"]) else f"to {row['high']:g}"
+        jaw = "opening exact" if row["jaw_exact"] else "opening as reported"
+        shares = [percent(row[key][view]) for view in range(3) for key in ("available", "possible")]
+        levels = [microns(row["median_level_m"]), microns(row["median_error_m"])]
+        name = f"{row['low']:g} {end} px/mm, {jaw}"
+        rows.append([name, str(row["scenes"]), *shares, *levels, str(row["misleading_scenes"])])
+    return rows
+
+
 def target_lines(total: dict[str, Any]) -> list[str]:
     words = {True: "met", False: "MISSED", None: "not judged"}
     return [f"{what}: {reached} - {words[met]}" for what, reached, met in targets(total)]
@@ -96,11 +118,14 @@ def worst_lines(worst: list[dict[str, Any]]) -> list[str]:
     """How to see each of the worst frames again, and what it was."""
     lines = []
     for item in worst:
-        level = "no" if item["level_m"] is None else f"{1e3 * item['level_m']:.3g} mm"
+        level = "none"
+        if item["level_m"] is not None:
+            level = f"{1e3 * item['level_m']:.3g} mm and {1e3 * item['level_rad']:.3g} mrad"
         verdict = "valid" if item["valid"] else "suspect"
         lines.append(
             f'--only "{item["condition"]}" --seed {item["seed"]} --scene {item["scene"]}: frame {item["frame"]}, '
-            f"{verdict}, error {1e3 * item['error_m']:.3g} mm, protection level {level}, {item['view']}"
+            f"{verdict}, error {1e3 * item['error_m']:.3g} mm and {1e3 * item['error_rad']:.3g} mrad, "
+            f"protection level {level}, {item['view']}"
             f"{'; ' + item['why'] if item['why'] else ''}; {item['misleading']} misleading frames in this scene"
         )
     return lines
@@ -142,6 +167,9 @@ def as_text(results: dict[str, Any]) -> str:
         "",
         *LEGEND,
         "",
+        aligned(scale_table(results)),
+        _POSSIBLE,
+        "",
         *target_lines(results["total"]),
         "",
         "worst frames, one of each scene:",
@@ -152,14 +180,15 @@ def as_text(results: dict[str, Any]) -> str:
 
 def as_markdown(results: dict[str, Any], pictures: list[str]) -> str:
     """The report as a file."""
-    head, *rows = table(results)
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head), *("| " + " | ".join(row) + " |" for row in rows)]
     parts = [
         "# Integrity",
         "Written by `tools/bench integrity --out docs`. Figures behind it: [integrity.json](integrity.json).",
         "\n".join(f"- {line}" for line in about(results)),
-        "\n".join(lines),
+        _markdown_table(table(results)),
         "\n".join(f"- {line}" for line in LEGEND),
+        "## Availability by image scale",
+        _markdown_table(scale_table(results)),
+        _POSSIBLE,
         "## Targets",
         "\n".join(f"- {line}" for line in target_lines(results["total"])),
         "## Worst frames",
@@ -171,6 +200,11 @@ def as_markdown(results: dict[str, Any], pictures: list[str]) -> str:
         "\n".join(f"- {name}: {row['what']}" for name, row in results["rows"].items()),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _markdown_table(rows: list[list[str]]) -> str:
+    head, *rest = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([head, "|" + "---|" * len(rows[0]), *rest])
 
 
 def about(results: dict[str, Any]) -> list[str]:
