@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+import msgspec
 import numpy as np
 from scipy import stats
 
@@ -24,6 +25,7 @@ from gripmon.drift import DriftSettings
 from gripmon.geometry import from_record, perturbation_between, rotation_angle, to_record
 from gripmon.gripper import Gripper
 from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.outlook import Rig, foresee_frame
 from gripmon.records import (
     Alert,
     AlertEvent,
@@ -189,8 +191,17 @@ def _short(value: float) -> float:
 
 
 def _settings(watched: Watched) -> MonitorSettings:
+    """As an integrator sets them up: an alert limit that the view can't keep is raised to what ``check`` foretells."""
     known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
-    return MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
+    settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
+    rig = Rig(watched.camera, watched.gripper, settings, None)
+    foretold = foresee_frame(rig, watched.start_cam_T_grip, None).protection
+    policy = msgspec.structs.replace(
+        settings.policy,
+        alert_limit_m=max(settings.policy.alert_limit_m, foretold.position_m),
+        alert_limit_rad=max(settings.policy.alert_limit_rad, foretold.rotation_rad),
+    )
+    return msgspec.structs.replace(settings, policy=policy)
 
 
 def _reference(watched: Watched) -> ReferenceRecord:
