@@ -1,4 +1,4 @@
-"""Bounds at a stated risk: quantiles against samples, refits against fits of the kept rows, the promise against truth."""
+"""Bounds at a stated risk: quantiles against samples, refits against fits of kept rows, the promise against truth."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_far_out_a_bound_is_short_by_no_more_than_stated():
         found = bounds(np.repeat(turned(variances)[None], len(risks), axis=0), risks)
         assert (found > 0.95e-5 * np.sqrt(stats.chi2.isf(risks, 1))).all()
         assert (found < 1.01e-5 * np.sqrt(stats.chi2.isf(risks, 3))).all()
-    # Two directions of half the variance beside one: exactly, by integrating over it, chi-square of 2 being exponential.
+    # Two directions of half the variance beside one: by integrating over it, as chi-square of 2 is exponential.
     x = np.linspace(0.0, 12.0, 200_001)
     for risk, short in ((1e-5, 0.03), (1e-7, 0.045), (1e-9, 0.05)):
         [radius] = bounds(turned((1.0, 0.5, 0.5))[None], np.array([risk]))
@@ -239,7 +239,9 @@ def test_an_edge_that_errs_is_beyond_a_bound_that_reckons_with_nothing():
 
 def test_hypotheses_doubt_what_their_names_say():
     found = of_two_fingers(has_opening=True)
-    doubted = {name: {NAMES[e] for e in np.flatnonzero(keep == 0.0)} for name, keep in zip(found.name, found.keep)}
+    doubted = {
+        name: {NAMES[e] for e in np.flatnonzero(keep == 0.0)} for name, keep in zip(found.name, found.keep, strict=True)
+    }
     a, b = set(NAMES[:4]), set(NAMES[4:])
     expected = {"nothing is wrong": set()}
     expected |= {f"edge {name} belongs to something else": {name} for name in NAMES}
@@ -249,10 +251,12 @@ def test_hypotheses_doubt_what_their_names_say():
         "finger a is not where its model says": a,
         "finger b is not where its model says": b,
         "the jaw opening is wrong": set(),
-        "what looks like the fingers' ends is something else": {n for n, along in zip(NAMES, ALONG) if not along},
+        "what looks like the fingers' ends is something else": {
+            n for n, along in zip(NAMES, ALONG, strict=True) if not along
+        },
     }
     assert doubted == expected
-    prior = dict(zip(found.name, found.prior.tolist()))
+    prior = dict(zip(found.name, found.prior.tolist(), strict=True))
     assert prior["nothing is wrong"] == prior["what looks like the fingers' ends is something else"] == 1.0
     assert {p for n, p in prior.items() if n.startswith("edge ")} == {EDGE}
     assert {p for n, p in prior.items() if n.startswith("the ends of")} == {ONE_FINGERS_ENDS}

@@ -14,7 +14,7 @@ EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else: a border parallel to it, a pad, a shadow."""
 
 ONE_FINGERS_ENDS = 1e-2
-"""That the ends of one finger do, though corners are seen there; and that a finger that shows such corners has others."""
+"""That the ends of one finger do, though corners are seen there; that a finger that shows such corners has others."""
 
 FINGER = 1e-3
 """That a finger isn't where the model has it: bent, shifted in its holder, exchanged."""
@@ -46,7 +46,7 @@ def hypotheses_of(
     along: NDArray[np.bool_],
     has_opening: bool,
 ) -> Hypotheses:
-    """All that a fit of these edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end."""
+    """All that a fit of these edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) it or an end."""
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
     whole = np.ones(count)

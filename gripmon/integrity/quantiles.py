@@ -18,9 +18,9 @@ def bounds(covariance: Array, risk: Array) -> Array:
     """(n,) radii that normal errors with the covariances (n, 3, 3) exceed with the probabilities ``risk`` (n,).
 
     The square of the length is a weighted sum of chi-squares; a shifted and scaled chi-square with the same mean,
-    variance and skewness stands in for it (Hall 1983; Buckley and Eagleson 1988): exact for one direction and for two or
-    three equal ones, else too short by 4 % at most down to 1e-7 and by 6 % down to 1e-12 (without the skewness, by 8 and
-    14 %).  A risk below 1e-12 counts as that, one of 0.9 and more as 0.9.
+    variance and skewness stands in for it (Hall 1983; Buckley and Eagleson 1988): exact for one direction and for two
+    or three equal ones, else too short by 4 % at most down to 1e-7 and by 6 % down to 1e-12 (without the skewness by 8
+    and 14 %).  A risk below 1e-12 counts as that, one of 0.9 and more as 0.9.
     """
     trace = np.einsum("nii->n", covariance)
     square = np.einsum("nij,nij->n", covariance, covariance)
