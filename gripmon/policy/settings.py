@@ -96,12 +96,15 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
             description="how often the camera's mount is knocked or slips (1/month)",
         ),
     ] = 1.0
-    suspect_sigma_m: Annotated[
-        float | None,
-        Meta(
-            gt=0.0,
-            le=1.0,
-            description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
-            "transform is suspect (m)",
-        ),
-    ] = None
+    suspect_sigma_m: (
+        Annotated[
+            float,
+            Meta(
+                gt=0.0,
+                le=1.0,
+                description="deprecated, use alert_limit_m: standard deviation of the TCP's position from which a "
+                "transform is suspect; replaced by an alert limit when a configuration is read (m)",
+            ),
+        ]
+        | None
+    ) = None
