@@ -26,7 +26,7 @@ from gripmon.records import Frame, FrameRecord, Refusal
 ROOT = Path(__file__).resolve().parent.parent
 CONTRACT = {
     "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
-    "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",
+    "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns", "protection",
 }  # fmt: skip
 FPS = 10
 

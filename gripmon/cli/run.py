@@ -162,7 +162,9 @@ def run_daemon(
             jaw=network.jaw,
             keeper=daemon.StateKeeper(kept),
             commands=network.commands,
-            reports=with_source(network.reports, source),
+            reports=dataclasses.replace(
+                with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m
+            ),
             notices=_notices(kept),
             duration_s=duration_s,
         )
