@@ -11,8 +11,9 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from gripmon.client import MonitorStatus
+    from gripmon.records import StateRecord
 
-COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "fps", "heard s", "reference", "alerts")
+COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
 _FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
 _STYLES = {
     "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
@@ -29,7 +30,7 @@ class Row(NamedTuple):
 
 
 def row(status: MonitorStatus) -> Row:
-    """The cells in the order of :data:`COLUMNS`; drift and sigma of a monitor that is gone are what it said last."""
+    """The cells in the order of :data:`COLUMNS`; drift, sigma and bound are what a monitor that is gone said last."""
     state = status.state
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
@@ -39,6 +40,7 @@ def row(status: MonitorStatus) -> Row:
         state.verdict.value if state is not None and there else "unknown",
         _number(1e3, status.drift_m, ".3f"),
         _number(1e3, None if state is None else state.sigma_m, ".3f"),
+        _bound(state),
         _number(1.0, rate if there else None, ".1f"),
         f"{_age_s(status):.1f}",
         "-" if state is None else f"{state.revision} {printable(state.reference_id)}",
@@ -78,7 +80,7 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> Rendera
     shown = statuses[: max(1, height - _FRAME_LINES)]
     out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
     for name in COLUMNS:
-        number = name in COLUMNS[3:7]
+        number = name in COLUMNS[3:8]
         out.add_column(
             name,
             justify="right" if number else "left",
@@ -151,6 +153,14 @@ def _alerts(status: MonitorStatus) -> str:
     marks = " ".join(f"{_MARKS[severity]}{count}" for severity, count in counts.items())
     worst = status.alerts[0]
     return f"{marks} {printable(worst.text)}{' (acknowledged)' * worst.acknowledged}"
+
+
+def _bound(state: StateRecord | None) -> str:
+    """The protection level over the alert limit, as far as they are known."""
+    if state is None or state.protection_m is None:
+        return "-"
+    limit = "" if state.alert_limit_m is None else f"/{1e3 * state.alert_limit_m:g}"
+    return f"{1e3 * state.protection_m:.2f}{limit}"
 
 
 def _number(scale: float, value: float | None, how: str) -> str:
