@@ -193,7 +193,8 @@ def _limits(config: Config | None) -> Limits | None:
         return None
     policy, nothing = config.settings.monitor.policy, (0.0,) * 6
     of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
-    return Limits(*of_policy, nothing, None, None, None, nothing, nothing)
+    alert_limits = policy.alert_limit_m, policy.alert_limit_rad
+    return Limits(*of_policy, nothing, None, None, None, nothing, nothing, *alert_limits)
 
 
 def _holds_recordings(path: Path) -> bool:

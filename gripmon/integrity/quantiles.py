@@ -31,7 +31,8 @@ def bounds(covariance: Array, risk: Array) -> Array:
     i, j = row.astype(int), column.astype(int)
     f, g = row - i, column - j
     table = _RADIUS_SQUARE
-    near, far = table[i, j] + g * (table[i, j + 1] - table[i, j]), table[i + 1, j] + g * (
-        table[i + 1, j + 1] - table[i + 1, j]
+    near, far = (
+        table[i, j] + g * (table[i, j + 1] - table[i, j]),
+        table[i + 1, j] + g * (table[i + 1, j + 1] - table[i + 1, j]),
     )
     return np.sqrt(trace * (near + f * (far - near)))
