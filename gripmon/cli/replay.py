@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gripmon.cli import common, second_run
+from gripmon.cli import common, promising, second_run
 from gripmon.cli.one_recording import keep
 from gripmon.cli.recorded_run import RecordedRun, is_recording
 from gripmon.cli.replaying import NOTHING_BEFORE, replay
@@ -111,6 +111,8 @@ def run(arguments: argparse.Namespace) -> int:
         out = opened.enter_context(_output(arguments.out))
         overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
         recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
+        if (said := promising.warning(config)) is not None:
+            print(f"replay: {said}", file=sys.stderr)
         counts = _Counts()
         try:
             step = opened.enter_context(
