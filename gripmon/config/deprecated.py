@@ -7,27 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from scipy import stats
 
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
-from gripmon.policy import PolicySettings
 
 _log = logging.getLogger(__name__)
 
 _OLD, _NEW = "suspect_sigma_m", "alert_limit_m"
 _SECTION = "monitor.policy"
 _LARGEST_LIMIT_M = 1.0
-
-
-def position_limit_m(policy: PolicySettings) -> float:
-    """The alert limit that ``suspect_sigma_m`` stands for, or the alert limit itself where there is none (m).
-
-    A normal error with that standard deviation along one axis exceeds it with the probability ``integrity_risk``.
-    """
-    if policy.suspect_sigma_m is None:
-        return policy.alert_limit_m
-    return float(stats.norm.isf(0.5 * policy.integrity_risk)) * policy.suspect_sigma_m
 
 
 def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings | Fault:
@@ -38,7 +26,7 @@ def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, 
     policy = settings.monitor.policy
     if policy.suspect_sigma_m is None:
         return settings
-    limit_m = round(position_limit_m(policy), 6)
+    limit_m = round(policy.position_limit_m, 6)
     if _NEW in values["monitor"]["policy"]:
         return Fault(f"{_SECTION}.{_OLD}", f"stands beside {_NEW}, which replaces it", f"{_NEW} alone")
     if not 0.0 < limit_m <= _LARGEST_LIMIT_M:
