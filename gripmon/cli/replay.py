@@ -188,7 +188,7 @@ class _Counts:
         self.frames = 0
         self.usable = 0
         self._verdicts: Counter[str] = Counter()
-        self._reasons: Counter[str] = Counter()  # by what comes before the colon: the rest may differ in every frame
+        self._reasons: Counter[str] = Counter()  # why nothing was measured, by what comes before the colon
         self._first_failure = ""
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
@@ -198,7 +198,7 @@ class _Counts:
         self.frames += 1
         self.usable += record.source is not Origin.HELD
         self._verdicts[record.verdict] += 1
-        if record.reason:
+        if record.reason and not record.measured:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
             if kind == "internal error":

@@ -124,7 +124,7 @@ def protection_figure(report: RecordingReport) -> go.Figure:
         (2, "protection_rad", math.degrees(1.0), limits.alert_limit_rad),
     ):
         label = "protection level" if row == 1 else "of the rotation"
-        _line(figure, curves[name], row, PURPLE, label, scale)
+        _line(figure, curves[name], row, PURPLE, label, scale, legend=row == 1)
         if limit is not None:  # a line, since a shape's text stands elsewhere on a logarithmic axis
             ends = _times([report.start_ns, report.end_ns])
             figure.add_scatter(
@@ -132,7 +132,7 @@ def protection_figure(report: RecordingReport) -> go.Figure:
                 line={"color": SEVERITIES["error"], "width": 1.2, "dash": "dash"}, hovertemplate="alert limit %{y:g}",
             )  # fmt: skip
     for row, title in enumerate(("TCP within (mm)", "turn within (°)"), 1):
-        figure.update_yaxes(type="log", title_text=title, title_standoff=8, row=row, col=1, dtick=1)
+        figure.update_yaxes(type="log", title_text=title, title_standoff=8, row=row, col=1, dtick="D2")
     figure.update_xaxes(title_text="UTC", row=2, col=1, title_standoff=4)
     return _styled(figure, 380)
 
