@@ -121,7 +121,7 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
 
     console = Console(width=120, height=12, force_terminal=True, color_system=None, legacy_windows=False)
     with console.capture() as capture:
-        console.print(fleet_table.table(THE_WORST_FIRST, "no connection to tcp/x", 12))
+        console.print(fleet_table.table(THE_WORST_FIRST, "no connection to tcp/x", 12, 120))
     lines = capture.get().splitlines()
     assert len(lines) <= 12
     shown = [line.split("/")[0] for line in lines if "/wrist" in line]
@@ -132,6 +132,17 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
         in below
     )
     assert "8 more than fit here, none in more trouble" in below
+
+
+@pytest.mark.parametrize(("width", "has_sigma"), [(80, False), (120, True)])
+def test_a_narrow_terminal_keeps_the_bound_and_the_drift(width: int, has_sigma: bool):
+    from rich.console import Console
+
+    console = Console(width=width, height=12, force_terminal=True, color_system=None, legacy_windows=False)
+    told = status("arm", tcp_shift_m=(0.003, 0.0, 0.0), protection_m=3.51e-4, alert_limit_m=5e-4)
+    with console.capture() as capture:
+        console.print(fleet_table.table([told], "", 12, width))
+    assert "3.000" in capture.get() and "0.35/0.5" in capture.get() and ("sigma mm" in capture.get()) == has_sigma
 
 
 def test_a_log_gets_aligned_columns_or_one_line():
@@ -152,7 +163,7 @@ def test_no_name_or_text_from_the_network_reaches_the_terminal_as_a_command():
     nasty = status(f"a{evil}", reference_id=evil, message=evil, state=State(evil))
     console = Console(width=300, force_terminal=True, color_system=None)
     with console.capture() as capture:
-        console.print(fleet_table.table([nasty], evil, 20))
+        console.print(fleet_table.table([nasty], evil, 20, 120))
     for text in (capture.get(), fleet_table.plain([nasty], evil), fleet_table.line(nasty)):
         assert "\x1b]" not in text and "\x07" not in text and "\r" not in text
         assert "[red]x[/]" in text  # not taken for markup either

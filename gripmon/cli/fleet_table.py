@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from gripmon.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
+_SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
 _FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
 _STYLES = {
     "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
@@ -72,14 +73,15 @@ def line(status: MonitorStatus) -> str:
     return f"{cells[0]}: {cells[1]}, {cells[2]}, {named}, reference {cells[-2]}; {cells[-1] or 'no open alerts'}"
 
 
-def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> RenderableType:
-    """For a terminal of that height: the worst monitors, as many as fit."""
+def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int) -> RenderableType:
+    """For a terminal of that size: the worst monitors, as many as fit; a narrow one does without sigma."""
     from rich.table import Table
     from rich.text import Text
 
     shown = statuses[: max(1, height - _FRAME_LINES)]
     out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
-    for name in COLUMNS:
+    chosen = [name for name in COLUMNS if name != _SPARED or width >= _WIDE]
+    for name in chosen:
         number = name in COLUMNS[3:8]
         out.add_column(
             name,
@@ -91,7 +93,8 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> Rendera
     for status in shown:
         condition, cells = row(status)
         # Text, not markup: what came from the network has no say in how it looks.
-        out.add_row(*(Text(cell) for cell in cells), style=_STYLES[condition])
+        named = zip(COLUMNS, cells, strict=True)
+        out.add_row(*(Text(cell) for name, cell in named if name in chosen), style=_STYLES[condition])
     rest = len(statuses) - len(shown)
     out.caption = Text(summary(statuses, fault) + (f"; {rest} more than fit here, none in more trouble" * (rest > 0)))
     out.caption_justify = "left"
