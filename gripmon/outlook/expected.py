@@ -59,7 +59,8 @@ class Outlook:
 
     ``covariance`` (6, 6) as it would be published; ``weakest`` (6,) one standard deviation along its least certain
     direction, rotations counted by how far they move the fingertips.  ``edges``: how many can be sampled; with fewer
-    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one.
+    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one; ``protection``: the
+    level before clutter.
     """
 
     covariance: Array
@@ -68,6 +69,7 @@ class Outlook:
     corners: NDArray[np.bool_]
     lever_m: float
     jaw: JawOutlook | None
+    protection: Protection
 
     @property
     def sigma(self) -> Array:
@@ -101,7 +103,8 @@ def expect(
         free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
         jaw = _jaw_outlook(tracker.update(free)[1], free.covariance, lever_m)
     edges, corners = _edges_seen(given), given.corners.usable
-    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw)
+    protection = foresee_protection(tracker, gripper, settings, given)
+    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw, protection)
 
 
 class Foreseen(NamedTuple):
