@@ -140,7 +140,8 @@ class FingerEnds:
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
         of = found.sample // PROBES
         near = np.abs(found.offset_px - offset_px[of]) < NEAR_PX
-        near &= found.step * np.sign(step[of]) > AS_STRONG * np.abs(step[of])
+        # Of either sign: a finger's tip may be of another shade than the rest.
+        near &= np.abs(found.step) > AS_STRONG * np.abs(step[of])
         shown = np.zeros(len(probes.ok), dtype=bool)
         shown[found.sample[near]] = True
         return np.asarray(shown.reshape(-1, PROBES).mean(axis=1) > GOES_ON)

@@ -183,6 +183,7 @@ class Monitor:
         standing = self._standing = self._trust.judge(
             frame, measurement, self._cam_T_grip, self._covariance, self._now_s
         )
+        measurement = self._newest = standing.measurement
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))

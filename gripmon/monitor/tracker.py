@@ -72,6 +72,17 @@ class Tracker:
         self._untrusted = 0 if measurement.trusted else self._untrusted + 1
         return measurement
 
+    def measure_at(self, frame: Frame, cam_T_grip: Array) -> Measurement:
+        """Measure about ``cam_T_grip`` (4, 4) and nowhere else."""
+        assert frame.image is not None
+        reported_m = frame.jaw_opening_m
+        opening_m = self.jaw_opening_m if reported_m is None else reported_m
+        here = Patience(when_doubtful=False, when_lost=False)
+        measurement = self._meter.measure(
+            frame.image, cam_T_grip, opening_m, self._usual_share, here, jaw_reported=reported_m is not None
+        )
+        return self.with_known_jaw(measurement, reported_m)
+
     def learn(self, measurement: Measurement) -> None:
         """The gripper was where it was measured: that is what it usually shows, and the report's error."""
         share = measurement.consensus.share
