@@ -121,9 +121,12 @@ class Integrity:
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self.anchor is None:
             trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        if trust.displaced and trust.proven:
+        if trust.displaced:
+            if trust.proven:
+                ends = self._tracker.ends(frame, measurement, strict=True)
+                trust = self.weigh(measurement, cam_T_grip, ends, now_s)
             rival = self._at_its_place(frame, now_s)
-            if rival is not None:
+            if rival is not None and (rival[3].proven or not trust.proven):
                 measurement, cam_T_grip, covariance, trust = rival
         rests_on_anchor = False
         if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
@@ -142,16 +145,18 @@ class Integrity:
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed)
 
     def _at_its_place(self, frame: Frame, now_s: float) -> tuple[Measurement, Array, Array, Trust] | None:
-        """The measurement where the gripper was, where its ends prove it there, too: marks on the fingers look like ends
-        elsewhere.
+        """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
+        look like their ends elsewhere.
         """
-        expected_T = self._expected[0] if self.anchor is None else self.anchor.cam_T_grip
-        measurement = self._tracker.measure_at(frame, expected_T)
+        anchor = self.anchor
+        expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
+        sigma = np.sqrt(covariance.diagonal() + self._wander(now_s) + self._floor)
+        measurement = self._tracker.measure_held(frame, expected_T, sigma)
         if not measurement.trusted:
             return None
         cam_T_grip, covariance = self._tracker.update(measurement)
         trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        return (measurement, cam_T_grip, covariance, trust) if trust.proven and not trust.displaced else None
+        return None if trust.displaced else (measurement, cam_T_grip, covariance, trust)
 
     def _confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
