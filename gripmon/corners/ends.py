@@ -80,19 +80,14 @@ class FingerEndsSeen:
     might: NDArray[np.intp]
 
     @property
-    def proven(self) -> int:
-        """How many fingers show their end."""
-        return int(np.count_nonzero(self.seen >= END_CORNERS))
-
-    @property
-    def provable(self) -> int:
-        """How many have to, so that the ends are sure: two that might, one where the view has no more."""
-        return min(int(np.count_nonzero(self.might >= END_CORNERS)), 2)
-
-    @property
     def sure(self) -> bool:
-        """Whether as many show it as have to."""
-        return 0 < self.provable <= self.proven
+        """Whether enough of them are seen, wherever the gripper was expected: two of each of two fingers or as many in
+        all; two of the only one whose end the view has.
+        """
+        fingers = int(np.count_nonzero(self.might >= END_CORNERS))
+        if fingers < 2:
+            return fingers == 1 and int(self.seen.max()) >= END_CORNERS
+        return int(np.count_nonzero(self.seen)) >= 2 and int(self.seen.sum()) >= 2 * END_CORNERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +135,7 @@ class FingerEnds:
             np.bincount(finger[self._at_end & prediction.corners.visible], minlength=fingers),
         )
 
-    def _going_on(
-        self, image: Image, measurement: Measurement, probes: _Probes, strict: bool
-    ) -> NDArray[np.bool_]:
+    def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
         prediction, candidates = measurement.prediction, measurement.candidates
         profiles = read_profiles(image, probes.map_x, probes.map_y)

@@ -128,6 +128,22 @@ class Integrity:
             rival = self._at_its_place(frame, now_s)
             if rival is not None and (rival[3].proven or not trust.proven):
                 measurement, cam_T_grip, covariance, trust = rival
+        return self._conclude(measurement, cam_T_grip, covariance, trust, now_s)
+
+    def held(self, frame: Frame, now_s: float) -> Standing | None:
+        """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
+        that place, or nothing of the fingers' ends is seen there.
+        """
+        rival = None if self.anchor is None else self._at_its_place(frame, now_s)
+        if rival is None or self._short(rival[3]) and rival[3].instead is None:
+            return None
+        standing = self._conclude(*rival, now_s)
+        return None if past_alert_limit(standing.protection, self._policy) else standing
+
+    def _conclude(
+        self, measurement: Measurement, cam_T_grip: Array, covariance: Array, trust: Trust, now_s: float
+    ) -> Standing:
+        """What to publish of a weighed pose, and whether it becomes the anchor."""
         rests_on_anchor = False
         if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
             # What the frame leaves open the anchor tells.
@@ -152,8 +168,9 @@ class Integrity:
         expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
         sigma = np.sqrt(covariance.diagonal() + self._wander(now_s) + self._floor)
         measurement = self._tracker.measure_held(frame, expected_T, sigma)
-        if not measurement.trusted:
+        if measurement.consensus.share == 0.0:
             return None
+        measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
         trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
         return None if trust.displaced else (measurement, cam_T_grip, covariance, trust)
