@@ -20,6 +20,7 @@ from gripmon.records import (
     Drift,
     FrameRecord,
     Origin,
+    Protection,
     ReferenceRecord,
     Severity,
     Smoothed,
@@ -112,6 +113,7 @@ def frame_record(seq: int = 7, **changes: object) -> FrameRecord:
         "corners": (CornerRecord("L_in_near", (12.5, 34.25), 0.05, used=True),),
         "alerts": (Alert(AlertKind.DRIFT, Cause.CAMERA_MOUNT, Severity.WARNING, "moved 1.5 mm"),),
         "name": "frame",
+        "protection": Protection(0.00045, 0.0055, 1e-5, "an edge belongs to something else"),
     }
     return FrameRecord(**(values | changes))  # type: ignore[arg-type]
 

@@ -87,7 +87,7 @@ def records_of_a_run(first: int, count: int) -> list[FrameRecord]:
             assert other is not None
             changes["smoothed"] = Smoothed(other.translation_m, other.rotation_xyzw, tuple(2.0 * v for v in COVARIANCE))
         if i % 20 == 7:
-            gone = {"cam_T_grip": None, "covariance": None, "drift": None, "rms_px": None, "jaw_opening_m": None}
+            gone = dict.fromkeys(("cam_T_grip", "covariance", "drift", "rms_px", "jaw_opening_m", "protection"))
             changes |= {**gone, "corners": (), "reason": "black", "verdict": Verdict.UNKNOWN, "state": State.LOST}
         if i % 50 == 40:
             changes |= {"alerts": (MOVED,), "state": State.DRIFTING, "verdict": Verdict.SUSPECT}

@@ -25,6 +25,7 @@ from gripmon.records import (
     FrameRecord,
     MeasurementTrace,
     Origin,
+    Protection,
     RecordedConfiguration,
     ReferenceRecord,
     State,
@@ -122,6 +123,7 @@ def record(
         corners=tuple(corners),
         alerts=alerts,
         latency_ns=int(rng.integers(100_000, 200_000)),
+        protection=Protection(rng.uniform(), rng.uniform(), 1e-5, "nothing is wrong"),
     )
     return msgspec.structs.replace(made, **changes)
 

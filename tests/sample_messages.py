@@ -32,6 +32,7 @@ from gripmon.records import (
     MonitorState,
     OpenAlert,
     Origin,
+    Protection,
     PulseFault,
     ReferenceInputs,
     ReferenceRecord,
@@ -108,6 +109,7 @@ MEASURED = FrameRecord(
     alerts=(MOVED,),
     latency_ns=2_650_000,
     name="/dev/video0",
+    protection=Protection(3.5e-4, 4.4e-3, 1e-5, "an edge belongs to something else"),
 )
 HELD = msgspec.structs.replace(
     MEASURED,
@@ -122,6 +124,7 @@ HELD = msgspec.structs.replace(
     corners=tuple(CornerRecord(c.id, None, None, used=False, reason=CornerFault.HIDDEN) for c in MEASURED.corners),
     alerts=(),
     reason="too few edges are seen",
+    protection=Protection(1.1e-3, 0.018, 1e-5, "nothing is wrong"),
 )
 NOTHING = msgspec.structs.replace(
     HELD,
@@ -133,6 +136,7 @@ NOTHING = msgspec.structs.replace(
     covariance=None,
     smoothed=None,
     drift=None,
+    protection=None,
 )
 CONFIGURED = ReferenceRecord("config-5f2ac301", 0, 0, "configuration", POSE, covariance(0.002, 0.01))
 RECALIBRATED = ReferenceRecord(
@@ -238,6 +242,8 @@ SAMPLES: dict[str, msgspec.Struct] = {
         version="0.1.0",
         tcp_shift_m=(0.0015, -0.0002, 0.0001),
         sigma_m=8e-5,
+        protection_m=3.5e-4,
+        alert_limit_m=5e-4,
         open_alerts=(
             StandingAlert(
                 "drift-3", AlertKind.STEP, Severity.WARNING, MOVED.text, STAMP_NS - 500_000_000, acknowledged=False

@@ -45,7 +45,17 @@ def test_a_valid_transform_is_given_as_it_came():
     got = reading(heard(seq=41, latency_ns=2_500_000), now_s=100.125)
     assert got.usable and got.why is None and got.reason == ""
     assert got.verdict is Verdict.VALID and got.monitor == WRIST
-    for name in ("covariance", "smoothed", "state", "source", "stamp_ns", "seq", "reference_id", "revision"):
+    for name in (
+        "covariance",
+        "smoothed",
+        "protection",
+        "state",
+        "source",
+        "stamp_ns",
+        "seq",
+        "reference_id",
+        "revision",
+    ):
         assert getattr(got, name) == getattr(record, name), name
     assert got.transform == record.cam_T_grip
     assert got.age_s == pytest.approx(0.125 + 0.0025, abs=1e-12)  # since it arrived, and what the monitor needed
@@ -70,6 +80,13 @@ def test_a_valid_transform_is_given_as_it_came():
         ({}, Policy(max_sigma_m=2.1e-4), 0.0, None, ""),
         ({}, Policy(max_sigma_m=1.9e-4), 0.0, Unusable.UNCERTAIN,
          "the transform is certain to 0.2 mm, allowed are 0.19 mm"),
+        ({}, Policy(max_protection_m=4.5e-4), 0.0, None, ""),
+        ({}, Policy(max_protection_m=4.4e-4), 0.0, Unusable.UNPROTECTED,
+         "the TCP may be 0.45 mm off, allowed are 0.44 mm"),
+        ({"protection": None}, Policy(), 0.0, None, ""),
+        ({"protection": None}, Policy(max_protection_m=1.0), 0.0, Unusable.UNPROTECTED,
+         "the monitor states no protection level"),
+        ({"verdict": Verdict.SUSPECT}, Policy(accept_suspect=True, max_protection_m=1e-3), 0.0, None, ""),
     ],
 )  # fmt: skip
 def test_the_policy_refuses(
@@ -81,7 +98,7 @@ def test_the_policy_refuses(
     assert got.reason.startswith(said) and bool(got.reason) == (why is not None)
     unknown = why in (Unusable.STALE, Unusable.UNKNOWN)
     assert (got.verdict is Verdict.UNKNOWN) == unknown
-    for value in (got.transform, got.covariance, got.smoothed):
+    for value in (got.transform, got.covariance, got.smoothed, *([] if "protection" in changes else [got.protection])):
         assert (value is None) == unknown
     assert got.sigma_m() == (math.inf if unknown else pytest.approx(2e-4))
 
@@ -158,6 +175,7 @@ def test_the_matrix_is_scipys(quaternion: list[float]):
 
 
 POSE = {"translation_m": [0.0, 0.0, 0.1], "rotation_xyzw": [0.0, 0.0, 0.0, 1.0]}
+BOUNDS = {"position_m": 4e-4, "rotation_rad": 5e-3, "risk": 1e-5}
 
 
 @pytest.mark.parametrize(
@@ -184,6 +202,10 @@ POSE = {"translation_m": [0.0, 0.0, 0.1], "rotation_xyzw": [0.0, 0.0, 0.0, 1.0]}
         ("covariance", [-1.0] + [1.0] * 35),
         ("smoothed", POSE | {"rotation_xyzw": [1.0, 1.0, 0.0, 0.0], "covariance": [1.0] * 36}),
         ("smoothed", POSE | {"covariance": [1.0] * 35 + [-1.0]}),
+        ("protection", BOUNDS | {"position_m": -1e-3}),
+        ("protection", BOUNDS | {"rotation_rad": math.nan}),
+        ("protection", BOUNDS | {"risk": 0.0}),
+        ("protection", {"position_m": 1e-3}),
     ],
 )
 def test_a_message_that_is_none_is_counted_said_once_and_changes_nothing(
@@ -202,6 +224,16 @@ def test_a_message_that_is_none_is_counted_said_once_and_changes_nothing(
     assert stale.why is Unusable.STALE and "; what came since can't be read: " in stale.reason
     inbox.take(WRIST, payload(), 101.0)
     assert reading(inbox, now_s=101.0).usable and inbox.unreadable == 3
+
+
+def test_an_older_monitor_has_no_protection_level_and_is_read():
+    told = json.loads(payload())
+    assert told.pop("protection") is not None
+    older = Inbox()
+    older.take(WRIST, json.dumps(told).encode(), 100.0)
+    got = reading(older)
+    assert got.usable and got.protection is None
+    assert not reading(older, Policy(max_protection_m=0.01)).usable
 
 
 def test_a_newer_monitor_is_named_as_the_reason_and_additions_are_passed_over():
@@ -242,7 +274,9 @@ def test_nothing_that_arrives_makes_an_exception(data: bytes):
         assert got.transform == (record.cam_T_grip if got.verdict is not Verdict.UNKNOWN else None)
 
 
-@pytest.mark.parametrize("values", [{"max_age_s": 0.0}, {"max_age_s": math.nan}, {"max_sigma_m": -1.0}])
+@pytest.mark.parametrize(
+    "values", [{"max_age_s": 0.0}, {"max_age_s": math.nan}, {"max_sigma_m": -1.0}, {"max_protection_m": 0.0}]
+)
 def test_a_policy_that_can_not_be_meant_is_refused(values: dict[str, float]):
     with pytest.raises(ValueError, match=rf"^{next(iter(values))} is .*; give a number above 0$"):
         Policy(**values)  # type: ignore[arg-type]

@@ -330,3 +330,35 @@ def test_a_state_belongs_to_camera_gripper_and_reference_whatever_else_changes(f
     moved = load_config(edited(folder, r"0.1188\]", "0.1189]")).state_owner.calibration
     assert (moved.camera, moved.gripper) == (owner.calibration.camera, owner.calibration.gripper)
     assert moved.reference != owner.calibration.reference
+
+
+# --- what earlier versions had ---
+
+
+def test_a_largest_sigma_is_read_as_the_alert_limit_that_it_stands_for(folder: Path, caplog: pytest.LogCaptureFixture):
+    path = edited(folder, r"^source:", "monitor: {policy: {suspect_sigma_m: 0.003}}\nsource:")
+    policy = load_config(path).settings.monitor.policy
+    # Of a normal distribution 1e-5 lies beyond 4.417 standard deviations, both tails together.
+    assert policy.alert_limit_m == pytest.approx(4.417 * 0.003, abs=1e-5) and policy.suspect_sigma_m is None
+    (said,) = caplog.messages
+    what = "monitor.policy.suspect_sigma_m: 0.003 is deprecated; write alert_limit_m: 0.013252, which it stands for"
+    assert said == f"{path}: {what}"
+    path = edited(folder, r"suspect_sigma_m: 0.003", "suspect_sigma_m: 0.003, integrity_risk: 0.01")
+    assert load_config(path).settings.monitor.policy.alert_limit_m == pytest.approx(2.576 * 0.003, abs=1e-5)
+
+
+def test_a_largest_sigma_beside_an_alert_limit_is_refused(folder: Path):
+    path = edited(folder, r"^source:", "monitor: {policy: {suspect_sigma_m: 1e-4, alert_limit_m: 5e-4}}\nsource:")
+    with pytest.raises(
+        ConfigError, match=r"suspect_sigma_m: stands beside alert_limit_m, which replaces it; alert_limit_m alone"
+    ):
+        load_config(path)
+    path = edited(folder, r"suspect_sigma_m: 1e-4, alert_limit_m: 5e-4", "suspect_sigma_m: 0.5")
+    with pytest.raises(ConfigError, match=r"0.5 stands for alert_limit_m: 2.2"):
+        load_config(path)
+
+
+def test_the_limits_are_the_defaults_without_a_word(folder: Path, caplog: pytest.LogCaptureFixture):
+    policy = load_config(folder / "config.yaml").settings.monitor.policy
+    assert (policy.alert_limit_m, policy.alert_limit_rad, policy.integrity_risk) == (5e-4, 0.02, 1e-5)
+    assert not caplog.messages

@@ -73,7 +73,8 @@ def moving(
     count: int, start_ns: int = MIDNIGHT_NS + DAY_NS // 2, period_ns: int = 100 * MILLISECOND_NS
 ) -> list[FrameRecord]:
     """Frames in which no two are alike; every seventh knows nothing."""
-    nothing = {"cam_T_grip": None, "covariance": None, "smoothed": None, "drift": None, "verdict": Verdict.UNKNOWN}
+    nothing = dict.fromkeys(("cam_T_grip", "covariance", "smoothed", "drift", "protection"))
+    nothing |= {"verdict": Verdict.UNKNOWN}
     return [
         frame_record(
             seq,
@@ -118,7 +119,7 @@ def test_every_number_of_a_frame_arrives(tmp_path: Path):
         assert (row["verdict"], row["state"], row["source"]) == (record.verdict, record.state, record.source)
         assert (row["reference_id"], row["revision"]) == ("plate-2", 3)
         assert (row["rms_px"], row["jaw_opening_m"]) == (0.0625, 0.034)
-        assert (row["corners_used"], row["corners_total"], row["refused"]) == (1, 1, False)
+        assert (row["corners_used"], row["corners_total"], row["refused"]) == (1, 1, record.cam_T_grip is None)
         assert (row["recording_id"], row["file_number"], row["robot"], row["camera"]) == ("run-1", 0, "arm1", "wrist")
         pose = [row[f"cam_T_grip_{part}"] for part in ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")]
         smoothed = [row[f"smoothed_{part}"] for part in ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")]
@@ -126,6 +127,7 @@ def test_every_number_of_a_frame_arrives(tmp_path: Path):
         sigma = [row[f"sigma_{axis}_m"] for axis in "xyz"]
         if record.cam_T_grip is None:
             assert pose == smoothed == [None] * 7 and shift == sigma == [None] * 3
+            assert row["protection_m"] is row["protection_rad"] is row["integrity_risk"] is None
             assert row["covariance"] is row["smoothed_covariance"] is row["d_m"] is row["delta_rad"] is None
             continue
         assert record.smoothed and record.drift and record.covariance
@@ -134,6 +136,7 @@ def test_every_number_of_a_frame_arrives(tmp_path: Path):
         assert [row["d_m"], row["delta_rad"], *shift] == [
             record.drift.translation_m, record.drift.rotation_rad, *record.drift.tcp_shift_m,
         ]  # fmt: skip
+        assert [row["protection_m"], row["protection_rad"], row["integrity_risk"]] == [0.00045, 0.0055, 1e-5]
         assert sigma == pytest.approx([math.sqrt(record.covariance[7 * k]) for k in range(3)])
         for name, flat in (("covariance", record.covariance), ("smoothed_covariance", record.smoothed.covariance)):
             assert row[name] == [flat[6 * i + j] for i in range(6) for j in range(i, 6)]
@@ -217,6 +220,7 @@ def test_alerts_commands_states_and_references_arrive(tmp_path: Path):
     told_state = samples["state"]
     for name in set(SCHEMAS["states"].names) & set(told_state.__struct_fields__) - {"open_alerts"}:
         assert state[name] == getattr(told_state, name), name
+    assert (state["protection_m"], state["alert_limit_m"]) == (3.5e-4, 5e-4)
     assert state["open_alerts"] == 1 and state["tcp_shift_y_m"] == -0.0002
     assert read["commands"]["name"].to_pylist() == ["accept", "undo"]  # by time
     assert read["commands"]["done"].to_pylist() == [False, True]

@@ -97,6 +97,8 @@ def test_a_daemon_tells_prometheus_what_it_tells_the_network(tmp_path: Path):
             ("gripmon_reference_revision", state.revision),
             ("gripmon_frames_per_second", state.frames_per_s),
             ("gripmon_sigma_meters", state.sigma_m),
+            ("gripmon_protection_meters", state.protection_m),
+            ("gripmon_alert_limit_meters", 5e-4),
             ("gripmon_camera_connected", state.camera_connected),
         ):
             assert only(found, name) == value, name
@@ -158,10 +160,25 @@ def test_what_is_not_known_has_no_sample(server: tuple[MetricsServer, int]):
     tally.state(msgspec.structs.replace(state_record(), verdict=Verdict.UNKNOWN, state=State("napping")))
     tally.transform(frame_record(verdict=Verdict.UNKNOWN, drift=None))
     found = scraped(port)
-    assert not {"gripmon_sigma_meters", "gripmon_tcp_shift_meters", "gripmon_rotation_radians"} & found.keys()
+    assert (
+        not {
+            "gripmon_sigma_meters",
+            "gripmon_protection_meters",
+            "gripmon_tcp_shift_meters",
+            "gripmon_rotation_radians",
+        }
+        & found.keys()
+    )
     assert found["gripmon_state"][(("state", "napping"),)] == 1.0 and sum(found["gripmon_state"].values()) == 1.0
     tally.transform(frame_record())
     assert math.isclose(only(scraped(port), "gripmon_rotation_radians"), 0.0026)
+
+
+def test_the_bound_and_its_limit_are_gauges(server: tuple[MetricsServer, int]):
+    tally, port = server
+    tally.state(msgspec.structs.replace(state_record(), protection_m=3.5e-4, alert_limit_m=1e-3))
+    found = scraped(port)
+    assert (only(found, "gripmon_protection_meters"), only(found, "gripmon_alert_limit_meters")) == (3.5e-4, 1e-3)
 
 
 def test_a_port_that_is_taken_is_said_at_the_start(tmp_path: Path):

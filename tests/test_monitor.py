@@ -282,11 +282,12 @@ FIELDS = {
     "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
     "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",
 }  # fmt: skip
-ADDED = {"reason", "name", "schema"}
+ADDED = {"reason", "name", "schema", "protection"}
 NESTED = {
     "cam_T_grip": {"translation_m", "rotation_xyzw"},
     "smoothed": {"translation_m", "rotation_xyzw", "covariance"},
     "drift": {"translation_m", "rotation_rad", "tcp_shift_m"},
+    "protection": {"position_m", "rotation_rad", "risk", "hypothesis"},
 }
 
 
@@ -299,6 +300,8 @@ def test_a_line_has_the_fields_of_the_contract():
         assert line["source"] in ("update", "recalibration", "held")
         assert line["verdict"] in ("valid", "suspect", "unknown")
         assert isinstance(line["seq"], int) and isinstance(line["stamp_ns"], int)
+        assert (line["protection"] is None) == (line["cam_T_grip"] is None)
+        assert (line["reason"] is None) == (line["verdict"] == "valid")
         if line["cam_T_grip"] is not None:
             assert [len(line["cam_T_grip"][k]) for k in ("translation_m", "rotation_xyzw")] == [3, 4]
             assert len(line["covariance"]) == len(line["smoothed"]["covariance"]) == 36

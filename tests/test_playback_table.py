@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from playback_runs import lines, records_of_a_run
@@ -11,7 +12,7 @@ from recorded import record
 
 from gripmon.geometry import from_record
 from gripmon.playback import FrameTable
-from gripmon.records import FrameRecord, Origin, State, Verdict
+from gripmon.records import FrameRecord, Origin, State, Verdict, to_json
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,10 @@ def test_every_number_stands_in_its_column(records: list[FrameRecord], table: Fr
         assert (table.reference_ids[table.reference[i]], table.revision[i]) == (r.reference_id, r.revision)
         assert table.corners_used[i] == sum(corner.used for corner in r.corners)
         assert table.corners_total[i] == len(r.corners)
-        assert table.refused[i] == (r.reason is not None)
+        assert table.refused[i] == (r.cam_T_grip is None)
+        if r.protection is not None:
+            bounds = table.protection_m[i], table.protection_rad[i], table.integrity_risk[i]
+            assert bounds == (r.protection.position_m, r.protection.rotation_rad, r.protection.risk)
         if r.drift is not None:
             assert table.d_m[i] == r.drift.translation_m and table.delta_rad[i] == r.drift.rotation_rad
             assert tuple(table.tcp_shift_m[i]) == r.drift.tcp_shift_m
@@ -51,12 +55,31 @@ def test_null_is_not_a_number(records: list[FrameRecord], table: FrameTable):
         (table.covariance[:, 0, 0], "covariance"),
         (table.smoothed[:, 0], "smoothed"),
         (table.smoothed_covariance[:, 0, 0], "smoothed"),
+        (table.protection_m, "protection"),
+        (table.protection_rad, "protection"),
+        (table.integrity_risk, "protection"),
         (table.d_m, "drift"),
         (table.rms_px, "rms_px"),
         (table.jaw_opening_m, "jaw_opening_m"),
     ):
         null = [getattr(r, name) is None for r in records]
         assert any(null) and np.array_equal(np.isnan(column), null), name
+
+
+def test_a_suspect_frame_was_measured_and_a_held_one_was_not():
+    suspect = record(0, verdict=Verdict.SUSPECT, reason="the TCP may be 0.9 mm off")
+    held = msgspec.structs.replace(suspect, source=Origin.HELD, reason="hidden")
+    assert FrameTable.from_records([suspect, held]).refused.tolist() == [False, True]
+    assert suspect.measured and not held.measured
+
+
+def test_lines_of_an_older_version_have_no_bounds(tmp_path: Path):
+    line = msgspec.json.decode(to_json(record(0)))
+    assert line.pop("protection")
+    path = tmp_path / "older.jsonl"
+    path.write_bytes(msgspec.json.encode(line) + b"\n" + to_json(record(1)) + b"\n")
+    table = FrameTable.from_jsonl(path)
+    assert np.isnan(table.protection_m).tolist() == [True, False] and np.isnan(table.integrity_risk[0])
 
 
 def test_matrices_are_those_of_the_geometry(records: list[FrameRecord], table: FrameTable):

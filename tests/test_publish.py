@@ -54,9 +54,12 @@ def test_transform_on_the_wire(publisher: Published, session: zenoh.Session):
     assert message["stamp_ns"] == 1_700_000_000_123_456_796
     assert message["covariance"] == [1e-9 * (i + 1) for i in range(36)]
     assert message["verdict"] == "valid" and message["source"] == "update"
+    assert {key: message["protection"][key] for key in ("position_m", "rotation_rad", "risk")} == {
+        "position_m": 0.00045, "rotation_rad": 0.0055, "risk": 1e-5,
+    }  # fmt: skip
     fields = (
         "seq stamp_ns verdict state source cam_T_grip covariance smoothed drift reference_id revision rms_px "
-        "jaw_opening_m corners alerts latency_ns"
+        "jaw_opening_m corners alerts latency_ns protection"
     )
     assert set(message) >= set(fields.split())
     assert message["corners"] == [

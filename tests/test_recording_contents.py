@@ -47,7 +47,9 @@ from gripmon.records import (
 
 COUNT = 20
 LEARNT_FROM = 5
-EARLY = Limits(1e-4, 3e-3, 2.5e-3, 0.02, (5e-6,) * 3 + (1e-4,) * 3, None, None, None, (0.5,) * 6, (1e-5,) * 6)
+EARLY = Limits(
+    1e-4, 3e-3, 2.5e-3, 0.02, (5e-6,) * 3 + (1e-4,) * 3, None, None, None, (0.5,) * 6, (1e-5,) * 6, 5e-4, 0.02
+)
 LATE = msgspec.structs.replace(
     EARLY,
     noticed=(1e-4, 2e-4, 3e-4, 0.01, 0.02, 0.03),
@@ -68,7 +70,7 @@ CONFIGURATION = RecordedConfiguration(
 def told_of(i: int) -> FrameRecord:
     """Frame 7 was refused; 4 raises an alert, in 8 it becomes another, 9 clears it."""
     if i == 7:
-        return record(i, cam_T_grip=None, covariance=None, drift=None, rms_px=None, reason="black")
+        return record(i, cam_T_grip=None, covariance=None, drift=None, rms_px=None, protection=None, reason="black")
     pose = record(i + 1000).cam_T_grip
     assert pose is not None
     covariance = tuple((0.25 * np.array(record(i).covariance)).tolist())
@@ -182,9 +184,23 @@ def test_the_statistic_stands_beside_its_threshold(told: Recorded) -> None:
     assert {0, COUNT - 1} <= set(alarm) and all(value == [1.0] for value in alarm.values())
 
 
+def test_the_protection_level_is_a_curve(told: Recorded) -> None:
+    level_mm, level_deg = (told.by_seq(f"protection/level_{unit}", "scalars") for unit in ("mm", "deg"))
+    assert level_mm[7] == level_deg[7] == []
+    for i in set(range(COUNT)) - {7}:
+        said = told_of(i).protection
+        assert said is not None
+        np.testing.assert_allclose(
+            [*level_mm[i], *level_deg[i]], [1e3 * said.position_m, math.degrees(said.rotation_rad)]
+        )
+    assert any("protection/level_mm" in text for text in told.blueprint)
+
+
 def test_limits_are_lines_from_the_first_frame_to_the_last(told: Recorded) -> None:
     for path, expected in (
         ("drift/limits_mm", [0.1, 2.5]),
+        ("protection/limit_mm", [0.5]),
+        ("protection/limit_deg", [0.02 * 180.0 / math.pi]),
         ("drift/limits_deg", [3e-3 * 180.0 / math.pi, 0.02 * 180.0 / math.pi]),
     ):
         values = told.by_seq(path, "scalars")

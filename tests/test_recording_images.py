@@ -22,6 +22,7 @@ from recorded import (
 
 from gripmon.records import (
     MeasurementTrace,
+    Origin,
     State,
     Verdict,
 )
@@ -50,7 +51,7 @@ def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.ndarray) -> None:
-    refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image")
+    refused = record(1, State.LOST, Verdict.UNKNOWN, corners=(), reason="not_an_image", source=Origin.HELD)
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0), partial(trace, 0))
     writer.offer(frame(1, picture), refused, lambda: None)

@@ -21,12 +21,12 @@ from loopback import frame_record
 from gripmon.cli import main
 from gripmon.cli.replay import _Counts
 from gripmon.monitor import Monitor
-from gripmon.records import Frame, FrameRecord, Refusal
+from gripmon.records import Frame, FrameRecord, Origin, Refusal
 
 ROOT = Path(__file__).resolve().parent.parent
 CONTRACT = {
     "seq", "stamp_ns", "verdict", "state", "source", "cam_T_grip", "covariance", "smoothed", "drift", "reference_id",
-    "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns",
+    "revision", "rms_px", "jaw_opening_m", "corners", "alerts", "latency_ns", "protection",
 }  # fmt: skip
 FPS = 10
 
@@ -229,7 +229,8 @@ def test_the_summary_needs_no_memory_for_each_frame():
     counts = _Counts()
     latencies_ns = np.random.default_rng(3).lognormal(14.0, 0.5, 5001).astype(int).tolist()
     for seq, latency_ns in enumerate(latencies_ns):
-        counts.add(frame_record(seq, latency_ns=latency_ns, reason=f"few_points: {seq} left"))
+        counts.add(frame_record(seq, latency_ns=latency_ns, source=Origin.HELD, reason=f"few_points: {seq} left"))
+        counts.add(frame_record(seq, latency_ns=latency_ns, reason=f"the TCP may be {seq} mm off"))
     said = re.search(r"median ([0-9.]+) ms", counts.summary())
     assert said and float(said[1]) == pytest.approx(1e-6 * float(np.median(latencies_ns)), rel=0.015)
     assert len(counts._reasons) == 1 and len(counts._latencies) < 300

@@ -7,22 +7,25 @@ import json
 import re
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
+import recorded
 import rerun as rr
 from replayed import EVERY_FRAME, replayed, without_latency
 from rerun.chunk import RrdReader
 
 from gripmon.cli import main
+from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds
 from gripmon.cli.replay import _recorder
 from gripmon.cli.replaying import replay
 from gripmon.config import load_config
 from gripmon.config.recorded import to_recorded
 from gripmon.recording import open_recorder
-from gripmon.records import Frame, Refusal
+from gripmon.records import Frame, Origin, Protection, Refusal, Verdict
 from gripmon.sources.folder import FolderSettings, FolderSource
 
 
@@ -208,7 +211,10 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     )
     text = re.sub(r"(?ms)^monitor:.*?(?=^\w|\Z)", "", (sequence / "config.yaml").read_text())
     tight = sequence / "tight.yaml"
-    tight.write_text(text + "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004}, recalibration: {mode: 'off'}}\n")
+    tight.write_text(
+        text
+        + "monitor: {policy: {warn_m: 0.0001, limit_m: 0.0004, alert_limit_m: 0.001}, recalibration: {mode: 'off'}}\n"
+    )
     lines_now = replayed(then, tmp_path / "now.jsonl", "--config", str(tight), "--recording", str(both))
     shifts, scalars = "drift/tcp_shift_mm", "Scalars:scalars"
     for entity, lines in ((f"recorded/{shifts}", lines_then), (shifts, lines_now)):
@@ -221,9 +227,15 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     for entity, limits_mm in (
         ("drift/limits_mm", [0.1, 0.4]),
         ("recorded/drift/limits_mm", [1e3 * policy.warn_m, 1e3 * policy.limit_m]),
+        ("recorded/protection/limit_mm", [1e3 * policy.alert_limit_m]),
+        ("protection/limit_mm", [1.0]),
     ):
-        for drawn_mm in contents(both, entity, scalars).values():
-            assert drawn_mm == pytest.approx(limits_mm)
+        drawn_mm = contents(both, entity, scalars)
+        assert drawn_mm and all(values == pytest.approx(limits_mm) for values in drawn_mm.values()), entity
+    for entity, lines in (("recorded/protection/level_mm", lines_then), ("protection/level_mm", lines_now)):
+        bounds = {line["seq"]: line["protection"] for line in map(json.loads, lines) if line["protection"]}
+        drawn = {seq: values[0] for seq, values in contents(both, entity, scalars).items() if values}
+        assert drawn == pytest.approx({seq: 1e3 * bound["position_m"] for seq, bound in bounds.items()})
     log = [text for (text,) in contents(both, "recorded/events", "TextLog:text").values()]
     assert log and all(text.startswith("recorded: ") for text in log)
     assert contents(both, "recorded/status/state", "StateChange:state") and contents(
@@ -283,3 +295,23 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         assert main(["replay", *map(str, inputs), "--out", "-"]) == code
         (line,) = capsys.readouterr().err.splitlines()
         assert expected in line
+
+
+def test_a_recording_from_before_protection_levels_is_compared_by_what_it_says():
+    bound = Protection(9e-4, 0.01, 1e-5, "an edge belongs to something else")
+    record = recorded.record(3, protection=bound, verdict=Verdict.SUSPECT, reason="the TCP may be 0.9 mm off")
+    then = as_recorded_before_bounds(record)
+    assert then.protection is None and then.reason is None and then.cam_T_grip == record.cam_T_grip
+    held = msgspec.structs.replace(record, source=Origin.HELD, reason="hidden")
+    assert as_recorded_before_bounds(held).reason == "hidden"
+    run = RecordedRun.__new__(RecordedRun)
+    run.source = SimpleNamespace(passed_over=0, images_damaged=0, record=then)
+    run._frames = run._same = run._verdicts = run._states = run._unbounded = 0
+    run.compare(record)
+    assert run.summary() == (
+        "replay: all 1 as they were recorded, every number the same; "
+        "1 frames were recorded by a version without protection levels"
+    )
+    run.source.record = msgspec.structs.replace(then, rms_px=9.0)
+    run.compare(record)
+    assert "1 of 2 otherwise than recorded" in run.summary()

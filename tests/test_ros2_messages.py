@@ -113,7 +113,11 @@ def test_levels_of_diagnostics(messages: Messages, changes: dict[str, object], a
 
 def test_values_of_diagnostics(messages: Messages):
     state = msgspec.structs.replace(
-        state_record(), stamp_ns=STAMP_NS + 250_000_000, tcp_shift_m=(0.001, -0.002, 0.003), sigma_m=12e-6
+        state_record(),
+        stamp_ns=STAMP_NS + 250_000_000,
+        tcp_shift_m=(0.001, -0.002, 0.003),
+        sigma_m=12e-6,
+        alert_limit_m=5e-4,
     )
     frame = frame_record(0, stamp_ns=STAMP_NS, reason="blurred")
     payload = cdr(
@@ -139,6 +143,11 @@ def test_values_of_diagnostics(messages: Messages):
         "tcp shift x y z in the camera frame (mm)": "1.0000 -2.0000 3.0000",
         "rotation (deg)": "0.1490",  # of 2.6 mrad
         "position sigma (mm)": "0.0120",
+        "protection level (mm)": "0.4500",
+        "rotation protection level (deg)": "0.3151",  # of 5.5 mrad
+        "integrity risk per frame": "1e-05",
+        "hypothesis": "an edge belongs to something else",
+        "alert limit (mm)": "0.5",
         "alerts": f"{AlertKind.DRIFT} (warning)",
         "camera connected": "true",
         "frames per s": "30.00",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import re
 import socket
 import threading
 import time
@@ -354,3 +355,14 @@ def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_pat
         assert list(tmp_path.iterdir()) == [path]
     finally:
         server.close()
+
+
+def test_an_answer_says_what_a_transform_may_promise(served: PageServer, rig: Rig):
+    corners = rig.rough("L_in_near", "L_in_far", "R_in_near", "R_in_far")
+    status, reply = look(served, {"corners": corners, "by_hand": list(corners), "image": 0})
+    assert status == 200 and reply["expected"]["reachable"] is True
+    assert re.match(
+        r"a transform of this view is good to [\d.]+ mm .*; alert limit 0.5 mm, 1.1 degrees: reachable$",
+        reply["expected"]["promise"],
+    )
+    assert b'id="promise"' in ask(served)[2] and b"#promise" in ask(served, "panel.js")[2]

@@ -72,6 +72,9 @@ def test_a_refusal_is_said_once_though_its_figures_change():
     assert watch.frames_refused == 4
     watch.frame(frame_record(reason="too few edges agree"), now_s=1.0)
     assert watch.message == "too few edges agree"
+    for off in ("0.61 mm off, alert limit 0.5 mm", "1.3e+02 mm off, alert limit 0.5 mm"):
+        watch.frame(frame_record(reason=f"the TCP may be {off}"), now_s=1.0)
+        assert watch.message == "the TCP may be 0.61 mm off, alert limit 0.5 mm", "figures change with every frame"
     watch.frame(frame_record(), now_s=1.0)
     assert watch.message == ""
 
@@ -87,14 +90,15 @@ def test_the_rate_is_that_of_the_last_frames():
     assert watch.frames_per_s(30.1) == pytest.approx(10.0)
 
 
-def test_drift_and_certainty_are_those_of_the_last_transform_while_it_counts():
+def test_drift_certainty_and_protection_are_those_of_the_last_transform_while_it_counts():
     watch = Watch(SETTINGS, now_s=0.0)
     assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
     covariance = np.diag([1e-10, 4e-10, 2.5e-9, 1.0, 1.0, 1.0]).ravel().tolist()
     watch.frame(frame_record(covariance=tuple(covariance)), now_s=1.0)
     assert watch.tcp_shift_m == frame_record().drift.tcp_shift_m and watch.sigma_m == pytest.approx(5e-5)
+    assert watch.protection_m == 0.00045
     watch.no_frame("unplugged", 9.0, 9)
-    assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
+    assert (watch.tcp_shift_m, watch.sigma_m, watch.protection_m) == (None, None, None)
     watch.frame(frame_record(drift=None, covariance=None, cam_T_grip=None, verdict=Verdict.SUSPECT), now_s=10.0)
     assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
 

@@ -76,26 +76,43 @@ def test_the_cells_say_what_the_monitor_said():
         standing(Severity.WARNING, "seen", since_ns=10, acknowledged=True),
     )
     row = fleet_table.row(
-        status("arm", state=State.DRIFTING, tcp_shift_m=(0.0, -0.003, 0.004), sigma_m=12e-6, open_alerts=alerts)
+        status(
+            "arm",
+            state=State.DRIFTING,
+            tcp_shift_m=(0.0, -0.003, 0.004),
+            sigma_m=12e-6,
+            protection_m=3.51e-4,
+            alert_limit_m=5e-4,
+            open_alerts=alerts,
+        )
     )
     assert dict(zip(fleet_table.COLUMNS, row.cells, strict=True)) == {
         "monitor": "arm/wrist", "state": "drifting", "verdict": "valid", "drift mm": "5.000", "sigma mm": "0.012",
+        "bound mm": "0.35/0.5",
         "fps": "30.0", "heard s": "0.5", "reference": "3 plate-2", "alerts": "!3 i1 moved 4.5 mm",
     }  # fmt: skip
     assert row.condition == "valid"
     listened = msgspec.structs.replace(status("arm"), transforms_per_s=24.96, transform_age_s=0.04)
-    assert fleet_table.row(listened).cells[5:7] == ("25.0", "0.0")
+    assert fleet_table.row(listened).cells[6:8] == ("25.0", "0.0")
+
+
+def test_a_bound_stands_there_as_far_as_it_is_known():
+    def bound(**changes: object) -> str:
+        return fleet_table.row(status("arm", **changes)).cells[5]
+
+    assert bound() == bound(alert_limit_m=5e-4) == "-"  # an older monitor; one that has no transform
+    assert bound(protection_m=8.3e-3) == "8.30" and bound(protection_m=8.3e-3, alert_limit_m=0.01) == "8.30/10"
 
 
 def test_a_monitor_that_is_gone_or_hangs_vouches_for_nothing():
     gone, stopped, hangs, *_ = map(fleet_table.row, THE_WORST_FIRST)
     for row in (gone, stopped, hangs):
-        assert row.cells[2] == "unknown" and row.cells[5] == "-"
+        assert row.cells[2] == "unknown" and row.cells[6] == "-"
     assert gone.cells[1].startswith("gone since 2023-11-1") and gone.cells[3] == "1.000"  # the last that was said
     assert stopped.cells[1].startswith("stopped since 2023-11-1") and stopped.cells[3] == "-"
     assert hangs.cells[1] == "silent, was tracking"
     assert fleet_table.row(status("new", state="none")).cells == (
-        "new/wrist", "starting", "unknown", "-", "-", "-", "0.5", "-", ""
+        "new/wrist", "starting", "unknown", "-", "-", "-", "-", "0.5", "-", ""
     )  # fmt: skip
 
 
@@ -104,7 +121,7 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
 
     console = Console(width=120, height=12, force_terminal=True, color_system=None, legacy_windows=False)
     with console.capture() as capture:
-        console.print(fleet_table.table(THE_WORST_FIRST, "no connection to tcp/x", 12))
+        console.print(fleet_table.table(THE_WORST_FIRST, "no connection to tcp/x", 12, 120))
     lines = capture.get().splitlines()
     assert len(lines) <= 12
     shown = [line.split("/")[0] for line in lines if "/wrist" in line]
@@ -115,6 +132,17 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
         in below
     )
     assert "8 more than fit here, none in more trouble" in below
+
+
+@pytest.mark.parametrize(("width", "has_sigma"), [(80, False), (120, True)])
+def test_a_narrow_terminal_keeps_the_bound_and_the_drift(width: int, has_sigma: bool):
+    from rich.console import Console
+
+    console = Console(width=width, height=12, force_terminal=True, color_system=None, legacy_windows=False)
+    told = status("arm", tcp_shift_m=(0.003, 0.0, 0.0), protection_m=3.51e-4, alert_limit_m=5e-4)
+    with console.capture() as capture:
+        console.print(fleet_table.table([told], "", 12, width))
+    assert "3.000" in capture.get() and "0.35/0.5" in capture.get() and ("sigma mm" in capture.get()) == has_sigma
 
 
 def test_a_log_gets_aligned_columns_or_one_line():
@@ -135,7 +163,7 @@ def test_no_name_or_text_from_the_network_reaches_the_terminal_as_a_command():
     nasty = status(f"a{evil}", reference_id=evil, message=evil, state=State(evil))
     console = Console(width=300, force_terminal=True, color_system=None)
     with console.capture() as capture:
-        console.print(fleet_table.table([nasty], evil, 20))
+        console.print(fleet_table.table([nasty], evil, 20, 120))
     for text in (capture.get(), fleet_table.plain([nasty], evil), fleet_table.line(nasty)):
         assert "\x1b]" not in text and "\x07" not in text and "\r" not in text
         assert "[red]x[/]" in text  # not taken for markup either

@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 import wire_page
 import zenoh
@@ -21,7 +22,7 @@ from loopback import (
 from published import Published
 from sample_messages import FOLDER, SAMPLES, kept, payload
 
-from gripmon.records import MESSAGES, from_json, schema_name
+from gripmon.records import MESSAGES, FrameRecord, from_json, schema_name
 from gripmon.wire import PublishSettings
 
 PAGE = wire_page.PAGE.read_text(encoding="utf-8")
@@ -39,6 +40,12 @@ def test_the_folder_holds_these_samples_and_nothing_else():
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_reads_them(name: str):
     assert from_json(kept(name), type(SAMPLES[name])) == SAMPLES[name]
+
+
+def test_a_transform_of_an_older_monitor_has_no_protection_level():
+    older = {field: value for field, value in json.loads(kept("transform")).items() if field != "protection"}
+    read = from_json(json.dumps(older).encode(), FrameRecord)
+    assert read.protection is None and read == msgspec.structs.replace(SAMPLES["transform"], protection=None)
 
 
 def test_there_is_a_sample_of_every_message():
@@ -61,10 +68,11 @@ def test_a_plain_reader_gets_what_was_meant():
     assert sigmas_m == pytest.approx([2e-5, 2e-5, 8e-5])
     assert transform["covariance"][6 * 1 + 3] == transform["covariance"][6 * 3 + 1] == 1e-9
     assert [corner["uv_px"] for corner in transform["corners"]] == [[401.25, 310.5], None]
+    assert transform["protection"]["position_m"] == 3.5e-4 and transform["protection"]["risk"] == 1e-5
     assert (read["transform_held"]["source"], read["transform_held"]["rms_px"]) == ("held", None)
     nothing = read["transform_null"]
     assert nothing["verdict"] == "unknown"
-    assert [nothing[field] for field in ("cam_T_grip", "covariance", "smoothed", "drift")] == [None] * 4
+    assert [nothing[field] for field in ("cam_T_grip", "covariance", "smoothed", "drift", "protection")] == [None] * 5
     assert read["reply_snapshot"]["snapshot"]["record"] == transform
     assert read["reply_state"]["monitor"]["references"][1] == read["reference"]
     assert {key: read["alert"][key] for key in transform["alerts"][0]} == transform["alerts"][0]

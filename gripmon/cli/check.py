@@ -7,7 +7,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, common, expected, margins, outside, second_check, second_run, sweep
+from gripmon.cli import check_laser, common, expected, margins, outside, promising, second_check, second_run, sweep
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -109,6 +109,7 @@ def expectation(config: Config) -> dict[str, Any]:
             {"id": name, "visible": bool(seen)} for name, seen in zip(gripper.edge_ids, view.edges_visible, strict=True)
         ],
         "accuracy": expected.accuracy(config),
+        **promising.values(config),
         "in_view": margins.in_view(config),
         **outside.values(config),
     }
@@ -200,6 +201,7 @@ def _as_text(report: dict[str, Any]) -> str:
         lines.insert(-1, " " * 11 + "the gripper file has no faces: what the finger itself hides isn't known")
     lines += [_corner_line(corner) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
+    lines.append(f"promise    {report['promise']}")
     lines += margins.in_view_lines(report["in_view"])
     lines += outside.lines(report)
     return "\n".join(lines)

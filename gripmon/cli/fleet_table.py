@@ -11,8 +11,10 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from gripmon.client import MonitorStatus
+    from gripmon.records import StateRecord
 
-COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "fps", "heard s", "reference", "alerts")
+COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
+_SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
 _FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
 _STYLES = {
     "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
@@ -29,7 +31,7 @@ class Row(NamedTuple):
 
 
 def row(status: MonitorStatus) -> Row:
-    """The cells in the order of :data:`COLUMNS`; drift and sigma of a monitor that is gone are what it said last."""
+    """The cells in the order of :data:`COLUMNS`; drift, sigma and bound are what a monitor that is gone said last."""
     state = status.state
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
@@ -39,6 +41,7 @@ def row(status: MonitorStatus) -> Row:
         state.verdict.value if state is not None and there else "unknown",
         _number(1e3, status.drift_m, ".3f"),
         _number(1e3, None if state is None else state.sigma_m, ".3f"),
+        _bound(state),
         _number(1.0, rate if there else None, ".1f"),
         f"{_age_s(status):.1f}",
         "-" if state is None else f"{state.revision} {printable(state.reference_id)}",
@@ -70,15 +73,16 @@ def line(status: MonitorStatus) -> str:
     return f"{cells[0]}: {cells[1]}, {cells[2]}, {named}, reference {cells[-2]}; {cells[-1] or 'no open alerts'}"
 
 
-def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> RenderableType:
-    """For a terminal of that height: the worst monitors, as many as fit."""
+def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int) -> RenderableType:
+    """For a terminal of that size: the worst monitors, as many as fit; a narrow one does without sigma."""
     from rich.table import Table
     from rich.text import Text
 
     shown = statuses[: max(1, height - _FRAME_LINES)]
     out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
-    for name in COLUMNS:
-        number = name in COLUMNS[3:7]
+    chosen = [name for name in COLUMNS if name != _SPARED or width >= _WIDE]
+    for name in chosen:
+        number = name in COLUMNS[3:8]
         out.add_column(
             name,
             justify="right" if number else "left",
@@ -89,7 +93,8 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int) -> Rendera
     for status in shown:
         condition, cells = row(status)
         # Text, not markup: what came from the network has no say in how it looks.
-        out.add_row(*(Text(cell) for cell in cells), style=_STYLES[condition])
+        named = zip(COLUMNS, cells, strict=True)
+        out.add_row(*(Text(cell) for name, cell in named if name in chosen), style=_STYLES[condition])
     rest = len(statuses) - len(shown)
     out.caption = Text(summary(statuses, fault) + (f"; {rest} more than fit here, none in more trouble" * (rest > 0)))
     out.caption_justify = "left"
@@ -151,6 +156,14 @@ def _alerts(status: MonitorStatus) -> str:
     marks = " ".join(f"{_MARKS[severity]}{count}" for severity, count in counts.items())
     worst = status.alerts[0]
     return f"{marks} {printable(worst.text)}{' (acknowledged)' * worst.acknowledged}"
+
+
+def _bound(state: StateRecord | None) -> str:
+    """The protection level over the alert limit, as far as they are known."""
+    if state is None or state.protection_m is None:
+        return "-"
+    limit = "" if state.alert_limit_m is None else f"/{1e3 * state.alert_limit_m:g}"
+    return f"{1e3 * state.protection_m:.2f}{limit}"
 
 
 def _number(scale: float, value: float | None, how: str) -> str:

@@ -68,7 +68,9 @@ def _jaw_values(config: Config, rig: Rig) -> dict[str, Any] | None:
     travel = over_jaw(rig, config.cam_T_grip)
     if travel is None:
         return None
-    openings_m, sigma_m = certainty(rig, config.cam_T_grip)
+    certain = certainty(rig, config.cam_T_grip)
+    policy = config.settings.monitor.policy
+    bounds = [None if each is None else each.protection for each in certain.promises]
     return {
         "share": travel.share,
         "gaps": [gap._asdict() for gap in travel.gaps],
@@ -77,9 +79,12 @@ def _jaw_values(config: Config, rig: Rig) -> dict[str, Any] | None:
         "from_m": config.gripper.jaw_min_m,
         "to_m": config.gripper.jaw_max_m,
         "certainty": {
-            "opening_m": openings_m.tolist(),
-            "worst_sigma_m": [None if math.isnan(v) else v for v in sigma_m.tolist()],
-            "suspect_from_m": config.settings.monitor.policy.suspect_sigma_m,
+            "opening_m": certain.openings_m.tolist(),
+            "worst_sigma_m": [None if math.isnan(v) else v for v in certain.sigma_m.tolist()],
+            "protection_m": [None if b is None else b.position_m for b in bounds],
+            "protection_rad": [None if b is None else b.rotation_rad for b in bounds],
+            "alert_limit_m": policy.alert_limit_m,
+            "alert_limit_rad": policy.alert_limit_rad,
         },
     }
 
@@ -151,13 +156,18 @@ def _certainty_lines(values: dict[str, Any]) -> list[str]:
     known = [(s, m) for m, s in zip(values["opening_m"], values["worst_sigma_m"], strict=True) if s is not None]
     if not known:
         return []
-    (least_m, at_m), limit_m = max(known), values["suspect_from_m"]
+    least_m, at_m = max(known)
     lines = [f"           the TCP is least certain at {1e3 * at_m:.1f} mm of opening: to {1e3 * least_m:.3f} mm"]
-    suspect = [m for s, m in known if s >= limit_m]
-    if suspect:
-        where = f"from {1e3 * min(suspect):.1f} to {1e3 * max(suspect):.1f} mm" if len(suspect) > 1 else "there"
-        what = f"transforms count as suspect {where}: {1e3 * limit_m:g} mm and more (monitor.policy.suspect_sigma_m)"
-        lines.append(f"           {what}")
+    columns = zip(values["opening_m"], values["protection_m"], values["protection_rad"], strict=True)
+    bounds = [(opening_m, bound_m, rad) for opening_m, bound_m, rad in columns if bound_m is not None]
+    limit_m, limit_rad = values["alert_limit_m"], values["alert_limit_rad"]
+    past = [opening_m for opening_m, bound_m, rad in bounds if bound_m > limit_m or rad > limit_rad]
+    if past:
+        where = f"from {1e3 * min(past):.1f} to {1e3 * max(past):.1f} mm" if len(past) > 1 else "there"
+        worst = f"{1e3 * max(m for _, m, _ in bounds):.2g} mm, {math.degrees(max(r for _, _, r in bounds)):.2g} degrees"
+        lines.append(
+            f"           no transform is valid {where}: bounds of up to {worst} (monitor.policy.alert_limit_m, _rad)"
+        )
     return lines
 
 

@@ -73,7 +73,7 @@ class RecordedRun:
                 f"{self.name}: holds no configuration; the one to replay with, by --config", common.EXIT_USAGE
             )
         self.config, self.past = self._begin(self.config)
-        self._frames = self._same = self._verdicts = self._states = 0
+        self._frames = self._same = self._verdicts = self._states = self._unbounded = 0
         self._say_what_is_missing()
 
     def compare(self, record: FrameRecord) -> None:
@@ -83,7 +83,10 @@ class RecordedRun:
         then = self.source.record
         assert then is not None, "every replayed frame has a record"
         self._frames += 1
-        self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == record
+        said_less = then.protection is None and record.protection is not None
+        self._unbounded += said_less
+        now = as_recorded_before_bounds(record) if said_less else record
+        self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == now
         self._verdicts += then.verdict is not record.verdict
         self._states += then.state is not record.state
 
@@ -92,6 +95,8 @@ class RecordedRun:
         lost, damaged = self.source.passed_over, self.source.images_damaged
         unread = f"; {lost} more could no longer be read" if lost else ""
         unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
+        if self._unbounded:
+            unread += f"; {self._unbounded} frames were recorded by a version without protection levels"
         if self._same == self._frames:
             return f"replay: all {self._frames} as they were recorded, every number the same{unread}"
         judged = f"{self._verdicts} another verdict, {self._states} another state"
@@ -185,6 +190,13 @@ class RecordedRun:
             )
 
 
+def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
+    """The record as a version wrote it that stated no bounds, and a reason only where nothing was measured."""
+    import msgspec
+
+    return msgspec.structs.replace(record, protection=None, reason=None if record.measured else record.reason)
+
+
 def _limits(config: Config | None) -> Limits | None:
     """Those that a configuration sets; what a monitor learns of a stream is not among them."""
     from gripmon.records import Limits
@@ -193,7 +205,8 @@ def _limits(config: Config | None) -> Limits | None:
         return None
     policy, nothing = config.settings.monitor.policy, (0.0,) * 6
     of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
-    return Limits(*of_policy, nothing, None, None, None, nothing, nothing)
+    alert_limits = policy.alert_limit_m, policy.alert_limit_rad
+    return Limits(*of_policy, nothing, None, None, None, nothing, nothing, *alert_limits)
 
 
 def _holds_recordings(path: Path) -> bool:

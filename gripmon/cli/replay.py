@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gripmon.cli import common, second_run
+from gripmon.cli import common, promising, second_run
 from gripmon.cli.one_recording import keep
 from gripmon.cli.recorded_run import RecordedRun, is_recording
 from gripmon.cli.replaying import NOTHING_BEFORE, replay
@@ -111,6 +111,8 @@ def run(arguments: argparse.Namespace) -> int:
         out = opened.enter_context(_output(arguments.out))
         overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
         recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
+        if (said := promising.warning(config)) is not None:
+            print(f"replay: {said}", file=sys.stderr)
         counts = _Counts()
         try:
             step = opened.enter_context(
@@ -186,7 +188,7 @@ class _Counts:
         self.frames = 0
         self.usable = 0
         self._verdicts: Counter[str] = Counter()
-        self._reasons: Counter[str] = Counter()  # by what comes before the colon: the rest may differ in every frame
+        self._reasons: Counter[str] = Counter()  # why nothing was measured, by what comes before the colon
         self._first_failure = ""
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
@@ -196,7 +198,7 @@ class _Counts:
         self.frames += 1
         self.usable += record.source is not Origin.HELD
         self._verdicts[record.verdict] += 1
-        if record.reason:
+        if record.reason and not record.measured:
             kind = record.reason.partition(":")[0]
             self._reasons[kind] += 1
             if kind == "internal error":

@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, second_run, viewing
+from gripmon.cli import common, promising, second_run, viewing
 
 if TYPE_CHECKING:
     from gripmon.config import Config
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from gripmon.sources import Source
     from gripmon.statefile import StateFile
     from gripmon.wire import Link
+
+_log = logging.getLogger(__name__)
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -91,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         out=out,
         duration_s=arguments.duration,
         verbose=arguments.verbose,
+        warns=True,
         keep_state=True,
         fresh_state=arguments.fresh_state,
         view=arguments.view,
@@ -106,6 +110,7 @@ def run_daemon(
     recording_name: str | None = None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
     on_network: Callable[[], None] = lambda: None,
+    warns: bool = False,
     keep_state: bool = False,
     fresh_state: bool = False,
     view: str | None = None,
@@ -114,8 +119,9 @@ def run_daemon(
 
     ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
     goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
-    ``keep_state``: what survives a restart is read from the configuration's state file, unless ``fresh_state``, and
-    kept there.  ``view`` is one of :data:`gripmon.cli.viewing.KINDS`.
+    ``warns``: it is logged when the view can't keep the alert limits.  ``keep_state``: what survives a restart is read
+    from the configuration's state file, unless ``fresh_state``, and kept there.  ``view`` is one of
+    :data:`gripmon.cli.viewing.KINDS`.
     """
     import cv2
 
@@ -129,6 +135,8 @@ def run_daemon(
         common.check_file(estimates)
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
+    if warns and (said := promising.warning(config)) is not None:
+        _log.warning("%s", said)
     live = None if view is None else viewing.LiveView(settings.view, view, str(config.path))
     with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None
@@ -162,7 +170,9 @@ def run_daemon(
             jaw=network.jaw,
             keeper=daemon.StateKeeper(kept),
             commands=network.commands,
-            reports=with_source(network.reports, source),
+            reports=dataclasses.replace(
+                with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m
+            ),
             notices=_notices(kept),
             duration_s=duration_s,
         )

@@ -23,6 +23,8 @@ def as_json(
         "jaw_opening_m": config.jaw_opening_m,
         "warn_m": config.settings.monitor.policy.warn_m,
         "limit_m": config.settings.monitor.policy.limit_m,
+        "alert_limit_m": config.settings.monitor.policy.alert_limit_m,
+        "alert_limit_rad": config.settings.monitor.policy.alert_limit_rad,
         "present": _trial_values(config.camera, present),
         "mounts": [_trial_values(grid.rigs[trial.lens].camera, trial) for trial in ranked],
     }
@@ -62,6 +64,13 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
         "weakest": None if weakest is None else {"tcp_m": weakest[:3], "rotation_rad": weakest[3:]},
         "worst_sigma_m": trial.worst_sigma_m,
         "worst_at_m": trial.worst_at_m,
+        "protection": None
+        if trial.promise is None
+        else {
+            "position_m": trial.promise.protection.position_m,
+            "rotation_rad": trial.promise.protection.rotation_rad,
+            "risk": trial.promise.protection.risk,
+        },
         "smallest": None if smallest is None else {"tcp_m": smallest[:3], "rotation_rad": smallest[3:]},
         "delay_frames": trial.delay_frames,
         "margin_px": trial.margin_px,
@@ -73,7 +82,7 @@ def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
 _COLUMNS = (
     ("distance", "mm", 9), ("tilt", "°", 7), ("side", "°", 7), ("roll", "°", 7), ("focal", "px", 7), ("corners", "", 9),
     ("edges", "", 7), ("travel", "%", 8), ("sigma x", "mm", 9), ("y", "mm", 7), ("z", "mm", 7), ("worst", "mm", 8),
-    ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
+    ("bound", "mm", 8), ("notices", "mm", 9), ("in", "frames", 8), ("margin", "px", 8), ("shift", "mm", 7),
 )  # fmt: skip
 
 
@@ -100,7 +109,8 @@ def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Tri
     lines += [
         "columns    corners, edges: the fewest over the jaw's travel; travel: part of it in which enough is visible;",
         "           sigma: one frame's TCP at the usual opening; worst: along its least certain direction, at the",
-        "           worst opening; notices: the smallest step that is noticed along every axis; in: frames until",
+        "           worst opening; bound: on its error at the worst opening, which alert_limit_m is held against;",
+        "           notices: the smallest step that is noticed along every axis; in: frames until",
         f"           one of {warn_mm:g} mm is; margin: corners to the image's border; shift: of the camera sideways",
         "           until too little is in view.  Not known here: focus, light, what is in the camera's way, and what",
         "           hides the fingers without being in the gripper file.",
@@ -134,7 +144,8 @@ def _row(camera: Camera, trial: Trial) -> str:
     cells += [str(trial.corners.min()), str(trial.edges.min()), f"{100.0 * trial.share:.0f}"]
     if covariance is not None:
         cells += [_number(math.sqrt(v), 1e3, 3) for v in covariance.diagonal()[:3].tolist()]
-        cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
+        bound_m = None if trial.promise is None else trial.promise.protection.position_m
+        cells += [_number(trial.worst_sigma_m, 1e3, 3), _number(bound_m, 1e3, 3), _number(trial.noticed_m, 1e3, 3)]
         cells += ["never" if trial.delay_frames is None else str(trial.delay_frames)]
         cells += [_number(trial.margin_px, 1.0, 0), _number(trial.shift_m, 1e3, 1)]
     row = "".join(cell.rjust(width) for cell, (_, _, width) in zip(cells, _COLUMNS, strict=False))

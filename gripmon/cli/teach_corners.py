@@ -191,6 +191,7 @@ def _table(found: Found) -> list[str]:
     if expected is not None:
         lines.append(f"expected of a frame   {_axes(expected.sigma)}")
         lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
+        lines.append(f"promise               {expected.promise.text()}")
     return lines
 
 

@@ -176,7 +176,9 @@ def _live(fleet: Fleet, period_s: float, end_s: float | None) -> None:
     console = Console()
     with Live(console=console, auto_refresh=False, screen=True) as live:
         _repeat(
-            lambda: live.update(fleet_table.table(_sorted(fleet), _fault(fleet), console.size.height), refresh=True),
+            lambda: live.update(
+                fleet_table.table(_sorted(fleet), _fault(fleet), console.size.height, console.size.width), refresh=True
+            ),
             period_s,
             end_s,
         )

@@ -36,6 +36,7 @@ def judge(
         transform=None if lost else record.cam_T_grip,
         covariance=None if lost else record.covariance,
         smoothed=None if lost else record.smoothed,
+        protection=None if lost else record.protection,
         state=record.state,
         source=record.source,
         stamp_ns=record.stamp_ns,
@@ -92,4 +93,16 @@ def _against_policy(record: FrameRecord, policy: Policy) -> _Refusal | None:
             Unusable.UNCERTAIN,
             f"the transform is certain to {1e3 * sigma_m:.3g} mm, allowed are {1e3 * policy.max_sigma_m:g} mm",
         )
-    return None
+    return _unprotected(record, policy.max_protection_m)
+
+
+def _unprotected(record: FrameRecord, allowed_m: float | None) -> _Refusal | None:
+    """The bound on the error, and not the covariance: what the monitor doesn't promise is not to be relied on."""
+    if allowed_m is None:
+        return None
+    if record.protection is None:
+        return Unusable.UNPROTECTED, "the monitor states no protection level; a newer version of it does"
+    bound_m = record.protection.position_m
+    if bound_m <= allowed_m:
+        return None
+    return Unusable.UNPROTECTED, f"the TCP may be {1e3 * bound_m:.3g} mm off, allowed are {1e3 * allowed_m:g} mm"

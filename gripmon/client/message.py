@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gripmon.records import FrameRecord, MessageRefused, Smoothed, Transform, Verdict, from_json
+from gripmon.records import FrameRecord, MessageRefused, Protection, Smoothed, Transform, Verdict, from_json
 
 _UNIT_TOLERANCE = 1e-3
 _LARGEST_NUMBER = 2**63 - 1
@@ -19,6 +19,8 @@ def transform_message(payload: bytes) -> FrameRecord:
     for covariance in (record.covariance, record.smoothed.covariance if record.smoothed else None):
         if covariance is not None and not _is_covariance(covariance):
             raise MessageRefused("a covariance with numbers that are not finite, or a variance below 0")
+    if record.protection is not None and not _is_protection(record.protection):
+        raise MessageRefused("a protection level that is not finite or below 0, or a risk that is not within 0 and 1")
     if record.verdict is not Verdict.UNKNOWN and (record.cam_T_grip is None or record.covariance is None):
         raise MessageRefused(f"verdict {record.verdict} without a transform and its covariance")
     for name in ("seq", "stamp_ns", "revision", "latency_ns"):
@@ -35,3 +37,8 @@ def _is_pose(pose: Transform | Smoothed) -> bool:
 
 def _is_covariance(covariance: tuple[float, ...]) -> bool:
     return all(map(math.isfinite, covariance)) and min(covariance[::7]) >= 0.0
+
+
+def _is_protection(protection: Protection) -> bool:
+    bounds = (protection.position_m, protection.rotation_rad)
+    return all(math.isfinite(bound) and bound >= 0.0 for bound in bounds) and 0.0 < protection.risk <= 1.0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from gripmon.client.names import MonitorName
-from gripmon.records import Origin, Smoothed, State, Transform, Verdict
+from gripmon.records import Origin, Protection, Smoothed, State, Transform, Verdict
 
 if TYPE_CHECKING:
     from gripmon.records import Array
@@ -29,6 +29,7 @@ class Unusable(enum.StrEnum):
     STALE = "stale"
     SUSPECT = "suspect"
     UNCERTAIN = "uncertain"
+    UNPROTECTED = "unprotected"
 
 
 class NotUsable(Exception):
@@ -45,7 +46,9 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
     ``max_age_s``: an older transform is refused.  The camera may have been knocked since, so give it the time that the
     controller may move on without knowing; it must span a few frames of the camera, or every late frame is a stop.
     ``accept_suspect``: allow what is held, uncertain or not confirmed, too; ``max_sigma_m``: allow a transform only
-    while the standard deviation of the TCP along each camera axis is at most that.  ``clocks_agree``: the clocks of
+    while the standard deviation of the TCP along each camera axis is at most that; ``max_protection_m``: only while its
+    protection level, the bound on the TCP's position error, is known and at most that (None: the verdict decides by the
+    monitor's own alert limit).  ``clocks_agree``: the clocks of
     monitor and controller show the same time (the same machine, PTP): the age then counts from the capture by their
     stamps, so that what was held up on the way is known to be old.
     """
@@ -53,10 +56,11 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
     max_age_s: float = 0.2
     accept_suspect: bool = False
     max_sigma_m: float | None = None
+    max_protection_m: float | None = None
     clocks_agree: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("max_age_s", "max_sigma_m"):
+        for name in ("max_age_s", "max_sigma_m", "max_protection_m"):
             value = getattr(self, name)
             if value is not None and not value > 0.0:
                 raise ValueError(f"{name} is {value!r}; give a number above 0")
@@ -65,8 +69,9 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
 class Reading(msgspec.Struct, frozen=True, kw_only=True):
     """The newest transform as it stood when it was asked for; frozen, may be passed on and kept.
 
-    ``transform`` (``cam_T_grip``), ``covariance`` (36 numbers, 6 x 6 row by row: m, rad, camera axes) and ``smoothed``
-    are None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` where the monitor can't
+    ``transform`` (``cam_T_grip``), ``covariance`` (36 numbers, 6 x 6 row by row: m, rad, camera axes), ``protection``
+    (bounds on the error of ``transform`` at a stated risk; None from an older monitor, too) and ``smoothed`` are
+    None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` where the monitor can't
     be asked any more: it is gone, its last transform too old, or there is none.
 
     ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` is the
@@ -85,6 +90,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     transform: Transform | None = None
     covariance: tuple[float, ...] | None = None
     smoothed: Smoothed | None = None
+    protection: Protection | None = None
     state: State | None = None
     source: Origin | None = None
     stamp_ns: int = 0

@@ -15,6 +15,7 @@ from gripmon.camera import Camera, make_camera
 from gripmon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
+from gripmon.config.deprecated import with_alert_limit
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import jaw_fault, network_fault, source_fault
 from gripmon.config.order import order_fault
@@ -120,11 +121,14 @@ class Config:
         return predict_view(self.camera, self.gripper, self.cam_T_grip, self.jaw_opening_m)
 
 
-def load_config(path: Path, *, check_source: bool = True, with_taught: bool = True) -> Config:
+def load_config(
+    path: Path, *, check_source: bool = True, with_taught: bool = True, say_deprecated: bool = True
+) -> Config:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
     ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
-    ``with_taught=False`` leaves out the taught model, for those who teach anew.
+    ``with_taught=False`` leaves out the taught model, for those who teach anew; ``say_deprecated=False`` logs no
+    warning of settings that have been replaced, for files that nobody can edit.
     """
     values = read_yaml(path)
     if SECTION in values:
@@ -135,6 +139,10 @@ def load_config(path: Path, *, check_source: bool = True, with_taught: bool = Tr
         settings = to_settings(values, Settings)
     except SettingsError as error:
         raise _error(path, error.fault) from None
+    converted = with_alert_limit(path, values, settings, say=say_deprecated)
+    if isinstance(converted, Fault):
+        raise _error(path, converted)
+    settings = converted
     camera = _camera(path, settings, calibrated)
     gripper_path = path.parent / settings.gripper
     gripper = _gripper(path, gripper_path)

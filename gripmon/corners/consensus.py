@@ -73,11 +73,13 @@ FARTHEST_PX = 1.0
 FEWEST_EDGES = 3
 """Edges that must be seen for a fit to be believed at all."""
 
+AGAIN_PX = 0.4
+"""Width of the robust weight at a start that is nearly right, px."""
+
 _TUKEY = 4.685
 _LARGEST_SPREAD = 3.0
 _SMALLEST_SPREAD_PX = 0.05
 _SMALLEST_STIFFNESS = 0.2
-_AGAIN_PX = 0.4  # width at a start that is nearly right
 _NARROWING = 0.4  # of the width that covers the start's error, from round to round
 _ROUNDS = 6
 _ROUNDS_AGAIN = 3
@@ -208,7 +210,7 @@ def agree_on_seen(
         return votes, consensus
     edge = votes.prediction.layout.edge[votes.candidates.sample]
     rest = replace(votes, weight=np.where(seen[edge], votes.weight, 0.0))
-    return rest, agree(rest, prior, consensus.xi, settings, _AGAIN_PX)
+    return rest, agree(rest, prior, consensus.xi, settings, AGAIN_PX)
 
 
 def agree_from_grid(

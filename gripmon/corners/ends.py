@@ -24,13 +24,19 @@ ALONG_COSINE = 0.87
 MAJORITY = 0.5
 """Part of the edges' length that has to run one way for the fingers to have a direction at all."""
 
-BEYOND_PX = (5.0, 17.0)
-"""Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and about as long as the stretch of an
-edge that makes a corner seen (``corners.neighbourhood_px``).
+BEYOND_PX = (3.0, 16.5)
+"""Stretch beyond a corner that is looked at, px: clear of the corner's own blur, and as long as the stretch of an edge
+that makes a corner seen (``corners.neighbourhood_px``).
 """
 
-PROBES = 7
-"""Profiles on it."""
+PROBES = 10
+"""Profiles on it: one each 1.5 px, since neighbours see the same pixels."""
+
+CLEAR = 2
+"""Probes next to a corner that another edge of the finger may run through."""
+
+FROM_THE_CORNER = 3
+"""Probes next to a corner that all show an edge where it doesn't end there but goes on a little: a step on the finger."""
 
 REACH_PX = 4.0
 """How far they reach to both sides, px: the shortest that the edge filter takes and that shows the response's decline."""
@@ -74,19 +80,14 @@ class FingerEndsSeen:
     might: NDArray[np.intp]
 
     @property
-    def proven(self) -> int:
-        """How many fingers show their end."""
-        return int(np.count_nonzero(self.seen >= END_CORNERS))
-
-    @property
-    def provable(self) -> int:
-        """How many have to, so that the ends are sure: two that might, one where the view has no more."""
-        return min(int(np.count_nonzero(self.might >= END_CORNERS)), 2)
-
-    @property
     def sure(self) -> bool:
-        """Whether as many show it as have to."""
-        return 0 < self.provable <= self.proven
+        """Whether enough of them are seen, wherever the gripper was expected: two of each of two fingers or as many in
+        all; two of the only one whose end the view has.
+        """
+        fingers = int(np.count_nonzero(self.might >= END_CORNERS))
+        if fingers < 2:
+            return fingers == 1 and int(self.seen.max()) >= END_CORNERS
+        return int(np.count_nonzero(self.seen)) >= 2 and int(self.seen.sum()) >= 2 * END_CORNERS
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,8 +115,11 @@ class FingerEnds:
         self._at_end = np.array([self.along.all() or (a.any() and not a.all()) for a in at_corner], dtype=bool)
         self._kept: tuple[Prediction, _Probes] | None = None
 
-    def seen(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
-        """Look beyond the measured corners; takes as long as a fourth of a measurement."""
+    def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+        """Look beyond the measured corners; takes as long as a fourth of a measurement.
+
+        ``strict``: an edge must not go on by a few pixels either, as beside a step on the finger; clutter looks so, too.
+        """
         gripper, prediction, corners = self._gripper, measurement.prediction, measurement.corners
         if self._kept is None or self._kept[0] is not prediction:
             self._kept = prediction, self._lay_out(prediction)
@@ -123,7 +127,7 @@ class FingerEnds:
         measured = self._at_end & corners.usable
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.corner) and measured.any():
-            goes_on[probes.corner[self._going_on(image, measurement, probes)]] = True
+            goes_on[probes.corner[self._going_on(image, measurement, probes, strict)]] = True
         finger = gripper.point_finger[gripper.corner_points]
         fingers = len(gripper.finger_ids)
         return FingerEndsSeen(
@@ -131,7 +135,7 @@ class FingerEnds:
             np.bincount(finger[self._at_end & prediction.corners.visible], minlength=fingers),
         )
 
-    def _going_on(self, image: Image, measurement: Measurement, probes: _Probes) -> NDArray[np.bool_]:
+    def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""
         prediction, candidates = measurement.prediction, measurement.candidates
         profiles = read_profiles(image, probes.map_x, probes.map_y)
@@ -140,10 +144,13 @@ class FingerEnds:
         offset_px = prediction.jacobian[probes.sample] @ measurement.consensus.xi
         of = found.sample // PROBES
         near = np.abs(found.offset_px - offset_px[of]) < NEAR_PX
-        near &= found.step * np.sign(step[of]) > AS_STRONG * np.abs(step[of])
-        shown = np.zeros(len(probes.ok), dtype=bool)
-        shown[found.sample[near]] = True
-        return np.asarray(shown.reshape(-1, PROBES).mean(axis=1) > GOES_ON)
+        # Of either sign, and beside the corner of any height: a finger's tip may be of another shade than the rest.
+        strong = near & (np.abs(found.step) > AS_STRONG * np.abs(step[of]))
+        shown, well_shown = np.zeros((2, len(probes.corner), PROBES), dtype=bool)
+        shown.ravel()[found.sample[near]] = True
+        well_shown.ravel()[found.sample[strong]] = True
+        goes_on = well_shown[:, CLEAR:].mean(axis=1) > GOES_ON
+        return np.asarray(goes_on | shown[:, :FROM_THE_CORNER].all(axis=1) if strict else goes_on)
 
     def _lay_out(self, prediction: Prediction) -> _Probes:
         gripper, layout, uv_px = self._gripper, prediction.layout, prediction.corners.uv_px

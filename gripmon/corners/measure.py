@@ -152,7 +152,7 @@ class FingertipMeter(FingerMeter):
             for place in _promising(again, PROMISING * max(beat, least)):
                 other = replace(self._settle(image, place.expected), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
-                if best.trusted and not self.ends(image, other).sure:
+                if best.trusted and not self.ends(image, other, strict=True).sure:
                     continue
                 if other.consensus.share > beat and other.trusted >= best.trusted:
                     best, beat = other, other.consensus.share
@@ -160,9 +160,18 @@ class FingertipMeter(FingerMeter):
                 break
         return best
 
-    def ends(self, image: Image, measurement: Measurement) -> FingerEndsSeen:
+    def measure_held(
+        self, image: Image, cam_T_grip: Array, sigma: Array, jaw_opening_m: float, usual_share: float
+    ) -> Measurement:
+        """Measure at a pose (4, 4), with what lies within the standard deviations (6,) of it, m and rad; nowhere else."""
+        held = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m, cam_T_grip, sigma)
+        measurement = self._settle(image, held)
+        measurement.trusted = self._trusted(image, measurement, usual_share)
+        return measurement
+
+    def ends(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as such where they were measured."""
-        return self._ends.seen(image, measurement)
+        return self._ends.seen(image, measurement, strict)
 
     def _at_other_zooms(self, image: Image, expected: Expected, best: Measurement) -> Measurement:
         """The best of the zooms: the image may have lost, or found, its focus."""

@@ -13,6 +13,7 @@ from msgspec import Meta
 
 from gripmon.camera import Camera
 from gripmon.corners.consensus import (
+    AGAIN_PX,
     Consensus,
     ConsensusSettings,
     Prior,
@@ -133,11 +134,17 @@ class Measurement:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """A pose and the two openings that go with it: the one to start from and the one that the robot reports."""
+    """A pose and the two openings that go with it: the one to start from and the one that the robot reports.
+
+    ``held_sigma`` (6,): edges are chosen as if the gripper were at ``held_T`` (4, 4) but for that, m and rad; what is
+    chosen is then measured freely.
+    """
 
     cam_T_grip: Array
     jaw_opening_m: float
     jaw_reported_m: float
+    held_T: Array | None = None
+    held_sigma: Array | None = None
 
 
 class Settler:
@@ -175,6 +182,9 @@ class Settler:
             votes = self._look(image, prediction)
             prior = self._prior_about(prediction, expected)
             consensus = agree(votes, prior, start, settings.consensus)
+            if expected.held_T is not None:
+                free = self._prior_about(prediction, replace(expected, held_T=None))
+                consensus = agree(votes, free, consensus.xi, settings.consensus, AGAIN_PX)
             moved_px = prediction.moved_px(consensus.xi)
             if moved_px > 2.0 * self._reach_px:
                 # Nothing was seen out there: the few points that agree don't determine the motion.
@@ -183,6 +193,7 @@ class Settler:
             expected = self._moved(prediction, consensus.xi, expected)
             if moved_px <= settings.relinearise_px:
                 break
+        prior = self._prior_about(prediction, replace(expected, held_T=None))
         votes, consensus = agree_on_seen(votes, prior, consensus, settings.consensus)
         uncertainty = self._assess(votes, consensus)
         if uncertainty.contradiction > CONTRADICTION:
@@ -306,16 +317,19 @@ class Settler:
         return measurement.prediction.moved_px(perturbation_between(cam_T_grip, measurement.cam_T_grip))
 
     def _prior_about(self, prediction: Prediction, expected: Expected) -> Prior:
-        mean = np.zeros(len(self._prior))
+        mean, information = np.zeros(len(self._prior)), self._prior
         mean[6:] = expected.jaw_reported_m - prediction.jaw_opening_m
-        return Prior(mean, self._prior)
+        if expected.held_T is not None and expected.held_sigma is not None:
+            mean[:6] = perturbation_between(prediction.cam_T_grip, expected.held_T)
+            information = information + np.append(expected.held_sigma**-2.0, np.zeros(len(mean) - 6))
+        return Prior(mean, information)
 
     def _moved(self, prediction: Prediction, xi: Array, expected: Expected) -> Expected:
         """The expectation after a fit; an opening beyond the jaw's range stays at its end (the fit sees the misfit)."""
         gripper = self._gripper
         jaw_opening_m = prediction.jaw_opening_m + (float(xi[6]) if len(xi) == 7 else 0.0)
         jaw_opening_m = min(max(jaw_opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
-        return Expected(perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m, expected.jaw_reported_m)
+        return replace(expected, cam_T_grip=perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m=jaw_opening_m)
 
 
 def median(values: Array) -> float:

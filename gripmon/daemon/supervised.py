@@ -276,6 +276,8 @@ class Loop(ABC):
             version=__version__,
             tcp_shift_m=watch.tcp_shift_m,
             sigma_m=watch.sigma_m,
+            protection_m=watch.protection_m,
+            alert_limit_m=reports.alert_limit_m,
             open_alerts=watch.standing(self._open_alerts),
             transforms_unsent=self._ask(reports.unsent, 0),
             malformed=self._ask(reports.malformed, 0),

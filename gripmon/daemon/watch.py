@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import deque
 from typing import NamedTuple
 
@@ -23,12 +24,13 @@ from gripmon.records import (
 )
 
 _RATE_OVER_FRAMES = 64
+_FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
 
 
 class Judged(NamedTuple):
     """What is kept of a frame.  ``usable``: it told something; ``refused``: it could not be looked at; ``reason``: what
-    is wrong, if anything.  ``tcp_shift_m`` and ``sigma_m`` as in the state message.
+    is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
 
     state: State
@@ -38,6 +40,7 @@ class Judged(NamedTuple):
     reason: str = ""
     tcp_shift_m: tuple[float, float, float] | None = None
     sigma_m: float | None = None
+    protection_m: float | None = None
 
 
 class Watch:
@@ -128,6 +131,11 @@ class Watch:
         return self._judged.sigma_m if self._judged is not None and self._holds else None
 
     @property
+    def protection_m(self) -> float | None:
+        """Of the last transform, if it still counts: the bound on the TCP's position error, m."""
+        return self._judged.protection_m if self._judged is not None and self._holds else None
+
+    @property
     def _holds(self) -> bool:
         """Is what was said of the last frame still said?"""
         return self._judged is not None and (self.state, self.verdict) == (self._judged.state, self._judged.verdict)
@@ -165,7 +173,8 @@ class Watch:
 
 
 def _kind(message: str) -> str:
-    return ":".join(message.split(":")[:2])
+    """Without figures, which differ in every frame, and what comes behind a second colon."""
+    return _FIGURES.sub("", ":".join(message.split(":")[:2]))
 
 
 def _of_record(record: FrameRecord) -> Judged:
@@ -178,6 +187,7 @@ def _of_record(record: FrameRecord) -> Judged:
         reason=record.reason or "",
         tcp_shift_m=record.drift.tcp_shift_m if counts and record.drift is not None else None,
         sigma_m=None if not counts or record.covariance is None else math.sqrt(max(record.covariance[:15:7])),
+        protection_m=None if not counts or record.protection is None else record.protection.position_m,
     )
 
 

@@ -54,6 +54,8 @@ class Families(Collector):
             ("gripmon_reference_revision", "Of the reference in force", state.revision),
             ("gripmon_state_timestamp_seconds", "When the state was said, Unix time", 1e-9 * state.stamp_ns),
             ("gripmon_sigma_meters", "Largest standard deviation of the TCP along a camera axis", state.sigma_m),
+            ("gripmon_protection_meters", "Bound on the TCP's position error", state.protection_m),
+            ("gripmon_alert_limit_meters", "Error of the TCP's position that the task bears", state.alert_limit_m),
         ):
             yield self._family(GaugeMetricFamily(name, text, labels=_WHO), value)
         text = "Displacement of the TCP along the camera's axes against the reference"

@@ -172,17 +172,15 @@ class Monitor:
                 explanation=of_stream(faults),
             )
         measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip, self._rivals())
-        if not measurement.trusted:
+        before_T = self._cam_T_grip
+        standing = self._stand(frame, measurement)
+        if standing is None:
             explanation = self._explain(frame, measurement, wrong=True)
             return self._unmeasured(
                 frame, "too few edges of the gripper agree", CornerFault.NO_FIT, explanation=explanation
             )
-        before_T = self._cam_T_grip
-        measurement = self._newest = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
-        self._cam_T_grip, self._covariance = self._tracker.update(measurement)
-        standing = self._standing = self._trust.judge(
-            frame, measurement, self._cam_T_grip, self._covariance, self._now_s
-        )
+        self._standing = standing
+        measurement = self._newest = standing.measurement
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
@@ -207,6 +205,13 @@ class Monitor:
         alerts += self._renew(frame, measurement, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
         return self._record(frame, judgement, origin, alerts, measurement)
+
+    def _stand(self, frame: Frame, measurement: Measurement) -> Standing | None:
+        """Where the gripper is by a measurement, and what may rest on it; None where it isn't seen."""
+        if not measurement.trusted:
+            return self._trust.held(frame, self._now_s)
+        measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
+        return self._trust.judge(frame, measurement, *self._tracker.update(measurement), self._now_s)
 
     def _rivals(self) -> tuple[Array, ...]:
         """Where else the gripper may be: where it proved to be last, and where the reference has it."""

@@ -41,6 +41,8 @@ class NoteTaker:
             _six(np.sqrt(watch.test.scatter.of_single_frames()[0].diagonal())) if known else None,
             _six(average.learnt.scatter),
             _six(np.sqrt(average.learnt.walk)),
+            policy.alert_limit_m,
+            policy.alert_limit_rad,
         )
 
 

@@ -72,16 +72,24 @@ class Tracker:
         self._untrusted = 0 if measurement.trusted else self._untrusted + 1
         return measurement
 
+    def measure_held(self, frame: Frame, cam_T_grip: Array, sigma: Array) -> Measurement:
+        """Measure at ``cam_T_grip`` (4, 4), with what lies within the standard deviations (6,) of it; nowhere else."""
+        assert frame.image is not None
+        reported_m = frame.jaw_opening_m
+        opening_m = self.jaw_opening_m if reported_m is None else reported_m
+        measurement = self._meter.measure_held(frame.image, cam_T_grip, sigma, opening_m, self._usual_share)
+        return self.with_known_jaw(measurement, reported_m)
+
     def learn(self, measurement: Measurement) -> None:
         """The gripper was where it was measured: that is what it usually shows, and the report's error."""
         share = measurement.consensus.share
         self._usual_share += USUAL_RATES[int(share > self._usual_share)] * (share - self._usual_share)
         self._jaw.learn()
 
-    def ends(self, frame: Frame, measurement: Measurement) -> FingerEndsSeen:
+    def ends(self, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""
         assert frame.image is not None
-        return self._meter.ends(frame.image, measurement)
+        return self._meter.ends(frame.image, measurement, strict)
 
     @property
     def along(self) -> NDArray[np.bool_]:

@@ -33,8 +33,15 @@ SWINGS = 20.0
 DISPLACED = 33.1
 """Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
 
-MISREAD_CORNER = 0.1
-"""Probability that a corner at a finger's end that is seen as such belongs to something else, a border that crosses it."""
+MISREAD_END = 0.1
+"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
+border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
+"""
+
+KNOCKED_UNSEEN = 5e-4
+"""Probability that the mount is knocked while something hides the fingers' ends: that is when the gripper touches things,
+so that the rate of knocks over all the time says too little.
+"""
 
 CORNERS_WHERE_EXPECTED = 3
 """Such corners that prove a pose where the gripper is expected: two fingers' four do anywhere."""
@@ -68,14 +75,16 @@ class Trust:
     displaced: bool = False
     ambiguous: bool = False
     instead: tuple[Array, Array] | None = None
+    ends: FingerEndsSeen | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What is published: pose (4, 4), covariance (6, 6) and ``protection``; ``believed``: the gripper may be taken to be
+    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``; ``believed``: the gripper may be taken to be
     there, so that averages, the drift test and what is learnt may rest on it.
     """
 
+    measurement: Measurement
     cam_T_grip: Array
     covariance: Array
     protection: Protection
@@ -110,20 +119,75 @@ class Integrity:
         trust = self.weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY == 0
         self._frames += 1
-        short = past_alert_limit(trust.protection, self._policy) is not None
-        if due or short or trust.displaced or self.anchor is None:
+        if due or self._short(trust) or trust.displaced or self.anchor is None:
             trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        if trust.displaced and trust.instead is not None and not trust.proven:
+        if trust.displaced:
+            if trust.proven:
+                ends = self._tracker.ends(frame, measurement, strict=True)
+                trust = self.weigh(measurement, cam_T_grip, ends, now_s)
+            rival = self._at_its_place(frame, now_s)
+            if rival is not None and (rival[3].proven or not trust.proven):
+                measurement, cam_T_grip, covariance, trust = rival
+        return self._conclude(measurement, cam_T_grip, covariance, trust, now_s)
+
+    def held(self, frame: Frame, now_s: float) -> Standing | None:
+        """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
+        that place, or nothing of the fingers' ends is seen there.
+        """
+        rival = None if self.anchor is None else self._at_its_place(frame, now_s)
+        if rival is None or self._short(rival[3]) and rival[3].instead is None:
+            return None
+        standing = self._conclude(*rival, now_s)
+        return None if past_alert_limit(standing.protection, self._policy) else standing
+
+    def _conclude(
+        self, measurement: Measurement, cam_T_grip: Array, covariance: Array, trust: Trust, now_s: float
+    ) -> Standing:
+        """What to publish of a weighed pose, and whether it becomes the anchor."""
+        rests_on_anchor = False
+        if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
+            # What the frame leaves open the anchor tells.
+            displaced, looked_at = trust.displaced, trust.ends
             cam_T_grip, covariance = trust.instead
-            trust = replace(self.weigh(measurement, cam_T_grip, None, now_s), displaced=True)
+            trust = replace(self.weigh(measurement, cam_T_grip, looked_at, now_s), displaced=displaced)
+            rests_on_anchor = True
         # A knock is rare: it must be seen, twice where the gripper had to be looked for.
         self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
         near = measurement.effort is Effort.NARROW
         moved = self._moved >= (1 if near else self._policy.confirm_frames)
         if trust.proven and (moved or not trust.displaced):
             self._settle(trust, cam_T_grip, covariance, now_s)
-        believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
-        return Standing(cam_T_grip, covariance, trust.protection, believed)
+        believed = moved or not (trust.displaced or rests_on_anchor) or (trust.proven and trust.ambiguous)
+        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed)
+
+    def _at_its_place(self, frame: Frame, now_s: float) -> tuple[Measurement, Array, Array, Trust] | None:
+        """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
+        look like their ends elsewhere.
+        """
+        anchor = self.anchor
+        expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
+        sigma = np.sqrt(covariance.diagonal() + self._wander(now_s) + self._floor)
+        measurement = self._tracker.measure_held(frame, expected_T, sigma)
+        if measurement.consensus.share == 0.0:
+            return None
+        measurement.trusted = True
+        cam_T_grip, covariance = self._tracker.update(measurement)
+        trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+        return None if trust.displaced else (measurement, cam_T_grip, covariance, trust)
+
+    def _confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
+        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
+        further corner.
+        """
+        fingers = len(self._gripper.finger_ids)
+        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
+        seen = measurement.consensus.edge_seen & ~self._tracker.along
+        by_edge = np.bincount(self._gripper.edge_finger[seen], minlength=fingers) > 0
+        return int(np.maximum(corners, by_edge).sum())
+
+    def _short(self, trust: Trust) -> bool:
+        """Whether the bound is above the alert limit."""
+        return past_alert_limit(trust.protection, self._policy) is not None
 
     def weigh(self, measurement: Measurement, cam_T_grip: Array, ends: FingerEndsSeen | None, now_s: float) -> Trust:
         """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
@@ -145,24 +209,25 @@ class Integrity:
         displaced = not holds[0]
         corners = 0 if ends is None else int(ends.seen.sum())
         proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
-        misread = 0.0 if proven else MISREAD_CORNER**corners
+        misread = 0.0 if proven else MISREAD_END ** self._confirmations(measurement, ends)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread
         lasting = np.where(hypotheses.sudden, 0.0, prior)
         lasting[hypotheses.ends] = misread
         alone = now = fits.bound(fits.free, lasting, risk)
         if anchor is None:
-            return Trust(now, now, proven)
-        jumped = self._jumps_per_s * (now_s - anchor.now_s) * misread > risk
+            return Trust(now, now, proven, displaced)
+        jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
         sudden = fits.bound(anchored, np.where(holds, prior, 0.0), risk)
         if not (displaced or jumped):
             # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
             lasting[hypotheses.ends] = 0.0
             now = fits.bound(fits.free, lasting, risk)
             now = min(now, self._as_then(fits, anchor, wander), key=lambda bound: bound.position_m)
-        instead = fits.solution(anchored, hypotheses.ends) if displaced and holds[hypotheses.ends] else None
+        number = hypotheses.ends if displaced or jumped else 0
+        instead = fits.solution(anchored, number) if holds[number] else None
         ambiguous = bool(holds[1:][prior[1:] > 0.0].any())
-        return Trust(larger(now, sudden), alone, proven, displaced, displaced and ambiguous, instead)
+        return Trust(larger(now, sudden), alone, proven, displaced, displaced and ambiguous, instead, ends)
 
     def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
         """The anchor's own bounds for a pose near it."""

@@ -12,9 +12,10 @@ from gripmon.outlook.expected import (
     foresee_frame,
     weakest_direction,
 )
-from gripmon.outlook.jaw_travel import Gap, JawTravel, certainty, over_jaw
+from gripmon.outlook.jaw_travel import Certainty, Gap, JawTravel, certainty, over_jaw
 from gripmon.outlook.margins import Border, Freedom, border, freedom, moved_camera, sideways_m
 from gripmon.outlook.mounts import Mount, field_of_view_rad, towards, with_focal
+from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.sweep import Grid, Trial, tried, try_mount
 from gripmon.outlook.visibility import FEWEST_CORNERS, FEWEST_EDGES, Rig, Sight, behind_another_finger, see
 
@@ -23,6 +24,7 @@ __all__ = [
     "FEWEST_CORNERS",
     "FEWEST_EDGES",
     "Border",
+    "Certainty",
     "ForeseeingMeter",
     "Foreseen",
     "Freedom",
@@ -32,6 +34,7 @@ __all__ = [
     "JawTravel",
     "Mount",
     "Outlook",
+    "Promise",
     "Rig",
     "Sight",
     "Trial",
@@ -44,6 +47,7 @@ __all__ = [
     "freedom",
     "moved_camera",
     "over_jaw",
+    "promise",
     "see",
     "sideways_m",
     "towards",

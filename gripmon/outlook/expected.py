@@ -27,8 +27,9 @@ from gripmon.records import Array, Image, Protection, ReferenceRecord
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
 
-CLUTTER_PX = 0.2
-"""What the background is assumed to shift a stretch of an edge by, beside that, for the protection level."""
+CLUTTER_PX = 0.4
+"""What the background is assumed to shift a stretch of an edge by, beside that, for the protection level: with it the
+bound is what 95 % of the frames before clutter keep (tools/bench integrity: clutter, light, jpeg)."""
 
 _STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0
 
@@ -59,7 +60,8 @@ class Outlook:
 
     ``covariance`` (6, 6) as it would be published; ``weakest`` (6,) one standard deviation along its least certain
     direction, rotations counted by how far they move the fingertips.  ``edges``: how many can be sampled; with fewer
-    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one.
+    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one; ``protection``: the
+    level before clutter.
     """
 
     covariance: Array
@@ -68,6 +70,7 @@ class Outlook:
     corners: NDArray[np.bool_]
     lever_m: float
     jaw: JawOutlook | None
+    protection: Protection
 
     @property
     def sigma(self) -> Array:
@@ -101,7 +104,8 @@ def expect(
         free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
         jaw = _jaw_outlook(tracker.update(free)[1], free.covariance, lever_m)
     edges, corners = _edges_seen(given), given.corners.usable
-    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw)
+    protection = foresee_protection(tracker, gripper, settings, given)
+    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw, protection)
 
 
 class Foreseen(NamedTuple):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.outlook.expected import foresee_frame
+from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.visibility import Rig, Sight, see
 from gripmon.records import Array
 
@@ -68,17 +69,27 @@ def over_jaw(rig: Rig, cam_T_grip: Array, count: int = OPENINGS) -> JawTravel | 
     )
 
 
-def certainty(rig: Rig, cam_T_grip: Array, count: int = CERTAINTY_AT) -> tuple[Array, Array]:
-    """Openings (n,) from end to end, and the standard deviation (n,) of a frame's TCP along its least certain direction
-    there, NaN where too little is visible.
+class Certainty(NamedTuple):
+    """At openings (n,) from end to end: ``sigma_m`` (n,) standard deviation of a frame's TCP along its least certain
+    direction, NaN where too little is visible, and what the frame may ``promise``, None there.
     """
+
+    openings_m: Array
+    sigma_m: Array
+    promises: tuple[Promise | None, ...]
+
+
+def certainty(rig: Rig, cam_T_grip: Array, count: int = CERTAINTY_AT) -> Certainty:
+    """How exact a frame is over the jaw's travel."""
     openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count)
     sigma_m = np.full(count, np.nan)
+    promises: list[Promise | None] = [None] * count
     for k, opening_m in enumerate(openings_m.tolist()):
         if see(rig, cam_T_grip, opening_m).enough:
-            covariance = foresee_frame(rig, cam_T_grip, opening_m).covariance
-            sigma_m[k] = np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
-    return openings_m, sigma_m
+            frame = foresee_frame(rig, cam_T_grip, opening_m)
+            sigma_m[k] = np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1])
+            promises[k] = promise(frame.protection, rig.settings.policy)
+    return Certainty(openings_m, sigma_m, tuple(promises))
 
 
 def _gaps(openings_m: Array, enough: list[bool], look: Callable[[float], Sight]) -> tuple[Gap, ...]:

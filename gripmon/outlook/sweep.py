@@ -15,6 +15,7 @@ from gripmon.monitor import CORNER_COUNTS
 from gripmon.outlook.expected import Foreseen, foresee_frame
 from gripmon.outlook.margins import border, moved_camera, sideways_m
 from gripmon.outlook.mounts import Mount
+from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.visibility import Rig, Sight, see
 from gripmon.recalibrate import refusal
 from gripmon.records import Array
@@ -60,7 +61,7 @@ NOWHERE = "nowhere enough in view"
 NOT_USUAL = "too little in view at the usual opening"
 NOT_ALL = "too little in view in a part of the jaw's travel"
 SHIFTED = "too little in view after a sideways shift that the policy allows"
-INEXACT = "transforms would count as suspect"
+INEXACT = "no transform would be valid: the bound on its error is above the alert limit"
 NO_POSE = "its corners give no new pose past the limit"
 
 
@@ -71,9 +72,10 @@ class Trial:
     ``sight`` at the usual opening.  ``corners``, ``edges`` (n,) at ``openings_m`` (n,), ``share`` of these openings at
     which the monitor can measure.  The rest is None unless it can at the usual opening: ``covariance`` (6, 6) of a
     frame, ``worst_sigma_m`` the standard deviation of the TCP along its least certain direction at the worst of some
-    openings, ``worst_at_m``; ``smallest`` (6,) steps that are noticed, ``delay_frames`` for a step of the TCP by the
-    policy's ``warn_m`` along the worst axis (None: not noticed at all); ``margin_px`` of the visible corners from the
-    border and ``shift_m`` that the camera may shift sideways until the monitor can't measure, at the usual opening.
+    openings, ``worst_at_m``; ``promise`` the worst that a frame may promise at one of them; ``smallest`` (6,) steps
+    that are noticed, ``delay_frames`` for a step of the TCP by the policy's ``warn_m`` along the worst axis (None: not
+    noticed at all); ``margin_px`` of the visible corners from the border and ``shift_m`` that the camera may shift
+    sideways until the monitor can't measure, at the usual opening.
     ``faults``: why this mount would not work; none if it would.
     """
 
@@ -88,6 +90,7 @@ class Trial:
     covariance: Array | None
     worst_sigma_m: float | None
     worst_at_m: float | None
+    promise: Promise | None
     smallest: Array | None
     delay_frames: int | None
     margin_px: float | None
@@ -142,11 +145,11 @@ def try_mount(
     sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m.tolist()]
     sight = see(rig, cam_T_grip, usual_m)
     frame = nearest = smallest = delay = shift_m = None
-    worst: tuple[float, float] | None = None
+    worst: _Worst | None = None
     if sight.enough:
         frame, nearest = foresee_frame(rig, cam_T_grip, usual_m), border(rig, sight)
         smallest, delay = _noticed(frame.covariance, rig.settings.drift, rig.settings.policy.warn_m)
-        worst = _worst(rig, cam_T_grip, [o for o, _ in _closer(openings_m, sights)], (usual_m, frame.covariance))
+        worst = _worst(rig, cam_T_grip, [o for o, _ in _closer(openings_m, sights)], (usual_m, frame))
         shift_m = sideways_m(rig, cam_T_grip, usual_m)
     return Trial(
         mount,
@@ -158,8 +161,9 @@ def try_mount(
         float(np.mean([s.enough for s in sights])),
         sight,
         None if frame is None else frame.covariance,
-        None if worst is None else worst[0],
-        None if worst is None else worst[1],
+        None if worst is None else worst.sigma_m,
+        None if worst is None else worst.at_m,
+        None if worst is None else worst.promise,
         smallest,
         delay,
         None if nearest is None else nearest.smallest_px,
@@ -193,10 +197,21 @@ def _closer(openings_m: Array, sights: list[Sight]) -> list[tuple[float, Sight]]
     return [(float(openings_m[k]), sights[k]) for k in chosen if sights[k].enough]
 
 
-def _worst(rig: Rig, cam_T_grip: Array, openings_m: list[float], usual: tuple[float, Array]) -> tuple[float, float]:
-    """Largest standard deviation of the TCP in any direction, over the usual and some more openings, and at which."""
-    each = [usual, *((m, foresee_frame(rig, cam_T_grip, m).covariance) for m in openings_m)]
-    return max((float(np.sqrt(np.linalg.eigvalsh(c[:3, :3])[-1])), opening_m) for opening_m, c in each)
+class _Worst(NamedTuple):
+    """Largest standard deviation of the TCP in any direction and at which opening; largest bounds and at which."""
+
+    sigma_m: float
+    at_m: float
+    promise: Promise
+    promise_at_m: float
+
+
+def _worst(rig: Rig, cam_T_grip: Array, openings_m: list[float], usual: tuple[float, Foreseen]) -> _Worst:
+    """Over the usual and some more openings."""
+    each = [usual, *((m, foresee_frame(rig, cam_T_grip, m)) for m in openings_m)]
+    sigma_m, at_m = max((float(np.sqrt(np.linalg.eigvalsh(f.covariance[:3, :3])[-1])), o) for o, f in each)
+    promises = [(promise(frame.protection, rig.settings.policy), opening_m) for opening_m, frame in each]
+    return _Worst(sigma_m, at_m, *max(promises, key=lambda pair: pair[0].excess))
 
 
 def _blind(openings_m: Array, sights: list[Sight], sight: Sight) -> tuple[Fault, ...]:
@@ -225,16 +240,17 @@ def _shifted(rig: Rig, cam_T_grip: Array, openings: list[tuple[float, Sight]]) -
     return ()
 
 
-def _inexact(rig: Rig, worst: tuple[float, float] | None, frame: Foreseen | None) -> tuple[Fault, ...]:
-    """Whether what is measured would count as suspect, or leave no way back past the limit."""
+def _inexact(rig: Rig, worst: _Worst | None, frame: Foreseen | None) -> tuple[Fault, ...]:
+    """Whether what is measured would never be valid, or leave no way back past the limit."""
     if worst is None or frame is None:
         return ()
-    worst_sigma_m, opening_m = worst
     faults, settings = [], rig.settings
-    if worst_sigma_m >= settings.policy.suspect_sigma_m:
-        most = f"{1e3 * settings.policy.suspect_sigma_m:g} mm and more counts as suspect"
-        where = f" at {1e3 * opening_m:.1f} mm of opening" if rig.gripper.has_jaw else ""
-        faults.append(Fault(INEXACT, f"TCP to {1e3 * worst_sigma_m:.3f} mm only{where}: {most}"))
+    if not worst.promise.reachable:
+        where = f" at {1e3 * worst.promise_at_m:.1f} mm of opening" if rig.gripper.has_jaw else ""
+        bound_mm = 1e3 * worst.promise.protection.position_m
+        faults.append(
+            Fault(INEXACT, f"bound on the TCP's error {bound_mm:.2g} mm{where}: needs {worst.promise.needed}")
+        )
     if settings.recalibration.mode != "off":
         taken = rig.gripper.innermost_corners(frame.usable, CORNER_COUNTS[settings.recalibrate_corners])
         points_m = rig.gripper.points_grip_m(None)[rig.gripper.corner_points][taken]

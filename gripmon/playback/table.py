@@ -46,6 +46,12 @@ class _Drift(msgspec.Struct, frozen=True, gc=False):
     tcp_shift_m: _Vector
 
 
+class _Protection(msgspec.Struct, frozen=True, gc=False):
+    position_m: float
+    rotation_rad: float
+    risk: float
+
+
 class _Corner(msgspec.Struct, frozen=True, gc=False):
     used: bool = False
 
@@ -71,6 +77,7 @@ class Line(msgspec.Struct, frozen=True, gc=False):
     alerts: tuple[msgspec.Raw, ...] = ()
     latency_ns: _Integer = -1
     reason: str | None = None
+    protection: _Protection | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +107,12 @@ class FrameTable:
     smoothed: FloatArray
     """(n, 7) as ``cam_T_grip``."""
     smoothed_covariance: FloatArray
+    protection_m: FloatArray
+    """(n,) protection level: bound on the TCP's position error; NaN in recordings from before it was computed, too."""
+    protection_rad: FloatArray
+    """(n,) bound on the angle of the rotation error."""
+    integrity_risk: FloatArray
+    """(n,) probability a frame that the error exceeds a bound."""
     d_m: FloatArray
     """(n,) length of the camera's displacement against the reference."""
     delta_rad: FloatArray
@@ -115,7 +128,7 @@ class FrameTable:
     corners_used: NDArray[np.int32]
     corners_total: NDArray[np.int32]
     refused: NDArray[np.bool_]
-    """(n,) nothing was measured: the record gives a reason."""
+    """(n,) nothing was measured in this frame: its transform, if there is one, is held."""
     reference_ids: tuple[str, ...] = ()
 
     def __len__(self) -> int:
@@ -180,7 +193,8 @@ class FrameTable:
 
 _COLUMNS: dict[str, tuple[int, ...]] = {
     "seq": (), "stamp_ns": (), "verdict": (), "state": (), "source": (), "cam_T_grip": (7,), "covariance": (6, 6),
-    "smoothed": (7,), "smoothed_covariance": (6, 6), "d_m": (), "delta_rad": (), "tcp_shift_m": (3,), "reference": (),
+    "smoothed": (7,), "smoothed_covariance": (6, 6), "protection_m": (), "protection_rad": (),
+    "integrity_risk": (), "d_m": (), "delta_rad": (), "tcp_shift_m": (3,), "reference": (),
     "revision": (), "rms_px": (), "jaw_opening_m": (), "latency_ns": (), "corners_used": (), "corners_total": (),
     "refused": (),
 }  # fmt: skip
@@ -256,6 +270,8 @@ class TableBuilder:
         poses, smoothed, drifts = [r.cam_T_grip for r in rows], [r.smoothed for r in rows], [r.drift for r in rows]
         covariances = [r.covariance or _NAN_36 for r in rows]
         smoothed_covariances = [_NAN_36 if s is None else s.covariance for s in smoothed]
+        protections = [(np.nan,) * 3 if (p := r.protection) is None else msgspec.structs.astuple(p)[:3] for r in rows]
+        bounds = np.array(protections, np.float64)
         places = self._references
         values: dict[str, Any] = {
             "seq": [r.seq for r in rows],
@@ -267,6 +283,9 @@ class TableBuilder:
             "covariance": np.array(covariances, np.float64).reshape(-1, 6, 6),
             "smoothed": [_NAN_7 if s is None else s.translation_m + s.rotation_xyzw for s in smoothed],
             "smoothed_covariance": np.array(smoothed_covariances, np.float64).reshape(-1, 6, 6),
+            "protection_m": bounds[:, 0],
+            "protection_rad": bounds[:, 1],
+            "integrity_risk": bounds[:, 2],
             "d_m": [np.nan if d is None else d.translation_m for d in drifts],
             "delta_rad": [np.nan if d is None else d.rotation_rad for d in drifts],
             "tcp_shift_m": [_NAN_3 if d is None else d.tcp_shift_m for d in drifts],
@@ -277,7 +296,7 @@ class TableBuilder:
             "latency_ns": [r.latency_ns for r in rows],
             "corners_used": [sum([c.used for c in r.corners]) for r in rows],
             "corners_total": [len(r.corners) for r in rows],
-            "refused": [r.reason is not None for r in rows],
+            "refused": [r.source == Origin.HELD.value or r.cam_T_grip is None for r in rows],
         }
         for name, v in values.items():
             self._blocks[name].append(np.asarray(v, _TYPES.get(name, np.float64)))

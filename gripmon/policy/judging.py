@@ -132,8 +132,6 @@ class Policy:
             return "the stream of frames is at fault"
         if evidence.explanation.probable.cause in NO_REFERENCE:
             return evidence.explanation.text or str(evidence.explanation.probable.cause)
-        if evidence.gripper_astray:
-            return "the gripper contradicts its model: a finger or the jaw is not where it should be"
         return past_alert_limit(evidence.protection, self._settings)
 
     def unmeasured(

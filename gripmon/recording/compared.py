@@ -152,6 +152,13 @@ def _name_both(stream: rr.RecordingStream) -> None:
             widths=[width] * 2,
         )
         stream.log(path, lines, static=True)
+    for path, whose, alpha, width in (
+        ("protection", REPLAYED, 255, _THIN),
+        (f"{RECORDED}/protection", RECORDED, 110, _WIDE),
+    ):
+        for name, said, colour in (("level", "protection level", palette.WHOLE), ("limit", "alert limit", palette.BAD)):
+            style = rr.SeriesLines(names=f"{whose} {said}", colors=palette.faded(colour, alpha), widths=width)
+            stream.log(f"{path}/{name}_mm", style, static=True)
 
 
 def _layout(scene: Scene) -> rrb.Blueprint:
@@ -175,6 +182,16 @@ def _layout(scene: Scene) -> rrb.Blueprint:
         axis_x=axis,
         plot_legend=rrb.PlotLegend(visible=False),
     )
+    bounds = rrb.TimeSeriesView(
+        origin="/",
+        contents=[
+            f"{RECORDED}/protection/level_mm", f"{RECORDED}/protection/limit_mm",
+            "protection/level_mm", "protection/limit_mm",
+        ],
+        name="Protection level (mm) and alert limit, of both",
+        axis_x=axis,
+        plot_legend=rrb.PlotLegend(visible=False),
+    )  # fmt: skip
     columns = rrb.TextLogColumns(timeline_columns=["frame"], text_log_columns=["LogLevel", "Body"])
     log = rrb.TextLogView(
         origin="/",
@@ -186,7 +203,7 @@ def _layout(scene: Scene) -> rrb.Blueprint:
         rrb.StateTimelineView(origin=origin, name=f"State and verdict, {whose}", time_view=axis)
         for origin, whose in ((f"{RECORDED}/status", RECORDED), ("status", REPLAYED))
     ]
-    details = rrb.Tabs(rig_view(scene), turn, active_tab=0)
+    details = rrb.Tabs(rig_view(scene), turn, bounds, active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(image_view(scene), log, row_shares=[6, 3]),

@@ -8,6 +8,8 @@
 ``drift/noticed_mm``, ``_deg``      between which two a constant shift along an axis passes unnoticed: x, y, z; x, y, z
 ``drift/truth_mm``, ``error_mm``    where a simulator tells the truth
 ``drift/alerts/<severity>``         a mark at the shift's length where an alert is raised, noted or another
+``protection/level_mm``, ``_deg``   bounds on the errors of the TCP's position and of the rotation
+``protection/limit_mm``, ``_deg``   the alert limits that they are held against
 ``test/share``                      the drift test's largest statistic over its threshold;  ``test/alarm`` is 1
 ``transform``                       translation (m) and quaternion x, y, z, w, raw and smoothed
 ``sigma/…``                         standard deviations, raw and smoothed;  ``noise/…`` what was learnt of the stream's
@@ -57,6 +59,7 @@ class CurveWriter:
 
     def write(self, rows: Sequence[Row]) -> None:
         self._drift(rows)
+        self._protection(rows)
         self._transforms(rows)
         self._test(rows)
         self._measurement(rows)
@@ -102,6 +105,14 @@ class CurveWriter:
                 # Without a drift to mark it stands on the axis.
                 heights_mm = [with_length_mm[i][3] if with_length_mm[i] else 0.0 for i in marked]
                 send.curve(f"drift/alerts/{severity}", [rows[i] for i in marked], heights_mm)
+
+    def _protection(self, rows: Sequence[Row]) -> None:
+        bounds = [r.record.protection for r in rows]
+        if all(b is None for b in bounds):  # of a version that had none; or nothing is measured
+            return
+        self._send.curve("protection/level_mm", rows, [None if b is None else 1e3 * b.position_m for b in bounds])
+        degrees = [None if b is None else math.degrees(b.rotation_rad) for b in bounds]
+        self._send.curve("protection/level_deg", rows, degrees)
 
     def _news(self, record: FrameRecord) -> set[Severity]:
         """Of alerts that are raised or noted, or have become another kind or severity: a creep that ends in a step."""
@@ -160,6 +171,10 @@ class CurveWriter:
         send.scalars("drift/limits_deg", rows, degrees)
         send.scalars("drift/noticed_mm", rows, [_noticed(each, slice(0, 3), 1e3) for each in limits])
         send.scalars("drift/noticed_deg", rows, [_noticed(each, slice(3, 6), 180.0 / math.pi) for each in limits])
+        alert_limits = [(each.alert_limit_m, each.alert_limit_rad) for each in limits]
+        if all(m is not None and rad is not None for m, rad in alert_limits):
+            send.curve("protection/limit_mm", rows, [1e3 * (m or 0.0) for m, _ in alert_limits])
+            send.curve("protection/limit_deg", rows, [math.degrees(rad or 0.0) for _, rad in alert_limits])
         scatters = [each.scatter or () for each in limits]
         send.scalars("noise/scatter_um", rows, [[1e6 * v for v in s[:3]] for s in scatters])
         send.scalars("noise/scatter_deg", rows, [list(map(math.degrees, s[3:])) for s in scatters])
@@ -203,6 +218,9 @@ def _log_styles(send: Sender, scene: Scene) -> None:
     for unit in ("mm", "deg"):
         lines(f"drift/limits_{unit}", ["warning", "limit"], [palette.DOUBTFUL, palette.BAD], 1.5)
         lines(f"drift/noticed_{unit}", [f"{name} unnoticed" for name in both], pale * 2, 1.0)
+    for unit in ("mm", "deg"):
+        lines(f"protection/level_{unit}", "protection level", palette.WHOLE, 1.5)
+        lines(f"protection/limit_{unit}", "alert limit", palette.BAD, 1.5)
     marks = {Severity.INFO: palette.BUSY, Severity.WARNING: palette.DOUBTFUL, Severity.ERROR: palette.BAD}
     for severity, colour in marks.items():
         points = rr.SeriesPoints(names=f"alert: {severity}", colors=colour, markers="Diamond", marker_sizes=6.0)

@@ -117,6 +117,7 @@ def _details(scene: Scene, axis: rrb.TimeAxis) -> rrb.Tabs:
             axis_y=rrb.ScalarAxis(range=_CLOSE_UP_MM),
             plot_legend=rrb.PlotLegend(visible=False),
         ),
+        plot("protection", ["protection/level_mm", "protection/limit_mm"], "Protection (mm)"),
         *error,
         plot("residual", "residual/rms_px", "Residual (px)"),
         plot("residual", "residual/corners_px", "Corners (px)"),

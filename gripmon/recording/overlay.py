@@ -51,7 +51,7 @@ class OverlayWriter:
 
     def write(self, rows: Sequence[Row]) -> None:
         # A refused frame has no picture to lie on, but must take the overlay of the one before away.
-        rows = [row for row in rows if row.picture is not None or row.record.reason is not None]
+        rows = [row for row in rows if row.picture is not None or not row.record.measured]
         if not rows:
             return
         self._images([row for row in rows if row.picture is not None])
@@ -60,7 +60,7 @@ class OverlayWriter:
     def write_late(self, rows: Sequence[Row]) -> None:
         """Images of frames that were written before without; a refused frame's overlay is there already."""
         self._images(rows)
-        rows = [row for row in rows if row.record.reason is None]
+        rows = [row for row in rows if row.record.measured]
         if rows:
             self._draw(rows)
 

@@ -74,7 +74,7 @@ class RigWriter:
         redrawn = [row for row in rows if self._looks_different(row)]
         if redrawn:
             self._write_fingers(redrawn)
-        pictured = [row for row in rows if row.picture is not None or row.record.reason is not None]
+        pictured = [row for row in rows if row.picture is not None or not row.record.measured]
         if pictured:
             self._write_shift(pictured)
 

@@ -138,6 +138,11 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         Protection | None, Meta(description="bounds on the error of cam_T_grip, null with it; a held one's grow")
     ] = None
 
+    @property
+    def measured(self) -> bool:
+        """Whether it has a transform that comes from this frame: one that isn't held."""
+        return self.source is not Origin.HELD and self.cam_T_grip is not None
+
 
 @dataclass(frozen=True, slots=True)
 class MeasurementTrace:

@@ -58,6 +58,14 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
             "second camera: of tcp_shift_m, null with it"
         ),
     ] = None
+    protection_m: Annotated[
+        float | None,
+        Meta(description="bound on the TCP's position error, of the last transform, m; null: unknown, second cameras"),
+    ] = None
+    alert_limit_m: Annotated[
+        float | None,
+        Meta(description="error of the TCP's position that the task bears, as configured, m; null for second cameras"),
+    ] = None
     open_alerts: Annotated[tuple[StandingAlert, ...], Meta(description="raised and not cleared yet, oldest first")] = ()
     transforms_unsent: Annotated[int, Meta(description="before there was a Zenoh session")] = 0
     malformed: Annotated[

@@ -15,8 +15,9 @@ class Limits(msgspec.Struct, frozen=True, array_like=True):
     minds.  ``noticed``: shifts that would be noticed, each alone on its axis, if all frames that the test now rests on
     had them, reckoned from ``offset``, the part of the shift that the reference's own error explains.  ``scatter``:
     standard deviations of frames about their mean, as learnt.  ``average_share``: share of the frames' variance that
-    the smoothed transform has seen to scatter, ``average_walk`` how far it takes the mount to wander in a second.  None
-    is what isn't known yet.
+    the smoothed transform has seen to scatter, ``average_walk`` how far it takes the mount to wander in a second.
+    ``alert_limit_m``, ``alert_limit_rad``: what bounds on a transform's error are held against.  None is what isn't
+    known.
     """
 
     warn_m: float
@@ -29,6 +30,8 @@ class Limits(msgspec.Struct, frozen=True, array_like=True):
     scatter: SixNumbers | None
     average_share: SixNumbers
     average_walk: SixNumbers
+    alert_limit_m: float | None = None
+    alert_limit_rad: float | None = None
 
 
 class MonitorNotes(msgspec.Struct, frozen=True, array_like=True):

@@ -18,6 +18,7 @@ from gripmon.report.envelope import curves_of
 from gripmon.report.formats import count
 from gripmon.report.happenings import happenings_of, pauses_of, with_reference_changes
 from gripmon.report.hindsight import look_back
+from gripmon.report.integrity import integrity_of
 from gripmon.report.limits import limits_of
 from gripmon.report.lives import MOTIONS, lives_of
 from gripmon.report.motions import motions_of
@@ -96,11 +97,12 @@ def _tell(source: Source, affected_m: float | None, affected_rad: float | None) 
         events=_numbered(events, source, track),
         affected=tuple(sorted(affected, key=lambda a: (a.start_ns, a.what))),
         running=running_of(table, clock, track, source.states, dropped),
-        curves=curves_of(track, [event.onset.stamp_ns for event in motions]),
+        curves=curves_of(table, track, [event.onset.stamp_ns for event in motions]),
         references=tuple(_references(source, in_force_ns)),
         commands=tuple(
             CommandEntry(clock.of(c.seq, c.stamp_ns), c.name, c.argument, c.done, c.text) for c in source.commands
         ),
+        integrity=integrity_of(table, limits),
         faults=(*(fault for fault in source.faults if fault not in dropped), *clock_faults),
     )
     return Told(source, msgspec.structs.replace(report, summary=paragraph(report)))

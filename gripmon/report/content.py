@@ -107,6 +107,23 @@ class Limits(msgspec.Struct, frozen=True):
     limit_m: Annotated[float, Meta(description="monitor.policy.limit_m: past it the reference is measured anew")]
     limit_rad: float
     origin: Annotated[str, Meta(description="where they come from, in words")]
+    alert_limit_m: Annotated[
+        float | None, Meta(description="monitor.policy.alert_limit_m: bounds on a position's error are held against it")
+    ] = None
+    alert_limit_rad: float | None = None
+
+
+class Integrity(msgspec.Struct, frozen=True, kw_only=True):
+    """How large errors may have been, frame by frame, and how often that was within the alert limits."""
+
+    frames: Annotated[int, Meta(description="that have bounds: those with a transform")]
+    valid: Annotated[float, Meta(description="share of all frames whose transform was valid, 0 to 1")]
+    within: Annotated[float, Meta(description="share of all frames with both bounds within the alert limits, 0 to 1")]
+    median_m: Annotated[float, Meta(description="median of the bounds on the TCP's position error")]
+    p99_m: Annotated[float, Meta(description="99 % of them are at most that")]
+    median_rad: Annotated[float, Meta(description="median of the bounds on the rotation error")]
+    p99_rad: float
+    risk: Annotated[float, Meta(description="probability a frame that the error exceeds a bound")]
 
 
 class Noise(msgspec.Struct, frozen=True):
@@ -153,7 +170,13 @@ class Curve(msgspec.Struct, frozen=True):
     included.  Null where nothing was measured.
     """
 
-    name: Annotated[str, Meta(description="tcp_from_beginning_m, tcp_from_reference_m, x_m, y_m, z_m, rotation_rad")]
+    name: Annotated[
+        str,
+        Meta(
+            description="tcp_from_beginning_m, tcp_from_reference_m, x_m, y_m, z_m, rotation_rad; where the recording "
+            "has them protection_m, protection_rad"
+        ),
+    ]
     stamp_ns: Annotated[tuple[int, ...], Meta(description="middle of each piece")]
     middle: Annotated[tuple[float | None, ...], Meta(description="median; x, y, z, rotation: against the reference")]
     low: tuple[float | None, ...]
@@ -233,6 +256,10 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
     references: tuple[ReferenceEntry, ...]
     commands: tuple[CommandEntry, ...]
     faults: Annotated[tuple[str, ...], Meta(description="what of it could not be used, a line each")]
+    integrity: Annotated[
+        Integrity | None,
+        Meta(description="null: the version that recorded it stated no bounds, or nothing was measured"),
+    ] = None
 
 
 class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.report/1"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,17 @@ from gripmon.report.content import Curve
 from gripmon.report.formats import COVERAGE
 from gripmon.report.track import Track
 
+if TYPE_CHECKING:
+    from gripmon.playback import FrameTable
+
 _PIECES = 1200
 _DETAIL_NS = 2 * SECOND_NS  # on either side of a motion every frame is shown
 _MOST_DETAIL = 2400  # frames
 
 
-def curves_of(track: Track, moments_ns: Sequence[int]) -> tuple[Curve, ...]:
+def curves_of(table: FrameTable, track: Track, moments_ns: Sequence[int]) -> tuple[Curve, ...]:
     """The TCP's way from the calibration at the beginning and from the reference in force, and that one's parts; with
-    every frame around some moments.
+    every frame around some moments; and the bounds on errors, where the recording has them.
     """
     if not len(track):
         return ()
@@ -36,6 +40,10 @@ def curves_of(track: Track, moments_ns: Sequence[int]) -> tuple[Curve, ...]:
         *((f"{axis}_m", shift[:, i], track.sigma[:, i]) for i, axis in enumerate("xyz")),
         ("rotation_rad", np.linalg.norm(shift[:, 3:], axis=1), turn),
     ]
+    for name in ("protection_m", "protection_rad"):
+        bounds = getattr(table, name)
+        if np.isfinite(bounds).any():
+            series.append((name, bounds, np.zeros(len(bounds))))
     return tuple(_curve(name, track, cuts, values, sigma) for name, values, sigma in series)
 
 

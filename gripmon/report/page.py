@@ -44,7 +44,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    from gripmon.report.plots import as_json, drift_figure, overview_figure, running_figure
+    from gripmon.report.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
 
     shown: dict[tuple[int, int], tuple[Shown | None, Shown | None]] = {}
     figures: dict[str, str] = {}
@@ -53,6 +53,8 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
     for n, each in enumerate(told, 1):
         if each.report.running.frames:
             figures[f"drift-{n}"] = as_json(drift_figure(each.report))
+            if each.report.integrity is not None:
+                figures[f"protection-{n}"] = as_json(protection_figure(each.report))
             figures[f"running-{n}"] = as_json(running_figure(each.report))
         for event in _cards(each.report.events):
             shown[n, event.number] = _pictures(each, event)

@@ -114,6 +114,29 @@ def running_figure(report: RecordingReport) -> go.Figure:
     return _styled(figure, 460)
 
 
+def protection_figure(report: RecordingReport) -> go.Figure:
+    """Bounds on the errors of position and rotation, logarithmic, with the alert limits."""
+    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.07, row_heights=[0.6, 0.4])
+    curves = {curve.name: curve for curve in report.curves}
+    limits = report.limits
+    for row, name, scale, limit in (
+        (1, "protection_m", _MM, limits.alert_limit_m),
+        (2, "protection_rad", math.degrees(1.0), limits.alert_limit_rad),
+    ):
+        label = "protection level" if row == 1 else "of the rotation"
+        _line(figure, curves[name], row, PURPLE, label, scale, legend=row == 1)
+        if limit is not None:  # a line, since a shape's text stands elsewhere on a logarithmic axis
+            ends = _times([report.start_ns, report.end_ns])
+            figure.add_scatter(
+                x=ends, y=[scale * limit] * 2, mode="lines", name="alert limit", showlegend=row == 1, row=row, col=1,
+                line={"color": SEVERITIES["error"], "width": 1.2, "dash": "dash"}, hovertemplate="alert limit %{y:g}",
+            )  # fmt: skip
+    for row, title in enumerate(("TCP within (mm)", "turn within (°)"), 1):
+        figure.update_yaxes(type="log", title_text=title, title_standoff=8, row=row, col=1, dtick="D2")
+    figure.update_xaxes(title_text="UTC", row=2, col=1, title_standoff=4)
+    return _styled(figure, 380)
+
+
 def _line(
     figure: go.Figure, curve: Curve, row: int, colour: str, name: str, scale: float, *, legend: bool = True
 ) -> None:

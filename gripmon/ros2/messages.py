@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 
 from gripmon.geometry import from_record, invert, skew, to_record
-from gripmon.records import Array, FrameRecord, Severity, StandingAlert, State, StateRecord, Transform, Verdict
+from gripmon.records import (
+    Array,
+    FrameRecord,
+    Protection,
+    Severity,
+    StandingAlert,
+    State,
+    StateRecord,
+    Transform,
+    Verdict,
+)
 from gripmon.ros2.types import DIAGNOSTICS, POSE, TF, prepare, typestore
 
 OK, WARN, ERROR, STALE = range(4)
@@ -132,6 +142,7 @@ def values_of(
         values.append(("rotation (deg)", f"{math.degrees(frame.drift.rotation_rad):.4f}"))
     if state.sigma_m is not None:
         values.append(("position sigma (mm)", f"{1e3 * state.sigma_m:.4f}"))
+    values += _bounds_of(state, None if frame is None else frame.protection)
     values += [
         ("alerts", ", ".join(f"{alert.kind} ({alert.severity})" for alert in alerts)),
         ("camera connected", str(state.camera_connected).lower()),
@@ -142,4 +153,19 @@ def values_of(
         ("uptime (s)", f"{state.uptime_s:.0f}"),
         ("version", state.version),
     ]
+    return values
+
+
+def _bounds_of(state: StateRecord, protection: Protection | None) -> list[tuple[str, str]]:
+    """How far off the newest transform may be, at which risk, and how far off it is allowed to be."""
+    values = []
+    if protection is not None:
+        values = [
+            ("protection level (mm)", f"{1e3 * protection.position_m:.4f}"),
+            ("rotation protection level (deg)", f"{math.degrees(protection.rotation_rad):.4f}"),
+            ("integrity risk per frame", f"{protection.risk:g}"),
+            ("hypothesis", protection.hypothesis),
+        ]
+    if state.alert_limit_m is not None:
+        values.append(("alert limit (mm)", f"{1e3 * state.alert_limit_m:g}"))
     return values

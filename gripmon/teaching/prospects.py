@@ -9,7 +9,7 @@ from gripmon.corners import TaughtEdges
 from gripmon.drift import foresee
 from gripmon.gripper import Gripper
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings
-from gripmon.outlook import FEWEST_EDGES, expect
+from gripmon.outlook import FEWEST_EDGES, Promise, expect, promise
 from gripmon.recalibrate import refusal
 from gripmon.records import Array, ReferenceRecord
 
@@ -18,14 +18,16 @@ from gripmon.records import Array, ReferenceRecord
 class Prospects:
     """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
     ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
-    drift test notices.  ``delay_frames``: after how many frames it notices a step of the TCP by 0.1 mm along x, y and
-    z, None for never.  ``recalibration``: why the corners in view give no new pose, None if they do.
+    drift test notices; ``promise``: bounds on its error, beside the alert limits.  ``delay_frames``: after how many
+    frames it notices a step of the TCP by 0.1 mm along x, y and z, None for never.  ``recalibration``: why the corners
+    in view give no new pose, None if they do.
     """
 
     edges: int
     sigma: Array
     weakest: Array
     smallest: Array
+    promise: Promise
     delay_frames: tuple[int | None, ...]
     recalibration: str | None
 
@@ -54,6 +56,7 @@ def prospects(
         outlook.sigma,
         outlook.weakest,
         foresight.smallest,
+        promise(outlook.protection, settings.policy),
         tuple(foresight.delay_frames(STEP_M, axis) for axis in range(3)),
         refusal(points_grip_m),
     )

@@ -258,6 +258,8 @@ def reply(found: Found) -> Reply:
             sigma=tuple(expected.sigma.tolist()),
             weakest=tuple(expected.weakest.tolist()),
             smallest=tuple(expected.smallest.tolist()),
+            promise=expected.promise.text(),
+            reachable=expected.promise.reachable,
             delay_frames=expected.delay_frames,
             recalibration=expected.recalibration,
         ),

@@ -87,12 +87,14 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """As :class:`gripmon.teaching.prospects.Prospects`."""
+    """As :class:`gripmon.teaching.prospects.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
 
     edges: int
     sigma: tuple[float, ...]
     weakest: tuple[float, ...]
     smallest: tuple[float, ...]
+    promise: str
+    reachable: bool
     delay_frames: tuple[int | None, ...]
     recalibration: str | None
 

@@ -108,6 +108,8 @@ export function expected(reply, state) {
     row.append(element("td", name), ...cells, element("td", unit));
     return row;
   }));
+  $("#promise").textContent = `${values.promise[0].toUpperCase()}${values.promise.slice(1)}.`;
+  $("#promise").classList.toggle("warn", !values.reachable);
   const delays = values.delay_frames.map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `${frames} frames`}`);
   const notes = [`A step of the TCP by 0.1 mm is noticed after: ${delays.join(", ")}.`];
   if (reference?.rival) notes.push("Another pose explains these corners as well: put one outside of their plane.");
