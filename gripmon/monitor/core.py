@@ -300,7 +300,17 @@ class Monitor:
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(
-            shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful, self._standing.protection
+            shift,
+            sigma,
+            d_m,
+            delta_rad,
+            motion,
+            jumped,
+            explanation,
+            astray,
+            doubtful,
+            self._standing.protection,
+            self._standing.where_it_was,
         )
 
     def _since_start(self, shift: Array) -> Array | None:
@@ -350,6 +360,8 @@ class Monitor:
             self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
         self._baseline_weighed = False
         self._watch.reset(covariance)
+        if book.in_force != book.configured:
+            self._trust.rebase(self.reference)
         self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
         if self.reference.restores is None:
             # How edges look from where the camera is now; an undo doesn't move it.
