@@ -16,8 +16,8 @@ AGREES = 0.6
 """
 
 HIDDEN = 0.5
-"""Probability that a patch of a finger is hidden, or looks otherwise than learnt, where the finger is: held objects hide
-half of a finger often.
+"""Probability that a patch of a finger is hidden, or looks otherwise than learnt, where the finger is: held objects
+often hide half of a finger.
 """
 
 MISSES = (0.02, 0.5)
@@ -30,11 +30,11 @@ tell; above, a patch isn't used.
 
 
 def patch_evidence(hit: Array, chance: Array) -> tuple[Array, Array]:
-    """Log odds (n,), nats, that the gripper is at a pose rather than elsewhere: of a patch that agrees there, and of one
-    that doesn't.
+    """Log odds (n,), nats, that the gripper is at a pose rather than elsewhere: of a patch that agrees there, and of
+    one that doesn't.
 
-    ``hit`` (n,): share of frames in which the patch agreed where it was; ``chance`` (n,): share in which it did where it
-    wasn't.
+    ``hit`` (n,): share of frames in which the patch agreed where it was; ``chance`` (n,): share in which it did where
+    it wasn't.
     """
     here = (1.0 - HIDDEN) * np.clip(hit, 1.0 - MISSES[1], 1.0 - MISSES[0])
     elsewhere = np.clip(chance, *CHANCES)
@@ -46,9 +46,9 @@ def patch_evidence(hit: Array, chance: Array) -> tuple[Array, Array]:
 class LookAgreement:
     """What the look says of k poses, on f fingers.
 
-    ``correlation`` (k, f): median over the patches in view, NaN where none is; ``agree`` (k, f): how many of them agree,
-    of ``seen`` (k, f).  ``log_odds`` (k, f): evidence that the finger is there rather than where it would look
-    otherwise, natural logarithm of odds; 0 where nothing can be told.
+    ``correlation`` (k, f): median over the finger's patches, NaN where it has none; ``agree`` (k, f): how many agree,
+    of those that lie in the image, ``seen`` (k, f).  ``log_odds`` (k, f): evidence that the finger is there rather than
+    where it would look otherwise, natural logarithm of odds; 0 where nothing can be told.
     """
 
     correlation: Array
@@ -63,8 +63,8 @@ class LookAgreement:
     def contradicts(self, risk: float, pose: int = 0) -> bool:
         """Whether the look is seen at another one of the poses, and so much less at this one that it can't be here.
 
-        The odds against it are 1 to ``risk``.  False where the look is seen nowhere: something hides it, or the light is
-        another; then it says nothing.
+        The odds against it are 1 to ``risk``.  False where the look is seen nowhere: something hides it, or the light
+        is another; then it says nothing.
         """
         total = self.log_odds.sum(axis=1)
         enough = -math.log(risk)

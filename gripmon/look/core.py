@@ -1,10 +1,10 @@
 """The gripper's own look, learnt from frames whose pose is trusted, and held against poses that are asked about.
 
 The background moves and the gripper doesn't: a mean over time of the image in the gripper's frame keeps the texture,
-screws, pads and letters of the fingers, and loses the rest.  Small patches each lose their brightness, two slopes of light and
-their contrast, so that light may change; the length of the mean of such unit vectors tells how much of a patch is the
-gripper's.  What a patch looks like when the gripper is taken to be elsewhere along its fingers is learnt, too: one that
-looks the same there tells nothing, and a finger of one shade has no other.
+screws, pads and letters of the fingers, and loses the rest.  Small patches each lose their brightness, two slopes of
+light and their contrast, so that light may change; the length of the mean of such unit vectors tells how much of a
+patch is the gripper's.  What a patch looks like when the gripper is taken to be elsewhere along its fingers is learnt,
+too: one that looks the same there tells nothing, and a finger of one shade has no other.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ CHANGED_SHARE = 0.33
 """Of the patches beside the fingers: the rest may be other parts of the gripper, which move with it."""
 
 SLIDES_M = (1e-3, 2e-3, 4e-3, 9e-3)
-"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm, most by 1 to 10."""
+"""Ways along the fingers that are tried while learning, m: wrong fits were seen to slide by 0.2 to 28 mm."""
 
 ELSEWHERE_M = 2e-3
-"""From this slide on a patch must look otherwise to count, m: less than the smallest thing that is mistaken for a tip."""
+"""From this slide on a patch must look otherwise to count, m: things that are mistaken for a tip lie farther off."""
 
 CONSTANT = 0.7
 """Length of the mean unit vector from which a patch is the gripper's: half of its variance always looks the same."""
@@ -105,8 +105,8 @@ class GripperLook:
         return np.bincount(self._chosen_finger, minlength=len(self._gripper.finger_ids))
 
     def tells_slide_m(self, risk: float) -> Array:
-        """(f,) smallest of :data:`SLIDES_M` from which on each of them would contradict where the finger is seen whole, at
-        odds of 1 to ``risk``; NaN for a finger that tells of none.
+        """(f,) smallest of :data:`SLIDES_M` from which on each would contradict where the finger is seen whole, at odds
+        of 1 to ``risk``; NaN for a finger that tells of none.
         """
         lost = self._gain - self._loss
         fingers = len(self._gripper.finger_ids)
@@ -237,9 +237,10 @@ class GripperLook:
         self._points, self._finger = layout.points_grip_m[own], layout.finger[own]
         self._guards, self._guard_finger = layout.points_grip_m[layout.guard], layout.finger[layout.guard]
         count, slides = len(self._points), len(self._slides_grip_m)
-        self._mean: NDArray[np.float32] = np.zeros((count, POINTS), dtype=np.float32)
+        self._mean = np.zeros((count, POINTS), dtype=np.float32)
         self._weight, self._hit = np.zeros(count), np.zeros(count)
         self._chance, self._tried = np.zeros((slides, count)), np.zeros(slides)
+        self._offsets: tuple[float | None, Array] | None = None
         self._take(np.zeros(0, dtype=np.intp))
 
     def _look(
@@ -250,37 +251,31 @@ class GripperLook:
         points_grip_m: Array,
         finger: NDArray[np.intp],
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Unit textures (k, n, POINTS) of patches at k poses, zero where there is no contrast, and which of them (k, n) lie
-        inside the image.
-        """
+        """Textures (k, n, POINTS) of patches at k poses, and which of them (k, n) lie inside the image."""
+        shape = len(poses_cam_T_grip), len(points_grip_m)
         if not len(points_grip_m):
-            return np.zeros((len(poses_cam_T_grip), 0, POINTS), dtype=np.float32), np.zeros(
-                (len(poses_cam_T_grip), 0), dtype=bool
-            )
-        moved = points_grip_m + self._offsets_m(jaw_opening_m)[finger][:, None]
-        flat = moved.reshape(-1, 3)
-        cam_m = np.concatenate([flat @ T[:3, :3].T + T[:3, 3] for T in poses_cam_T_grip])
-        uv_px = self._camera.project(cam_m).astype(np.float32)
-        shape = len(poses_cam_T_grip), len(points_grip_m), POINTS
-        u, v = uv_px[:, 0], uv_px[:, 1]
+            return np.zeros((*shape, POINTS), dtype=np.float32), np.zeros(shape, dtype=bool)
+        grip_m = (points_grip_m + self._offsets_m(jaw_opening_m)[finger][:, None]).reshape(-1, 3)
+        cam_m = [grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3] for cam_T_grip in poses_cam_T_grip]
+        uv_px = self._camera.project(cam_m[0] if len(cam_m) == 1 else np.concatenate(cam_m)).astype(np.float32)
+        u, v = uv_px.T.reshape(2, -1, POINTS)
         height, width = image.shape[:2]
-        # A point outside the lens is NaN, which is inside of nothing.
+        # A point outside the lens is NaN, which is inside of nothing; OpenCV needs a number for it.
         within = (u >= 0.0) & (u <= width - 1.0) & (v >= 0.0) & (v <= height - 1.0)
-        maps = [np.ascontiguousarray(np.where(within, w, 0.0), dtype=np.float32).reshape(-1, POINTS) for w in (u, v)]
-        values = cv2.remap(image, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        grey = values.astype(np.float32)
-        texture = (grey @ GREY_BGR if grey.ndim == 3 else grey) @ _TEXTURE
-        length = np.sqrt(np.einsum("np,np->n", texture, texture))
+        if not within.all():
+            u, v = np.where(within, u, np.float32(0.0)), np.where(within, v, np.float32(0.0))
+        values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         quantum = 1.0 if np.issubdtype(image.dtype, np.integer) else 1.0 / 65535.0
-        per = np.where(length > NOISE_QUANTA * quantum * math.sqrt(POINTS), 1.0 / np.maximum(length, 1e-12), 0.0)
-        texture *= per.astype(np.float32)[:, None]
-        return texture.reshape(shape), within.reshape(shape).all(axis=2)
+        texture = _texture(values @ GREY_BGR if values.ndim == 3 else values, quantum)
+        return texture.reshape(*shape, POINTS), within.all(axis=1).reshape(shape)
 
     def _offsets_m(self, jaw_opening_m: float | None) -> Array:
         """(f, 3) by how much each finger has moved since the patches were laid out."""
         assert self._laid_out is not None
-        now, then = self._gripper.points_grip_m(jaw_opening_m), self._gripper.points_grip_m(self._laid_out[1])
-        return np.asarray(now[self._first] - then[self._first])
+        if self._offsets is None or self._offsets[0] != jaw_opening_m:
+            now, then = self._gripper.points_grip_m(jaw_opening_m), self._gripper.points_grip_m(self._laid_out[1])
+            self._offsets = jaw_opening_m, np.asarray(now[self._first] - then[self._first])
+        return self._offsets[1]
 
     def _add(self, look: NDArray[np.float32], inside: NDArray[np.bool_], pair: int, kept: float) -> None:
         """Learn textures (3, n, POINTS) at the pose and at two slides from it, the ``pair``-th and the next."""
@@ -319,6 +314,16 @@ class GripperLook:
             self._hit[chosen], self._chance[np.ix_(self._far, chosen)].max(axis=0, initial=0.0)
         )
         self._starts = np.flatnonzero(np.diff(self._chosen_finger, prepend=-1))
+
+
+def _texture(values: NDArray[np.float32], quantum: float) -> NDArray[np.float32]:
+    """Unit vectors (n, POINTS) of grey levels (n, POINTS) less their brightness and slopes; zero without contrast."""
+    texture = values @ _TEXTURE
+    length = np.sqrt(np.einsum("np,np->n", texture, texture))
+    shows = length > NOISE_QUANTA * quantum * math.sqrt(POINTS)
+    np.divide(texture, length[:, None], out=texture, where=shows[:, None])
+    texture[~shows] = 0.0
+    return texture
 
 
 def _another_background(now: NDArray[np.float32], before: NDArray[np.float32]) -> bool:

@@ -52,18 +52,20 @@ class Layout:
 
 def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float | None) -> Layout:
     """Patches for a gripper seen at ``cam_T_grip`` (4, 4); none for a finger that doesn't show, or is too small."""
-    points_cam_m = gripper.points_grip_m(jaw_opening_m) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-    depths = [_finger_depth_m(camera, gripper, cam_T_grip, points_cam_m, f) for f in range(len(gripper.finger_ids))]
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)
+    points_cam_m = points_grip_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
+    visible = gripper.edge_view(points_grip_m, invert(cam_T_grip)[:3, 3]).visible
+    depths = [_finger_depth_m(camera, gripper, points_cam_m, visible, f) for f in range(len(gripper.finger_ids))]
     anywhere = np.any([np.isfinite(d) for d in depths], axis=0).astype(np.uint8)
-    near, far = (cv2.dilate(anywhere, _disc(px)) for px in BESIDE_PX)
+    free = 1 - _dilated(anywhere, BESIDE_PX[0])
     points, finger, guard = [], [], []
     for f, depth_m in enumerate(depths):
         shown = np.isfinite(depth_m).astype(np.uint8)
         if not shown.any():
             continue
-        uv_px = _patches_in(cv2.erode(shown, _disc(BORDER_PX), borderValue=0), MOST_PATCHES)
+        uv_px = _patches_in(1 - _dilated(1 - shown, BORDER_PX), MOST_PATCHES)
         u, v = np.rint(uv_px).astype(int).T
-        beside_px = _patches_in(cv2.dilate(shown, _disc(BESIDE_PX[1])) & far & (1 - near), MOST_GUARDS)
+        beside_px = _patches_in(_dilated(shown, BESIDE_PX[1]) & free, MOST_GUARDS)
         z_m = np.append(depth_m[v, u], np.full(len(beside_px), np.nanmean(depth_m)))
         xy = camera.undistort(np.concatenate([uv_px, beside_px]))
         place = (np.column_stack([xy, np.ones(len(xy))]) * z_m[:, None] - cam_T_grip[:3, 3]) @ cam_T_grip[:3, :3]
@@ -77,8 +79,9 @@ def lay_out(camera: Camera, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: 
     return Layout(every[sound], whose[sound], aside[sound])
 
 
-def _disc(radius_px: int) -> NDArray[np.uint8]:
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2), dtype=np.uint8)
+def _dilated(mask: NDArray[np.uint8], radius_px: int) -> NDArray[np.uint8]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius_px + 1,) * 2)
+    return np.asarray(cv2.dilate(mask, disc), dtype=np.uint8)
 
 
 def _patches_in(mask: NDArray[np.uint8], most: int) -> Array:
@@ -96,12 +99,15 @@ def _patches_in(mask: NDArray[np.uint8], most: int) -> Array:
     return np.asarray(uv_px.reshape(-1, 2), dtype=float)
 
 
-def _finger_depth_m(camera: Camera, gripper: Gripper, cam_T_grip: Array, points_cam_m: Array, finger: int) -> Array:
+def _finger_depth_m(
+    camera: Camera, gripper: Gripper, points_cam_m: Array, visible: NDArray[np.bool_], finger: int
+) -> Array:
     """Depth (h, w) of a finger's nearest surface at every pixel, NaN beside it."""
     faces = [face.points for face in gripper.faces if face.finger == finger]
     depth_m = np.full((camera.height_px, camera.width_px), np.nan)
     if not faces:
-        _fill_between_edges(camera, gripper, cam_T_grip, points_cam_m, finger, depth_m)
+        edges = gripper.edge_points[visible & (gripper.edge_finger == finger)]
+        _fill_between_edges(camera, points_cam_m[edges], depth_m)
     for loop in faces:
         corners = points_cam_m[loop]
         normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
@@ -126,19 +132,18 @@ def _pixels_within(camera: Camera, corners_cam_m: Array) -> tuple[NDArray[np.int
     return u, v
 
 
-def _fill_between_edges(
-    camera: Camera, gripper: Gripper, cam_T_grip: Array, points_cam_m: Array, finger: int, depth_m: Array
-) -> None:
-    """Depths inside the hull of a finger's visible edges, without faces: exact on planes that its edges surround."""
-    from scipy.interpolate import LinearNDInterpolator  # noqa: PLC0415  slow to load, and rarely needed
-    from scipy.spatial import QhullError  # noqa: PLC0415
+def _fill_between_edges(camera: Camera, ends_cam_m: Array, depth_m: Array) -> None:
+    """Depths (h, w) inside the hull of a finger's visible edges (e, 2, 3), which has no faces: exact on planes that its
+    edges surround.
+    """
+    from scipy.interpolate import LinearNDInterpolator  # slow to load, and rarely needed
+    from scipy.spatial import QhullError
 
-    view = gripper.edge_view(gripper.points_grip_m(None), invert(cam_T_grip)[:3, 3])
-    ends = points_cam_m[gripper.edge_points[view.visible & (gripper.edge_finger == finger)]]
     share = np.linspace(0.0, 1.0, EDGE_SAMPLES)[:, None, None]
-    along = ((1.0 - share) * ends[:, 0] + share * ends[:, 1]).reshape(-1, 3)
+    along = ((1.0 - share) * ends_cam_m[:, 0] + share * ends_cam_m[:, 1]).reshape(-1, 3)
     uv_px = camera.project(along)
-    along = along[np.isfinite(uv_px).all(axis=1)]
+    sound = np.isfinite(uv_px).all(axis=1)
+    along, uv_px = along[sound], uv_px[sound]
     if len(along) < SIDE:
         return
     # One over the depth is linear in ideal coordinates on a plane.
@@ -147,7 +152,7 @@ def _fill_between_edges(
     except QhullError:  # all on one line: the finger is seen from its end, or edge-on
         return
     v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].reshape(2, -1)
-    low, high = np.nanmin(uv_px, axis=0), np.nanmax(uv_px, axis=0)
+    low, high = uv_px.min(axis=0), uv_px.max(axis=0)
     near = (u >= low[0]) & (u <= high[0]) & (v >= low[1]) & (v <= high[1])
     u, v = u[near], v[near]
     if len(u):
