@@ -31,6 +31,12 @@ FORGET_S = 4.0 * 3600.0
 FEWEST_VIEWS = 12
 """Frames with new backgrounds before the look may judge: what isn't the gripper's then averages to 1/sqrt(12) = 0.3."""
 
+ENOUGH_TRIES = 3
+"""Frames in which a slide was tried, old ones forgotten, that are kept: as many as the fewest views allow."""
+
+LAY_OUT_AGAIN_S = 60.0
+"""Pause before fingers that weren't in view are looked for again, s: it takes as long as some frames."""
+
 CHANGED = 0.5
 """Correlation of a patch beside a finger with the last learnt frame's, below which its background is another one."""
 
@@ -91,6 +97,7 @@ class GripperLook:
         self.views = 0
         self._laid_out: tuple[Array, float | None] | None = None
         self._last_s: float | None = None
+        self._not_before_s = -math.inf
         self._behind: NDArray[np.float32] | None = None
         self._begin(Layout(np.zeros((0, POINTS, 3)), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool)))
 
@@ -98,6 +105,17 @@ class GripperLook:
     def ready(self) -> bool:
         """Whether it may judge: enough backgrounds were seen, and some patches would tell."""
         return len(self._chosen) > 0
+
+    @property
+    def missing(self) -> str:
+        """Why the look can't judge yet, in words; empty when it can."""
+        if self.ready:
+            return ""
+        if not len(self._points):
+            return "no part of a finger is in view that is large enough to look at"
+        if self.views < FEWEST_VIEWS:
+            return f"learnt before {self.views} backgrounds, of at least {FEWEST_VIEWS}"
+        return "the fingers look the same all along, or never the same twice"
 
     @property
     def informative(self) -> NDArray[np.intp]:
@@ -121,14 +139,20 @@ class GripperLook:
         return out
 
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> bool:
-        """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s.  About 1 ms.
+        """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s.  About 1 ms, the
+        first time 40 ms.
 
         False, and nothing learnt, while the background is the same as in the last frame that was: it would be taken for
-        the gripper's.
+        the gripper's; and while no finger is in view.
         """
-        if self._laid_out is None:
+        if not len(self._points):
+            if now_s < self._not_before_s:
+                return False
+            self._not_before_s = now_s + LAY_OUT_AGAIN_S
             self._laid_out = cam_T_grip.copy(), jaw_opening_m
             self._begin(lay_out(self._camera, self._gripper, cam_T_grip, jaw_opening_m))
+            if not len(self._points):
+                return False
         poses = cam_T_grip[None]
         behind = self._look(image, poses, jaw_opening_m, self._guards, self._guard_finger)[0][0]
         if self._behind is not None and not _another_background(behind, self._behind):
@@ -173,12 +197,14 @@ class GripperLook:
         return out
 
     def state(self, reference_id: str) -> LookRecord | None:
-        """What survives a restart, some 10 kB; None before the first frame."""
-        if self._laid_out is None:
+        """What survives a restart, some 15 kB; None before the first frame with a finger in view."""
+        if self._laid_out is None or not len(self._points):
             return None
         cam_T_grip, jaw_opening_m = self._laid_out
+        camera, gripper = self._digests()
         return LookRecord(
-            *self._digests(),
+            camera,
+            gripper,
             reference_id,
             to_record(cam_T_grip),
             jaw_opening_m,
@@ -278,19 +304,23 @@ class GripperLook:
         return self._offsets[1]
 
     def _add(self, look: NDArray[np.float32], inside: NDArray[np.bool_], pair: int, kept: float) -> None:
-        """Learn textures (3, n, POINTS) at the pose and at two slides from it, the ``pair``-th and the next."""
+        """Learn textures (3, n, POINTS) at the pose and at two slides from it, the ``pair``-th and the next.
+
+        Time alone never empties the means: after a pause one frame would be all, its background included.
+        """
         length = np.linalg.norm(self._mean, axis=1)
         alike = np.einsum("knp,np->kn", look, self._mean) / np.maximum(length, 1e-12)
         agree = alike > AGREES
         known = (length > CONSTANT) & (self._weight > FEWEST_VIEWS / 2)
         weight = np.where(known & ~agree[0], UNLIKE_WEIGHT, 1.0) * inside[0]
-        self._weight = kept * self._weight + weight
+        self._weight = np.maximum(kept * self._weight, np.minimum(self._weight, FEWEST_VIEWS)) + weight
         share = weight / np.maximum(self._weight, 1e-12)
         self._mean += share[:, None].astype(np.float32) * (look[0] - self._mean)
         self._hit += share * (agree[0] - self._hit)
         if self.views >= len(SLIDES_M):  # before, there is little that a slid image could agree with
             now = slice(pair, pair + 2)
-            self._tried[now] = kept * self._tried[now] + 1.0
+            tried = self._tried[now]
+            self._tried[now] = np.maximum(kept * tried, np.minimum(tried, ENOUGH_TRIES)) + 1.0
             self._chance[now] += (agree[1:] - self._chance[now]) / self._tried[now, None]
 
     def _choose(self) -> None:
