@@ -83,7 +83,7 @@ class GripperLook:
     A pure function of the frames so far: no clock, time is what comes with them.
     """
 
-    def __init__(self, camera: Camera, gripper: Gripper, axis_grip: Sequence[float] = (0.0, 0.0, 1.0)):
+    def __init__(self, camera: Camera, gripper: Gripper, axis_grip: Sequence[float] | Array = (0.0, 0.0, 1.0)):
         self._camera, self._gripper = camera, gripper
         axis = np.asarray(axis_grip, dtype=float)
         steps_m = np.array([sign * way for way in SLIDES_M for sign in (1.0, -1.0)])

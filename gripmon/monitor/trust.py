@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.camera import Camera
 from gripmon.corners import Effort, FingerEndsSeen, Measurement
 from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.look import GripperLook
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, Refits, larger
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -37,6 +39,12 @@ MISREAD_END = 0.1
 """Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
 border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
 """
+
+LOOK_RISK = 1e-3
+"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+
+ALONG_Z = np.array([0.0, 0.0, 1.0])
+"""The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
 
 KNOCKED_UNSEEN = 5e-4
 """Probability that the mount is knocked while something hides the fingers' ends: that is when the gripper touches things,
@@ -96,7 +104,14 @@ class Standing:
 class Integrity:
     """Bounds for one monitor's frames, and the anchor that they rest on."""
 
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+    def __init__(
+        self,
+        camera: Camera,
+        tracker: Tracker,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+    ):
         self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._floor = np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
@@ -108,6 +123,9 @@ class Integrity:
         self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
         self._kept: tuple[bytes, Hypotheses] | None = None
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
+        axis = tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z
+        self.look = GripperLook(camera, gripper, axis)
+        """The gripper's own look, the second witness."""
         self._frames = 0
         self._moved = 0
         self.anchor: Anchor | None = None
@@ -129,30 +147,53 @@ class Integrity:
             if trust.proven:
                 ends = self._tracker.ends(frame, measurement, strict=True)
                 trust = self.weigh(measurement, cam_T_grip, ends, now_s)
+            if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
+                trust = replace(trust, proven=False)
             rival = self._at_its_place(frame, now_s)
             if rival is not None and (rival[3].proven or not trust.proven):
                 measurement, cam_T_grip, covariance, trust = rival
-        return self._conclude(measurement, cam_T_grip, covariance, trust, now_s)
+        return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
 
     def held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
         that place, or nothing of the fingers' ends is seen there.
         """
         rival = None if self.anchor is None else self._at_its_place(frame, now_s)
-        if rival is None or self._short(rival[3]) and rival[3].instead is None:
+        if rival is None or (self._short(rival[3]) and rival[3].instead is None):
             return None
-        standing = self._conclude(*rival, now_s)
+        standing = self._conclude(frame, *rival, now_s)
         return None if past_alert_limit(standing.protection, self._policy) else standing
 
+    def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""
+        if not self.look.ready or frame.image is None:
+            return False
+        expected_T = self._expected[0] if self.anchor is None else self.anchor.cam_T_grip
+        poses = np.stack([cam_T_grip, expected_T])
+        return self.look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
+
+    def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen at a pose (4, 4)."""
+        if not self.look.ready or frame.image is None:
+            return False
+        return self.look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_RISK)
+
     def _conclude(
-        self, measurement: Measurement, cam_T_grip: Array, covariance: Array, trust: Trust, now_s: float
+        self,
+        frame: Frame,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        covariance: Array,
+        trust: Trust,
+        now_s: float,
     ) -> Standing:
         """What to publish of a weighed pose, and whether it becomes the anchor."""
         rests_on_anchor = False
         if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
             # What the frame leaves open the anchor tells.
             number, cam_T_grip, covariance = trust.instead
-            trust = self.weigh(measurement, cam_T_grip, trust.ends, now_s, number)
+            seen = self._look_supports(frame, measurement, cam_T_grip)
+            trust = self.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
             rests_on_anchor = True
         # A knock is rare: it must be seen, twice where the gripper had to be looked for.
         where_it_was = self.anchor is not None and not trust.displaced
@@ -161,6 +202,8 @@ class Integrity:
         moved = self._moved >= (1 if near else self._policy.confirm_frames)
         if trust.proven and (moved or not trust.displaced):
             self._settle(trust, cam_T_grip, covariance, now_s)
+            if frame.image is not None and not moved:
+                self.look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
         believed = moved or not (trust.displaced or rests_on_anchor) or (trust.proven and trust.ambiguous)
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
 
@@ -203,11 +246,12 @@ class Integrity:
         ends: FingerEndsSeen | None,
         now_s: float,
         explained: int | None = None,
+        look_seen: bool = False,
     ) -> Trust:
         """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
 
         ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor.
+        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -226,6 +270,8 @@ class Integrity:
         proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven else MISREAD_END ** self._confirmations(measurement, ends, kept)
+        if look_seen:
+            misread *= LOOK_RISK
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread
         lasting = np.where(hypotheses.sudden, 0.0, prior)
