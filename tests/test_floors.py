@@ -18,7 +18,7 @@ FLOORS = {
     "records": 0, "provenance": 0, "atomic": 0, "geometry": 0, "lenses": 0, "pixels": 0, "camera": 0, "gripper": 0,
     "corners": 1, "differential": 1, "inspection": 1, "jaw": 1, "recalibrate": 1, "smoothing": 1, "policy": 1,
     "references": 1, "causes": 1, "stream": 1, "drift": 1, "hindsight": 1,
-    "calibration": 1, "simulator": 1, "integrity": 1,
+    "calibration": 1, "simulator": 1, "integrity": 1, "look": 1,
     "monitor": 2, "pulses": 2, "spotwatch": 2, "teaching": 2, "onboarding": 2, "outlook": 2,
     "wire": 3, "sources": 3, "publish": 3, "ros2": 3, "recording": 3, "playback": 3, "report": 3, "interchange": 3,
     "client": 3, "statefile": 3, "metrics": 3, "export": 3, "teachpage": 3,

@@ -54,9 +54,10 @@ GOES_ON = 0.5
 """Share of the probes that must show it: half of them, as for an edge beside a corner."""
 
 
-def along_fingers(gripper: Gripper) -> NDArray[np.bool_]:
-    """(e,) which edges run along the fingers: the way that most of the edges' length has; all True, so that nothing is
-    an end, where no way has most of it.
+def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
+    """The way (3,) that most of the edges' length has, gripper frame, and (e,) which edges run along it.
+
+    Where no way has most of it: zero, and all True, so that nothing is an end.
     """
     points_m = gripper.points_grip_m()
     way = points_m[gripper.edge_points[:, 1]] - points_m[gripper.edge_points[:, 0]]
@@ -66,8 +67,8 @@ def along_fingers(gripper: Gripper) -> NDArray[np.bool_]:
     together = near @ length
     best = int(np.argmax(together))
     if together[best] < MAJORITY * length.sum():
-        return np.ones(len(length), dtype=bool)
-    return np.asarray(near[best])
+        return np.zeros(3), np.ones(len(length), dtype=bool)
+    return direction[best], np.asarray(near[best])
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +110,7 @@ class FingerEnds:
 
     def __init__(self, gripper: Gripper, settings: EdgeSettings):
         self._gripper, self._settings = gripper, settings
-        self.along = along_fingers(gripper)
+        self.axis, self.along = along_fingers(gripper)
         at_corner = [self.along[gripper.edges_at_corner(i)] for i in range(len(gripper.corner_ids))]
         # Without a direction of the fingers every corner is an end.
         self._at_end = np.array([self.along.all() or (a.any() and not a.all()) for a in at_corner], dtype=bool)

@@ -88,6 +88,11 @@ class FingertipMeter(FingerMeter):
         self._ends = FingerEnds(gripper, settings.edges)
 
     @property
+    def finger_axis(self) -> Array:
+        """(3,) the way that the fingers run, gripper frame; zero where they have none."""
+        return self._ends.axis
+
+    @property
     def along(self) -> NDArray[np.bool_]:
         """(e,) which edges run along the fingers."""
         return self._ends.along

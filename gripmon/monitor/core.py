@@ -17,6 +17,7 @@ from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
 from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
+from gripmon.look import LookRefused
 from gripmon.monitor.answers import (
     after_restart,
     corner_records,
@@ -101,7 +102,7 @@ class Monitor:
         self._notes = NoteTaker(settings)
         self._due: list[Alert] = []  # of commands, for the next record
         self._covariance: Array | None = None
-        self._trust = Integrity(self._tracker, gripper, settings, reference)
+        self._trust = Integrity(camera, self._tracker, gripper, settings, reference)
         self._standing: Standing | None = None
         self._now_s = 0.0  # time that has passed since the first frame
         self._measured_s: float | None = None
@@ -118,6 +119,13 @@ class Monitor:
         last = None if state is None else state.cam_T_grip
         self._located = last is not None  # here, or before a restart
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
+        self.look_refused: str | None = None
+        """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
+        if state is not None and state.look is not None:
+            try:
+                self._trust.look.restore(state.look, self.reference.reference_id)
+            except LookRefused as refused:
+                self.look_refused = str(refused)
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
             self._watch.resume(moved=self._policy.drifting)
@@ -154,6 +162,7 @@ class Monitor:
             alerts_raised=self._policy.alerts.raised,
             cam_T_grip=to_record(self._cam_T_grip) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
+            look=self._trust.look.state(self.reference.reference_id),
         )
 
     def process(self, frame: Frame) -> FrameRecord:
@@ -300,7 +309,17 @@ class Monitor:
         explanation = self._explain(frame, measurement, astray or motion.present or motion.suspicious or odd)
         d_m, delta_rad = drift.translation_m, drift.rotation_rad
         return Evidence(
-            shift, sigma, d_m, delta_rad, motion, jumped, explanation, astray, doubtful, self._standing.protection
+            shift,
+            sigma,
+            d_m,
+            delta_rad,
+            motion,
+            jumped,
+            explanation,
+            astray,
+            doubtful,
+            self._standing.protection,
+            self._standing.where_it_was,
         )
 
     def _since_start(self, shift: Array) -> Array | None:
@@ -336,8 +355,12 @@ class Monitor:
             done, text = False, str(refusal)
         if self.reference is not before:
             self._begin()
-        state = self.state() if command.name in (CommandName.STATE, CommandName.SNAPSHOT) else None
+        state = self._told_state() if command.name in (CommandName.STATE, CommandName.SNAPSHOT) else None
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
+
+    def _told_state(self) -> MonitorState:
+        """The state for people: without what only a restart needs."""
+        return msgspec.structs.replace(self.state(), look=None)
 
     def _begin(self) -> None:
         """Drift is reckoned from the reference in force."""
@@ -350,6 +373,8 @@ class Monitor:
             self._baseline = Baseline(np.zeros(6), 0, error=np.zeros(6))
         self._baseline_weighed = False
         self._watch.reset(covariance)
+        if book.in_force != book.configured:
+            self._trust.rebase(self.reference)
         self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
         if self.reference.restores is None:
             # How edges look from where the camera is now; an undo doesn't move it.

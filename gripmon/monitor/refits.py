@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.corners import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
 from gripmon.geometry import perturb, perturbation_between
@@ -25,10 +26,35 @@ class Anchored(NamedTuple):
     surprise: Array
 
 
+class ModelError(NamedTuple):
+    """What the gripper file may be wrong by: each finger longer or shorter by ``sigma_m``, along ``axis_grip`` (3,);
+    ``finger`` (e,) that each edge belongs to.
+    """
+
+    sigma_m: float
+    axis_grip: Array
+    finger: NDArray[np.intp]
+
+    def of_pose(self, inverse: Array, information: Array, edge: NDArray[np.intp], rotation: Array) -> Array:
+        """(6, 6) covariance of the pose by that: a finger that is longer pulls by all its edges together.
+
+        ``inverse`` (m, m) of the normal matrix, ``information`` (v, m, m) of the edges ``edge`` (v,), ``rotation`` (3, 3)
+        from gripper to camera.
+        """
+        out = np.zeros((6, 6))
+        finger = self.finger[edge]
+        for number in np.unique(finger):
+            pull = (inverse @ information[finger == number].sum(axis=0)[:, :3] @ (rotation @ self.axis_grip))[:6]
+            out += self.sigma_m**2 * np.outer(pull, pull)
+        return out
+
+
 class Refits:
     """One measurement's fits under h hypotheses, about the published pose ``cam_T_grip`` (4, 4)."""
 
-    def __init__(self, measurement: Measurement, cam_T_grip: Array, hypotheses: Hypotheses, floor: Array):
+    def __init__(
+        self, measurement: Measurement, cam_T_grip: Array, hypotheses: Hypotheses, floor: Array, model: ModelError
+    ):
         """``floor`` (6,): variances of the error that no averaging removes."""
         self.cam_T_grip, self._hypotheses, self._floor = cam_T_grip, hypotheses, floor
         self._normal = measurement.normal
@@ -46,6 +72,9 @@ class Refits:
             self._known[:, 6, 6] = told
             self._pull[:, 6] = told * (measurement.jaw_known_m - fitted_m)
         self.free = self._separate(self._known, self._pull)
+        normal = self._normal
+        inverse = np.linalg.inv(normal.information.sum(axis=0) + self._known[0])
+        self._of_model = model.of_pose(inverse, normal.information, normal.edge, cam_T_grip[:3, :3])
 
     def _separate(self, known: Array, pull: Array) -> Separation:
         normal = self._normal
@@ -73,6 +102,7 @@ class Refits:
             return Protection(0.0, 0.0, risk, "")
         shift, covariance = separation.shift[counted, :6], separation.covariance[counted, :6, :6].copy()
         covariance[:, range(6), range(6)] += self._floor
+        covariance += self._of_model / INFLATION**2
         position, rotation = levels(shift - self._published, covariance, risk / len(prior) / prior[counted], INFLATION)
         worst = int(np.argmax(position))
         return Protection(

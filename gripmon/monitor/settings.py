@@ -60,6 +60,15 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         float,
         Meta(ge=0.0, le=0.1, description="systematic error of the rotation that no averaging removes, each axis (rad)"),
     ] = 5e-5
+    model_sigma_m: Annotated[
+        float,
+        Meta(
+            ge=0.0,
+            le=0.01,
+            description="standard deviation of each finger's length in the gripper file, for the protection level; none "
+            "where edges were taught (m)",
+        ),
+    ] = 5e-5
     corners: MeasurementSettings = MeasurementSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
     drift: DriftSettings = DriftSettings()

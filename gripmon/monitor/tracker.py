@@ -34,6 +34,8 @@ class Tracker:
         self._jaw = JawKnowledge(settings.jaw_sigma_m, settings.jaw_offset_sigma_m)
         self._meter = FingertipMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+        self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
+        """By how much the model may have each finger out of its place; teaching measures that."""
         self.jaw_opening_m = gripper.jaw_nominal_m
         """Where the jaw was seen last: what to expect when nobody reports it."""
         self._usual_share = USUAL_SHARE
@@ -90,6 +92,11 @@ class Tracker:
         """Whether the fingers' ends are seen as such; takes as long as a fourth of a measurement."""
         assert frame.image is not None
         return self._meter.ends(frame.image, measurement, strict)
+
+    @property
+    def finger_axis(self) -> Array:
+        """(3,) the way that the fingers run, gripper frame; zero where they have none."""
+        return self._meter.finger_axis
 
     @property
     def along(self) -> NDArray[np.bool_]:

@@ -12,11 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.camera import Camera
 from gripmon.corners import Effort, FingerEndsSeen, Measurement
 from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.integrity import Hypotheses, bounds, hypotheses_of
-from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Refits, larger
+from gripmon.look import GripperLook
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, Refits, larger
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.policy import past_alert_limit
@@ -37,6 +39,12 @@ MISREAD_END = 0.1
 """Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
 border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
 """
+
+LOOK_RISK = 1e-3
+"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+
+ALONG_Z = np.array([0.0, 0.0, 1.0])
+"""The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
 
 KNOCKED_UNSEEN = 5e-4
 """Probability that the mount is knocked while something hides the fingers' ends: that is when the gripper touches things,
@@ -66,7 +74,8 @@ class Trust:
 
     ``protection`` of the pose that was asked about, ``alone`` what the frame by itself bounds; ``proven``: the fingers' ends are seen as such; ``displaced``: the
     pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
-    ``instead``: pose and covariance without the ends, where the anchor explains the rest; None where it doesn't.
+    ``instead``: pose and covariance that the anchor and the rest of the edges give under the most probable hypothesis,
+    with its number; None where there is none.
     """
 
     protection: Protection
@@ -74,14 +83,14 @@ class Trust:
     proven: bool
     displaced: bool = False
     ambiguous: bool = False
-    instead: tuple[Array, Array] | None = None
+    instead: tuple[int, Array, Array] | None = None
     ends: FingerEndsSeen | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
     """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``; ``believed``: the gripper may be taken to be
-    there, so that averages, the drift test and what is learnt may rest on it.
+    there, so that averages, the drift test and what is learnt may rest on it; ``where_it_was``: the anchor has it there.
     """
 
     measurement: Measurement
@@ -89,12 +98,20 @@ class Standing:
     covariance: Array
     protection: Protection
     believed: bool
+    where_it_was: bool
 
 
 class Integrity:
     """Bounds for one monitor's frames, and the anchor that they rest on."""
 
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+    def __init__(
+        self,
+        camera: Camera,
+        tracker: Tracker,
+        gripper: Gripper,
+        settings: MonitorSettings,
+        reference: ReferenceRecord,
+    ):
         self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
         self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
         self._floor = np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
@@ -102,8 +119,13 @@ class Integrity:
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
         self._swing: Array = np.zeros(6)
+        self._unexplained: Array | None = None
+        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
         self._kept: tuple[bytes, Hypotheses] | None = None
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
+        axis = tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z
+        self.look = GripperLook(camera, gripper, axis)
+        """The gripper's own look, the second witness."""
         self._frames = 0
         self._moved = 0
         self.anchor: Anchor | None = None
@@ -125,40 +147,65 @@ class Integrity:
             if trust.proven:
                 ends = self._tracker.ends(frame, measurement, strict=True)
                 trust = self.weigh(measurement, cam_T_grip, ends, now_s)
+            if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
+                trust = replace(trust, proven=False)
             rival = self._at_its_place(frame, now_s)
             if rival is not None and (rival[3].proven or not trust.proven):
                 measurement, cam_T_grip, covariance, trust = rival
-        return self._conclude(measurement, cam_T_grip, covariance, trust, now_s)
+        return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
 
     def held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
         that place, or nothing of the fingers' ends is seen there.
         """
         rival = None if self.anchor is None else self._at_its_place(frame, now_s)
-        if rival is None or self._short(rival[3]) and rival[3].instead is None:
+        if rival is None or (self._short(rival[3]) and rival[3].instead is None):
             return None
-        standing = self._conclude(*rival, now_s)
+        standing = self._conclude(frame, *rival, now_s)
         return None if past_alert_limit(standing.protection, self._policy) else standing
 
+    def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""
+        if not self.look.ready or frame.image is None:
+            return False
+        expected_T = self._expected[0] if self.anchor is None else self.anchor.cam_T_grip
+        poses = np.stack([cam_T_grip, expected_T])
+        return self.look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
+
+    def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen at a pose (4, 4)."""
+        if not self.look.ready or frame.image is None:
+            return False
+        return self.look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_RISK)
+
     def _conclude(
-        self, measurement: Measurement, cam_T_grip: Array, covariance: Array, trust: Trust, now_s: float
+        self,
+        frame: Frame,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        covariance: Array,
+        trust: Trust,
+        now_s: float,
     ) -> Standing:
         """What to publish of a weighed pose, and whether it becomes the anchor."""
         rests_on_anchor = False
         if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
             # What the frame leaves open the anchor tells.
-            displaced, looked_at = trust.displaced, trust.ends
-            cam_T_grip, covariance = trust.instead
-            trust = replace(self.weigh(measurement, cam_T_grip, looked_at, now_s), displaced=displaced)
+            number, cam_T_grip, covariance = trust.instead
+            seen = self._look_supports(frame, measurement, cam_T_grip)
+            trust = self.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
             rests_on_anchor = True
         # A knock is rare: it must be seen, twice where the gripper had to be looked for.
+        where_it_was = self.anchor is not None and not trust.displaced
         self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
         near = measurement.effort is Effort.NARROW
         moved = self._moved >= (1 if near else self._policy.confirm_frames)
         if trust.proven and (moved or not trust.displaced):
             self._settle(trust, cam_T_grip, covariance, now_s)
+            if frame.image is not None and not moved:
+                self.look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
         believed = moved or not (trust.displaced or rests_on_anchor) or (trust.proven and trust.ambiguous)
-        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed)
+        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
 
     def _at_its_place(self, frame: Frame, now_s: float) -> tuple[Measurement, Array, Array, Trust] | None:
         """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
@@ -175,41 +222,56 @@ class Integrity:
         trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
         return None if trust.displaced else (measurement, cam_T_grip, covariance, trust)
 
-    def _confirmations(self, measurement: Measurement, ends: FingerEndsSeen | None) -> int:
+    def _confirmations(
+        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None
+    ) -> int:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
-        further corner.
+        further corner.  ``kept`` (v,): the measured edges that count.
         """
         fingers = len(self._gripper.finger_ids)
         corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
-        seen = measurement.consensus.edge_seen & ~self._tracker.along
-        by_edge = np.bincount(self._gripper.edge_finger[seen], minlength=fingers) > 0
-        return int(np.maximum(corners, by_edge).sum())
+        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
+        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
+        return int((by_edge * np.maximum(corners, 1)).sum())
 
     def _short(self, trust: Trust) -> bool:
         """Whether the bound is above the alert limit."""
         return past_alert_limit(trust.protection, self._policy) is not None
 
-    def weigh(self, measurement: Measurement, cam_T_grip: Array, ends: FingerEndsSeen | None, now_s: float) -> Trust:
+    def weigh(
+        self,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        ends: FingerEndsSeen | None,
+        now_s: float,
+        explained: int | None = None,
+        look_seen: bool = False,
+    ) -> Trust:
         """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
 
-        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.
+        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
+        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
             nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
             return Trust(nothing, nothing, False)
         hypotheses = self._hypotheses(edges)
-        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor)
+        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor, self._model)
         anchor = self.anchor
         wander = self._wander(now_s)
         expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
         anchored = fits.anchored(expected_T, covariance + np.diag(wander))
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
-        displaced = not holds[0]
+        displaced = not holds[0] and explained is None
         corners = 0 if ends is None else int(ends.seen.sum())
         proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
-        misread = 0.0 if proven else MISREAD_END ** self._confirmations(measurement, ends)
+        kept = None if explained is None else hypotheses.keep[explained] > 0.0
+        misread = 0.0 if proven else MISREAD_END ** self._confirmations(measurement, ends, kept)
+        if look_seen:
+            misread *= LOOK_RISK
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread
         lasting = np.where(hypotheses.sudden, 0.0, prior)
@@ -218,16 +280,22 @@ class Integrity:
         if anchor is None:
             return Trust(now, now, proven, displaced)
         jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
-        sudden = fits.bound(anchored, np.where(holds, prior, 0.0), risk)
+        possible = np.where(holds, prior, 0.0)
+        sudden = fits.bound(anchored, possible, risk)
+        as_then = self._as_then(fits, anchor, wander)
+        if not displaced:
+            alone = min(alone, as_then, key=lambda bound: bound.position_m)
         if not (displaced or jumped):
             # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
             lasting[hypotheses.ends] = 0.0
-            now = fits.bound(fits.free, lasting, risk)
-            now = min(now, self._as_then(fits, anchor, wander), key=lambda bound: bound.position_m)
-        number = hypotheses.ends if displaced or jumped else 0
-        instead = fits.solution(anchored, number) if holds[number] else None
-        ambiguous = bool(holds[1:][prior[1:] > 0.0].any())
-        return Trust(larger(now, sudden), alone, proven, displaced, displaced and ambiguous, instead, ends)
+            now = as_then
+            if explained is None:
+                now = min(now, fits.bound(fits.free, lasting, risk), key=lambda bound: bound.position_m)
+        ambiguous = bool((possible[1:] > 0.0).any())
+        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
+        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
+        protection = larger(larger(now, sudden), self._as_found())
+        return Trust(protection, alone, proven, displaced, displaced and ambiguous, instead, ends)
 
     def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
         """The anchor's own bounds for a pose near it."""
@@ -250,7 +318,29 @@ class Integrity:
             noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self._swing
             self._swing = self._swing + (np.minimum(square, DISPLACED * noise) - self._swing) / SWINGS
         bound = trust.alone
+        if self.anchor is None and trust.displaced:
+            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
+            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
         self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
+
+    def rebase(self, reference: ReferenceRecord) -> None:
+        """There is a new reference: what an older one left unexplained is over."""
+        self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
+        self._unexplained = None
+
+    def _as_found(self) -> Protection:
+        """The bound by what the first frames differed from the reference."""
+        away, risk = self._unexplained, self._policy.integrity_risk
+        if away is None:
+            return Protection(0.0, 0.0, risk)
+        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
+        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
+        return Protection(
+            position_m + float(np.linalg.norm(away[:3])),
+            rotation_rad + float(np.linalg.norm(away[3:])),
+            risk,
+            "at the start it wasn't where the reference has it: knocked before, or the model is off",
+        )
 
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
@@ -277,6 +367,10 @@ def foresee_protection(
     hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
     prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
     fits = Refits(
-        measurement, measurement.cam_T_grip, hypotheses, np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+        measurement,
+        measurement.cam_T_grip,
+        hypotheses,
+        np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3),
+        ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger),
     )
     return fits.bound(fits.free, prior, settings.policy.integrity_risk)

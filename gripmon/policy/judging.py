@@ -63,6 +63,7 @@ class Evidence:
     jumped against the previous frame, what would explain it, and whether the gripper contradicts its model (a finger or
     the jaw is not where it should be), and whether the stream of frames is at fault (so that stamps or the camera's
     calibration may not hold).  ``protection``: bounds on the transform's error; None where there are none.
+    ``where_it_was``: the gripper is where it proved to be before, so that no second frame has to say so.
     """
 
     shift: Array
@@ -75,6 +76,7 @@ class Evidence:
     gripper_astray: bool = False
     stream_at_fault: bool = False
     protection: Protection | None = None
+    where_it_was: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +108,7 @@ class Policy:
         self._bad_since_s = None
         self._since_jump = 1 if evidence.jumped else self._since_jump + 1
         self._count_still(evidence)
-        confirmed = self._since_jump >= settings.confirm_frames
+        confirmed = evidence.where_it_was or self._since_jump >= settings.confirm_frames
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
         unreliable = probable.cause in NO_REFERENCE
         recalibrate = False

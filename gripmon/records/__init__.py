@@ -38,6 +38,7 @@ from gripmon.records.frames import (
 )
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
+from gripmon.records.looks import LookRecord
 from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.notes import Limits, MonitorNotes
@@ -77,6 +78,7 @@ __all__ = [
     "JawReading",
     "LaserPulse",
     "Limits",
+    "LookRecord",
     "MeasurementTrace",
     "MessageRefused",
     "Meta",

@@ -8,6 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.records.alerts import Cause, OpenAlert
+from gripmon.records.looks import LookRecord
 from gripmon.records.values import Covariance, Transform
 
 
@@ -67,3 +68,6 @@ class MonitorState(msgspec.Struct, frozen=True):
             "start; null if that isn't known"
         ),
     ] = None
+    look: Annotated[LookRecord | None, Meta(description="the gripper's own learned look; null before there is one")] = (
+        None
+    )

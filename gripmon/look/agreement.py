@@ -1,0 +1,72 @@
+"""What the gripper's look says of poses: which patches agree with it, and what that is worth as evidence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.records import Array
+
+AGREES = 0.6
+"""Correlation from which a patch agrees: two that have nothing to do with each other reach it once in a hundred times
+(13 free numbers).
+"""
+
+HIDDEN = 0.5
+"""Probability that a patch of a finger is hidden, or looks otherwise than learnt, where the finger is: held objects
+often hide half of a finger.
+"""
+
+MISSES = (0.02, 0.5)
+"""Bounds on the probability that a patch doesn't agree where it is and can be seen."""
+
+CHANCES = (0.02, 0.3)
+"""Bounds on the probability that a patch agrees where the finger isn't: below, some hundred slid views are too few to
+tell; above, a patch isn't used.
+"""
+
+
+def patch_evidence(hit: Array, chance: Array) -> tuple[Array, Array]:
+    """Log odds (n,), nats, that the gripper is at a pose rather than elsewhere: of a patch that agrees there, and of
+    one that doesn't.
+
+    ``hit`` (n,): share of frames in which the patch agreed where it was; ``chance`` (n,): share in which it did where
+    it wasn't.
+    """
+    here = (1.0 - HIDDEN) * np.clip(hit, 1.0 - MISSES[1], 1.0 - MISSES[0])
+    elsewhere = np.clip(chance, *CHANCES)
+    here = here + HIDDEN * elsewhere
+    return np.log(here / elsewhere), np.log((1.0 - here) / (1.0 - elsewhere))
+
+
+@dataclass(frozen=True, slots=True)
+class LookAgreement:
+    """What the look says of k poses, on f fingers.
+
+    ``correlation`` (k, f): median over the finger's patches, NaN where it has none; ``agree`` (k, f): how many agree,
+    of those that lie in the image, ``seen`` (k, f).  ``log_odds`` (k, f): evidence that the finger is there rather than
+    where it would look otherwise, natural logarithm of odds; 0 where nothing can be told.
+    """
+
+    correlation: Array
+    agree: NDArray[np.intp]
+    seen: NDArray[np.intp]
+    log_odds: Array
+
+    def supports(self, risk: float, pose: int = 0) -> bool:
+        """Whether the gripper's look is seen at a pose, by chance with no more than a probability of ``risk``."""
+        return float(self.log_odds[pose].sum()) > -math.log(risk)
+
+    def contradicts(self, risk: float, pose: int = 0) -> bool:
+        """Whether the look is seen at another one of the poses, and so much less at this one that it can't be here.
+
+        The odds against it are 1 to ``risk``.  False where the look is seen nowhere: something hides it, or the light
+        is another; then it says nothing.
+        """
+        total = self.log_odds.sum(axis=1)
+        enough = -math.log(risk)
+        best = float(total.max())
+        return best > enough and best - float(total[pose]) > enough

@@ -1,0 +1,26 @@
+"""What survives a restart of the gripper's learned look."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.records.values import Transform
+
+
+class LookRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.look/1"):
+    """Learned texture of the fingers; bytes are little-endian and in JSON base64."""
+
+    camera: Annotated[str, Meta(description="digest of the camera model that it was learnt with")]
+    gripper: Annotated[str, Meta(description="digest of the gripper file")]
+    reference_id: Annotated[str, Meta(description="the reference that was in force")]
+    cam_T_grip: Annotated[Transform, Meta(description="where the gripper was when its pixels were chosen")]
+    jaw_opening_m: Annotated[float | None, Meta(description="and its opening then, m; null without a jaw")]
+    views: Annotated[int, Meta(description="frames with a new background that it was learnt from")]
+    mean: Annotated[bytes, Meta(description="float16 (n, 16): mean texture of each patch")]
+    weight: Annotated[bytes, Meta(description="float32 (n,): frames behind each mean, old ones forgotten")]
+    hit: Annotated[bytes, Meta(description="float16 (n,): share of frames in which a patch agreed where it was")]
+    chance: Annotated[bytes, Meta(description="float16 (s, n): and where it wasn't, for each tried slide")]
+    tried: Annotated[bytes, Meta(description="float32 (s,): frames behind each slide, old ones forgotten")]
