@@ -118,7 +118,8 @@ class Integrity:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self._swing: Array = np.zeros(6)
+        self.swing: Array = np.zeros(6)
+        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         self._unexplained: Array | None = None
         self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
         self._kept: tuple[bytes, Hypotheses] | None = None
@@ -315,8 +316,8 @@ class Integrity:
         if self.anchor is not None:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is no vibration, but what rings after it is.
-            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self._swing
-            self._swing = self._swing + (np.minimum(square, DISPLACED * noise) - self._swing) / SWINGS
+            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
+            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
         bound = trust.alone
         if self.anchor is None and trust.displaced:
             # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
@@ -345,8 +346,8 @@ class Integrity:
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
         if self.anchor is None:
-            return self._swing
-        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self._swing
+            return self.swing
+        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
 
     def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
         key = edges.tobytes()
