@@ -144,16 +144,32 @@ class Integrity:
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self.anchor is None:
             trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        if trust.displaced:
-            if trust.proven:
-                ends = self._tracker.ends(frame, measurement, strict=True)
-                trust = self.weigh(measurement, cam_T_grip, ends, now_s)
-            if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
-                trust = replace(trust, proven=False)
-            rival = self._at_its_place(frame, now_s)
-            if rival is not None and (rival[3].proven or not trust.proven):
-                measurement, cam_T_grip, covariance, trust = rival
-        return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        if not trust.displaced:
+            return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        confirmed = self._confirmations(measurement, trust.ends, None) >= CORNERS_WHERE_EXPECTED
+        if trust.proven:
+            ends = self._tracker.ends(frame, measurement, strict=True)
+            trust = self.weigh(measurement, cam_T_grip, ends, now_s)
+        if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
+            trust = replace(trust, proven=False)
+        rival = self._at_its_place(frame, now_s)
+        if rival is None or (trust.proven and not rival[3].proven):
+            standing = self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        else:
+            standing = self._conclude(frame, *rival, now_s)
+            confirmed = confirmed and not rival[3].proven
+        return self._between(standing, cam_T_grip) if confirmed and not trust.proven else standing
+
+    def _between(self, standing: Standing, other_T: Array) -> Standing:
+        """The same where the gripper may as well be at another pose (4, 4)."""
+        away, bound = perturbation_between(standing.cam_T_grip, other_T), standing.protection
+        farther = Protection(
+            bound.position_m + float(np.linalg.norm(away[:3])),
+            bound.rotation_rad + float(np.linalg.norm(away[3:])),
+            bound.risk,
+            "the fingers' ends are seen elsewhere, too",
+        )
+        return replace(standing, protection=farther, believed=False)
 
     def held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
@@ -279,7 +295,7 @@ class Integrity:
         lasting[hypotheses.ends] = misread
         alone = now = fits.bound(fits.free, lasting, risk)
         if anchor is None:
-            return Trust(now, now, proven, displaced)
+            return Trust(now, now, proven, displaced, ends=ends)
         jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
         possible = np.where(holds, prior, 0.0)
         sudden = fits.bound(anchored, possible, risk)
