@@ -17,6 +17,7 @@ from gripmon.records import (
     Creep,
     Explanation,
     Motion,
+    Protection,
     State,
     Verdict,
     Vibration,
@@ -30,6 +31,10 @@ SETTINGS = PolicySettings(
 PERIOD_S = 0.125
 SIGMA = np.array([4e-6, 4e-6, 1.5e-5, 3e-4, 3e-4, 1e-4])
 """What a frame of the simulated gripper is worth."""
+
+BOUNDED = Protection(2e-4, 3e-3, 1e-5, "nothing is wrong")
+"""Well within the alert limits."""
+BEYOND = Protection(2e-3, 3e-3, 1e-5, "finger left is not where its model says")
 
 
 def seen(
@@ -45,6 +50,8 @@ def seen(
     explanation: Explanation | None = None,
     astray: bool = False,
     stream_at_fault: bool = False,
+    protection: Protection | None = BOUNDED,
+    where_it_was: bool = False,
 ) -> Evidence:
     """A measured frame: the TCP shifted along the camera's x axis, turned about z; any shift is one that the drift test
     has found unless ``present`` says otherwise.
@@ -65,6 +72,8 @@ def seen(
         explanation or Explanation(),
         astray,
         stream_at_fault,
+        protection,
+        where_it_was,
     )
 
 

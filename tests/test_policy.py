@@ -6,6 +6,7 @@ import pytest
 from policy_runs import (
     ACQUIRING,
     BENT,
+    BEYOND,
     BLACK,
     CLEARED,
     DRIFTING,
@@ -199,10 +200,16 @@ TABLES: dict[str, list[Row]] = {
         (seen(1.0, explanation=KNOCKED), DRIFTING, VALID, [(K.STEP, UPDATED)], False),
         (seen(1.0, explanation=KNOCKED), DRIFTING, VALID, [], False),
     ],
-    "a gripper that contradicts its model: suspect while it does": [
+    "a gripper that contradicts its model: what that may do to the transform is in its bound, which alone counts": [
         *START,
-        (seen(astray=True), TRACKING, SUSPECT, [], False),
+        (seen(astray=True), TRACKING, VALID, [], False),
+        (seen(astray=True, protection=BEYOND), TRACKING, SUSPECT, [], False),
         (seen(), TRACKING, VALID, [], False),
+    ],
+    "hidden, then where it was: no second frame has to say so": [
+        *START,
+        (HIDDEN, OCCLUDED, SUSPECT, [(K.OCCLUDED, RAISED)], False),
+        (seen(where_it_was=True), TRACKING, VALID, [], False),
     ],
     "a stream at fault: suspect while it is": [
         *START,

@@ -11,6 +11,7 @@ from policy_runs import (
     HIDDEN,
     LOST,
     RAISED,
+    SETTINGS,
     SUSPECT,
     UNKNOWN,
     UPDATED,
@@ -24,16 +25,29 @@ from policy_runs import (
 )
 
 from gripmon.policy import Policy, PolicySettings
-from gripmon.records import AlertKind, Cause
+from gripmon.records import AlertKind, Cause, Protection, Verdict
 
 K = AlertKind
 
 
-def test_an_uncertain_transform_is_suspect():
+def test_a_transform_is_suspect_while_its_error_may_be_beyond_an_alert_limit_and_says_why():
+    """At the limit it is valid still; the covariance has no say, nor whether the mount moved."""
     run = settled()
-    wide = np.array([4e-6, 4e-6, 1.05e-4, 3e-4, 3e-4, 1e-4])
-    assert run.feed(seen(sigma=wide)).verdict is SUSPECT
-    assert run.feed(seen(sigma=wide * 0.9)).verdict is VALID
+    limit_m, limit_rad = SETTINGS.alert_limit_m, SETTINGS.alert_limit_rad
+
+    def judged(position_m: float, rotation_rad: float) -> tuple[Verdict, str | None]:
+        bound = Protection(position_m, rotation_rad, 1e-5, "edge a belongs to something else")
+        judgement = run.feed(seen(protection=bound))
+        return judgement.verdict, judgement.reason
+
+    assert judged(limit_m, limit_rad) == (VALID, None)
+    verdict, reason = judged(1.05 * limit_m, 1e-3)
+    assert verdict is SUSPECT and reason is not None
+    assert reason.startswith("the TCP may be") and "alert limit 1 mm (edge a belongs" in reason
+    verdict, reason = judged(1e-4, 1.05 * limit_rad)
+    assert verdict is SUSPECT and reason is not None and reason.startswith("the rotation may be")
+    assert run.feed(seen(protection=None)).verdict is SUSPECT
+    assert run.feed(seen(sigma=np.full(6, 0.1))).verdict is VALID, "bounds count, which are made of covariances"
 
 
 def test_every_second_frame_hidden_is_never_lost_and_never_valid():

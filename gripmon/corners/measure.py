@@ -115,8 +115,7 @@ class FingertipMeter(FingerMeter):
         elsewhere: another place than one that may be true must show the fingers' ends.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
-        # Encoders report a little beyond the end at which a jaw stands.
-        jaw_opening_m = min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
+        jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         expected = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m)
         best = self._settle(image, expected)
         satisfied = SATISFIED * usual_share
@@ -169,10 +168,15 @@ class FingertipMeter(FingerMeter):
         self, image: Image, cam_T_grip: Array, sigma: Array, jaw_opening_m: float, usual_share: float
     ) -> Measurement:
         """Measure at a pose (4, 4), with what lies within the standard deviations (6,) of it, m and rad, alone."""
+        jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         held = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m, cam_T_grip, sigma)
         measurement = self._settle(image, held)
         measurement.trusted = self._trusted(image, measurement, usual_share)
         return measurement
+
+    def _possible_opening_m(self, jaw_opening_m: float) -> float:
+        """Encoders report a little beyond the end at which a jaw stands."""
+        return min(max(jaw_opening_m, self._gripper.jaw_min_m), self._gripper.jaw_max_m)
 
     def ends(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Whether the fingers' ends are seen as such where they were measured."""

@@ -381,6 +381,8 @@ def foresee_protection(
     tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
 ) -> Protection:
     """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
+    if not len(measurement.normal.edge):
+        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
     hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
     prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
     fits = Refits(

@@ -1,0 +1,198 @@
+"""Whether the ends of the fingers are seen as ends: in free view, behind a bar, where a pose slid along the fingers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from box_models import cube_model, two_fingers_model
+from meters import NARROW, box_gripper, measure, meter, picture
+from simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
+
+from gripmon.camera import make_camera
+from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.corners.ends import along_fingers
+from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.simulator import Scenario, Simulator, make_scenario
+from gripmon.simulator.scenario import Background, FingerMark, ObjectLook, Prop
+
+PLAIN = plain_scenario()
+CUBE = Path(__file__).parent.parent / "configs" / "grippers" / "visp_cube.yaml"
+
+
+def slid(slide_m: float) -> np.ndarray:
+    """The nominal pose moved along the gripper's z."""
+    pose = nominal_cam_T_grip()
+    pose[:3, 3] += slide_m * pose[:3, 2]
+    return pose
+
+
+def slide_of(measurement: Measurement) -> float:
+    """How far along the gripper's z a measured pose is from the nominal one."""
+    nominal = nominal_cam_T_grip()
+    return float((measurement.cam_T_grip[:3, 3] - nominal[:3, 3]) @ nominal[:3, 2])
+
+
+def looked_at(scenario: Scenario, slide_m: float = 0.0, *, seed: int = 1) -> tuple[Measurement, FingerEndsSeen]:
+    """A measurement about a slid pose, narrowly, and what is seen of the ends there."""
+    using, image = meter(), picture(scenario, seed=seed)
+    found = measure(image, slid(slide_m), using=using)
+    return found, using.ends(image, found)
+
+
+def bar_before_the_tips(z_m: float, size_z_m: float, level_dn: float, **look: object) -> Scenario:
+    """Parallel to the tips, wider than the gripper, between it and the camera."""
+    bar = Prop(
+        size_m=(0.2, 0.01, size_z_m),
+        centre_m=(0.0, -0.02, z_m),
+        look=ObjectLook(pattern="plain", level_dn=level_dn),
+    )
+    return plain_scenario(props=(bar,), **look)
+
+
+def toned(from_tip_m: float, gain: float) -> Scenario:
+    """Fingers that are of another tone from somewhere behind their tips on."""
+    tone = FingerMark(from_tip_m=(from_tip_m, 0.3), across=(-2.0, 2.0), gain=gain)
+    return plain_scenario(fingers=msgspec.structs.replace(PLAIN_FINGERS, marks=(tone,)))
+
+
+# --- free view ---
+
+
+@pytest.mark.parametrize(
+    "scenario",
+    [
+        PLAIN,
+        Scenario(name="usual", background=Background(kind="blobs"), duration_s=1.0),
+        Scenario(name="printed", background=Background(kind="printed"), duration_s=1.0),
+    ],
+    ids=lambda scenario: scenario.name,
+)
+def test_in_free_view_both_fingers_show_their_ends(scenario: Scenario):
+    found, ends = looked_at(scenario)
+    assert abs(slide_of(found)) < 5e-5
+    assert ends.sure and (ends.seen >= 2).all()
+    np.testing.assert_array_equal(ends.might, [3, 3])
+
+
+def test_one_finger_with_its_end_hidden_proves_nothing_and_the_other_one_is_seen():
+    box = Prop(size_m=(0.06, 0.01, 0.04), centre_m=(0.038, -0.02, -0.012), look=ObjectLook(pattern="plain"))
+    _, ends = looked_at(plain_scenario(props=(box,)))
+    left, right = ends.seen.tolist()
+    assert left == 3 and right < 2
+    assert not ends.sure
+
+
+# --- what only looks like the ends ---
+
+
+@pytest.mark.parametrize("level_dn", [30.0, 120.0, 230.0])
+@pytest.mark.parametrize(("z_m", "size_z_m"), [(-0.010, 0.03), (-0.012, 0.02), (-0.018, 0.04)])
+def test_a_bar_before_the_tips_with_its_rim_parallel_to_them_proves_nothing(
+    z_m: float, size_z_m: float, level_dn: float
+):
+    """Wherever along the fingers they are expected: one of these places has the tips on the bar's rim."""
+    scenario = bar_before_the_tips(z_m, size_z_m, level_dn)
+    assert simulator(scenario).outline_seen(0).tips.max() < 0.7, "it hides them"
+    for slide_m in np.linspace(-0.03, 0.012, 15).tolist():
+        _, ends = looked_at(scenario, slide_m)
+        assert not ends.sure and ends.seen.max() < 2
+
+
+@pytest.mark.parametrize("scenario", [PLAIN, Scenario(name="usual", duration_s=1.0)], ids=["plain", "usual"])
+@pytest.mark.parametrize("slide_m", [-9e-3, -6e-3, -4.5e-3, 3e-3, 4.5e-3, 6e-3, 9e-3])
+def test_a_pose_that_slid_along_the_fingers_is_not_proven(scenario: Scenario, slide_m: float):
+    """Most edges agree there; the fingers go on beyond where it has their ends, or end before."""
+    found, ends = looked_at(scenario, slide_m)
+    assert found.trusted and abs(slide_of(found)) > 2.5e-3, "measured there, or nearly"
+    assert not ends.sure and ends.seen.max() < 2
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.7, 2.0])
+@pytest.mark.parametrize("from_tip_m", [0.004, 0.006, 0.009])
+def test_where_a_tone_of_the_fingers_begins_is_not_their_end(from_tip_m: float, gain: float):
+    """The slid pose shows corners there, and its tip edges; that the edges along the fingers go on gives it away."""
+    scenario = toned(from_tip_m, gain)
+    found, ends = looked_at(scenario, -from_tip_m)
+    assert found.trusted and abs(slide_of(found) + from_tip_m) < 1e-3
+    assert found.corners.usable.sum() >= 4, "corners are seen"
+    assert not ends.sure and ends.seen.max() < 2
+    assert looked_at(scenario)[1].sure, "the true ends are"
+
+
+@pytest.mark.parametrize(("z_m", "size_z_m", "rim_m"), [(-0.010, 0.03, -0.0143), (-0.012, 0.02, -0.0109)])
+def test_corners_that_a_rim_makes_with_the_fingers_are_none(z_m: float, size_z_m: float, rim_m: float):
+    """It cuts both fingers and goes on beside them: a corner a finger is seen there, and none counts."""
+    found, ends = looked_at(bar_before_the_tips(z_m, size_z_m, 120.0), rim_m)
+    assert abs(slide_of(found) - rim_m) < 1e-3 and found.corners.usable.sum() == 2
+    np.testing.assert_array_equal(ends.seen, 0)
+
+
+def test_the_prediction_that_is_kept_between_frames_is_the_one_that_is_looked_at():
+    """The same meter on the true pose, on a slid one, and on the true one again."""
+    using, image = meter(), picture(toned(0.006, 0.5))
+    for slide_m, sure in ((0.0, True), (-6e-3, False), (0.0, True)):
+        found = measure(image, slid(slide_m), using=using)
+        assert using.ends(image, found).sure is sure
+        assert using.ends(image, found).sure is sure, "and once more with what was kept"
+
+
+def test_before_a_background_full_of_lines_most_corners_at_the_ends_count():
+    """A line that happens to lie on a finger's continuation, or beside it, is seldom long and strong enough."""
+    using, counted = meter(), []
+    scenario = make_scenario("clutter", duration_s=8.0, fps=4.0)
+    for index in range(24):
+        image = picture(scenario, index)
+        found = measure(image, using=using)
+        counted.append(using.ends(image, found).seen.sum())
+    assert np.mean(counted) > 3.3
+
+
+# --- counting ---
+
+
+def test_ends_are_sure_when_two_fingers_show_four_corners_or_the_only_one_two():
+    def sure(seen: list[int], might: list[int]) -> bool:
+        return FingerEndsSeen(np.array(seen), np.array(might)).sure
+
+    assert sure([2, 2], [3, 3]) and sure([3, 1], [3, 3]) and sure([2, 2, 0], [3, 3, 3]) and sure([2, 1, 1], [3, 3, 3])
+    assert not sure([2, 1], [3, 3]) and not sure([1, 1], [3, 3]) and not sure([4, 0], [4, 4]), "one finger may be bent"
+    assert sure([2], [4]) and sure([2, 0], [3, 1]) and not sure([1, 0], [3, 1]), "the view has no more"
+    assert not sure([1, 1], [1, 1]) and not sure([0, 0], [0, 0]), "none can be proven"
+
+
+# --- grippers ---
+
+
+def test_edges_along_the_fingers_are_those_of_the_way_that_most_of_them_go():
+    gripper = box_gripper()
+    along = {name for name, flag in zip(gripper.edge_ids, along_fingers(gripper), strict=True) if flag}
+    assert along == {name for name in gripper.edge_ids if name.endswith("_along")}
+    boxes = gripper_from_dict(two_fingers_model())
+    way = np.diff(boxes.points_grip_m()[boxes.edge_points], axis=1)[:, 0]
+    np.testing.assert_array_equal(along_fingers(boxes), np.abs(way[:, 2]) > 0.01)
+
+
+@pytest.mark.parametrize("cube", [load_gripper(CUBE), gripper_from_dict(cube_model())], ids=["visp_cube", "cube"])
+def test_a_gripper_without_a_direction_has_all_its_corners_for_ends(cube: Gripper):
+    assert along_fingers(cube).all()
+    pose = np.eye(4)
+    turn = np.deg2rad([35.0, 25.0, 10.0])
+    for axis, angle in enumerate(turn):
+        c, s = np.cos(angle), np.sin(angle)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        about = np.eye(4)
+        about[[i, i, j, j], [i, j, i, j]] = [c, -s, s, c]
+        pose = about @ pose
+    middle = cube.points_grip_m().mean(axis=0)
+    pose[:3, 3] = np.array([0.0, 0.0, 0.35]) - pose[:3, :3] @ middle
+    image = Simulator(make_camera(PAPER_LENS), cube, pose, PLAIN, 1).render(0)
+    using = meter(cube)
+    found = using.measure(image, pose, cube.jaw_nominal_m, 0.9, NARROW)
+    ends = using.ends(image, found)
+    visible, usable = found.prediction.corners.visible, found.corners.usable
+    assert usable.sum() >= 5
+    assert ends.might.tolist() == [visible.sum()] and ends.seen.tolist() == [usable.sum()]
+    assert ends.sure

@@ -1,0 +1,292 @@
+"""Bounds at a stated risk: quantiles against samples, refits against fits of kept rows, the promise against truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from gripmon.integrity import Hypotheses, Separation, bounds, hypotheses_of, levels, separate
+from gripmon.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
+
+# --- quantiles ---
+
+VARIANCES = [
+    (1.0, 0.0, 0.0),
+    (1.0, 1.0, 1.0),
+    (1.0, 0.5, 0.1),
+    (1.0, 0.3, 0.0),
+    (1.0, 0.2, 0.2),
+    (1.0, 0.5, 0.5),
+    (1.0, 0.8, 0.7),
+    (1.0, 1.0, 0.0),
+    (1.0, 0.9, 0.01),
+    (1.0, 0.03, 0.02),
+]
+NORMAL = np.random.default_rng(1).normal(size=(400_000, 3))
+
+
+def turned(variances: tuple[float, ...], seed: int = 2) -> np.ndarray:
+    """(3, 3) covariance with these variances along directions at random, of the size that a pose's has."""
+    axes, _ = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))
+    return 1e-10 * (axes * variances) @ axes.T
+
+
+@pytest.mark.parametrize("risk", [1e-1, 1e-2, 1e-3])
+@pytest.mark.parametrize("variances", VARIANCES)
+def test_normal_errors_exceed_their_bound_as_often_as_stated(variances: tuple[float, ...], risk: float):
+    """Up to 1.3 times as often, which is one per cent of the bound; as rarely as a third where two axes are as long."""
+    axes, _ = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))
+    errors = 1e-5 * (NORMAL * np.sqrt(variances)) @ axes.T
+    [radius] = bounds(turned(variances)[None], np.array([risk]))
+    share = float((np.linalg.norm(errors, axis=1) > radius).mean())
+    scatter = 4.0 * np.sqrt(risk / len(errors))
+    assert 0.27 * risk - scatter < share < 1.3 * risk + scatter
+    one_or_three = min(variances) == 1.0 or max(variances[1:]) == 0.0
+    assert not one_or_three or abs(share - risk) < scatter, "there it is exact"
+
+
+@pytest.mark.parametrize("directions", [1, 3])
+def test_bounds_of_one_direction_and_of_three_equal_ones_are_those_of_chi_square(directions: int):
+    risks = 10.0 ** np.array([-0.6, -1.0, -3.3, -5.0, -7.7, -9.0, -11.9])
+    covariance = turned((1.0,) * directions + (0.0,) * (3 - directions))
+    found = bounds(np.repeat(covariance[None], len(risks), axis=0), risks)
+    np.testing.assert_allclose(found, 1e-5 * np.sqrt(stats.chi2.isf(risks, directions)), rtol=5e-3)
+
+
+def test_far_out_a_bound_is_exceeded_hardly_more_often_than_stated():
+    """Of all others the longest axis says at least, three as long as that at most."""
+    risks = 10.0 ** np.array([-5.0, -7.0, -9.0, -12.0])
+    for variances in VARIANCES:
+        found = bounds(np.repeat(turned(variances)[None], len(risks), axis=0), risks)
+        assert (found > 0.999e-5 * np.sqrt(stats.chi2.isf(risks, 1))).all()
+        assert (found < 1.001e-5 * np.sqrt(stats.chi2.isf(risks, 3))).all()
+    # Two directions beside one, equally long: by integrating over it, as chi-square of 2 is exponential.
+    x = np.linspace(0.0, 12.0, 200_001)
+    for two in (0.2, 0.5, 0.8, 0.95):
+        radii = bounds(np.repeat(turned((1.0, two, two))[None], len(risks), axis=0), risks)
+        for risk, radius in zip(risks, 1e5 * radii, strict=True):
+            rest = np.exp(-np.maximum(radius**2 - x * x, 0.0) / (2.0 * two))
+            beyond = 2.0 * np.trapezoid(stats.norm.pdf(x) * rest, x)
+            assert 0.2 * risk < beyond < 1.35 * risk
+
+
+def test_bounds_grow_with_the_covariance_and_as_the_risk_falls_and_stay_finite():
+    risks = np.concatenate([[0.0, 1e-300], np.geomspace(1e-14, 0.9, 200)])
+    found = bounds(np.repeat(turned((1.0, 0.4, 0.1))[None], len(risks), axis=0), risks)
+    assert np.isfinite(found).all() and (found > 0.0).all()
+    assert (np.diff(found) < 1e-12).all()
+    assert found[0] == found[1] == pytest.approx(found[2])
+    larger = bounds(4.0 * np.repeat(turned((1.0, 0.4, 0.1))[None], len(risks), axis=0), risks)
+    np.testing.assert_allclose(larger, 2.0 * found, rtol=1e-9)
+    assert bounds(np.zeros((1, 3, 3)), np.array([1e-5])) < 1e-100
+    assert np.isfinite(bounds(turned((1.0, 0.4, 0.1))[None], np.array([5.0]))).all(), "more than certain"
+
+
+# --- refits ---
+
+
+class Model:
+    """A linear model of v edges with m unknowns: Jacobian rows with normal errors of known size, fitted at once."""
+
+    def __init__(self, rng: np.random.Generator, edges: int = 9, unknowns: int = 6, rows: int = 7) -> None:
+        self.jacobian = rng.normal(size=(edges, rows, unknowns))
+        self.sigma = rng.uniform(0.5, 2.0, (edges, rows))
+        weighted = self.jacobian / self.sigma[..., None] ** 2
+        self.information = np.einsum("vri,vrj->vij", weighted, self.jacobian)
+        self._weighted = weighted
+
+    def pull(self, residual: np.ndarray) -> np.ndarray:
+        """(v, m) of residuals (v, rows)."""
+        return np.einsum("vri,vr->vi", self._weighted, residual)
+
+    def fit(self, measured: np.ndarray, known: np.ndarray, mean: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        """(m,) by least squares on the rows of the kept edges and on what is known, by NumPy."""
+        kept = keep > 0.0
+        root = np.linalg.cholesky(known).T
+        rows = np.concatenate([(self.jacobian / self.sigma[..., None])[kept].reshape(-1, len(mean)), root])
+        values = np.concatenate([(measured / self.sigma)[kept].ravel(), root @ mean])
+        return np.linalg.lstsq(rows, values, rcond=None)[0]
+
+
+@pytest.mark.parametrize("unknowns", [6, 7])
+def test_refits_are_the_fits_of_the_rows_that_are_kept(unknowns: int):
+    rng = np.random.default_rng(3)
+    model = Model(rng, unknowns=unknowns)
+    keep = np.ones((11, 9))
+    keep[1:10] -= np.eye(9)
+    keep[10, :5] = 0.0
+    square = rng.normal(size=(11, unknowns, unknowns))
+    known = square @ square.transpose(0, 2, 1) + 0.1 * np.eye(unknowns)
+    mean = rng.normal(size=(11, unknowns))
+    measured = rng.normal(size=(9, 7))
+    at = rng.normal(size=unknowns)  # anywhere: the sums need not be of a solution
+    pull = model.pull(measured - model.jacobian @ at)
+    known_pull = np.einsum("hij,hj->hi", known, mean - at)
+    found = separate(pull, model.information, model.information, keep, known, known_pull)
+    for k in range(11):
+        expected = model.fit(measured, known[k], mean[k], keep[k])
+        np.testing.assert_allclose(at + found.shift[k], expected, atol=1e-9)
+        covariance = np.linalg.inv(np.einsum("v,vij->ij", keep[k], model.information) + known[k])
+        np.testing.assert_allclose(found.covariance[k], covariance, atol=1e-9)
+
+
+def test_the_covariance_of_a_refit_is_that_of_its_errors_where_weights_and_errors_differ():
+    """Rows err four times as much as their weights say, which ``middle`` knows."""
+    rng = np.random.default_rng(4)
+    model = Model(rng)
+    keep, known = np.ones((2, 9)), np.repeat(0.3 * np.eye(6)[None], 2, axis=0)
+    keep[1, 2:4] = 0.0
+    shifts = []
+    for _ in range(4000):
+        error = 4.0 * model.sigma * rng.normal(size=model.sigma.shape)
+        prior_error = np.sqrt(0.3) * rng.normal(size=(2, 6))  # information times an error of 1 / 0.3
+        found = separate(model.pull(error), model.information, 16.0 * model.information, keep, known, prior_error)
+        shifts.append(found.shift)
+    for k in range(2):
+        sampled = np.cov(np.array(shifts)[:, k].T)
+        ratio = np.linalg.eigvals(np.linalg.solve(found.covariance[k], sampled)).real
+        assert ratio.min() > 0.85 and ratio.max() < 1.15
+
+
+def test_without_anything_that_determines_a_direction_there_is_no_refit():
+    model = Model(np.random.default_rng(5))
+    nothing = np.zeros((1, 6, 6))
+    with pytest.raises(np.linalg.LinAlgError):
+        separate(np.zeros((9, 6)), model.information, model.information, np.zeros((1, 9)), nothing, np.zeros((1, 6)))
+
+
+def test_levels_are_the_distance_and_what_the_covariance_allows_for_position_and_rotation_alone():
+    covariance = np.zeros((2, 6, 6))
+    covariance[:, range(6), range(6)] = [4.0, 0.0, 0.0, 9.0, 9.0, 9.0]
+    covariance[:, 0, 3] = covariance[:, 3, 0] = 1.0  # errors that belong together change neither part
+    shift = np.array([[3.0, 0.0, 4.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, -2.0, 0.0]])
+    risk = np.array([1e-3, 0.1])
+    position, rotation = levels(shift, covariance, risk, 1.5)
+    one, three = np.sqrt(stats.chi2.isf(risk, 1)), np.sqrt(stats.chi2.isf(risk, 3))
+    np.testing.assert_allclose(position, [5.0, 0.0] + 1.5 * 2.0 * one, rtol=5e-3)
+    np.testing.assert_allclose(rotation, [0.0, 2.0] + 1.5 * 3.0 * three, rtol=3e-3)
+
+
+# --- the promise ---
+
+NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side", "b_back")
+FINGER_OF = np.array([0, 0, 0, 0, 1, 1, 1, 1, 1])
+ALONG = np.array([True, True, False, False, True, True, False, False, False])
+
+
+def of_two_fingers(has_opening: bool = False) -> Hypotheses:
+    return hypotheses_of(NAMES, FINGER_OF, ("a", "b"), ALONG, has_opening)
+
+
+def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
+    """The bound of the position: the first fit is published, each hypothesis has the same share of the risk."""
+    shares = risk / len(hypotheses.prior) / hypotheses.prior
+    counted = shares < 1.0
+    away = found.shift[counted] - found.shift[0]
+    return float(levels(away, found.covariance[counted], shares[counted], 1.0)[0].max())
+
+
+def exceeded(model: Model, hypotheses: Hypotheses, risk: float, trials: int, bias: np.ndarray, seed: int) -> float:
+    """Share of trials whose error is beyond the bound, with errors (v, rows) on top of the noise."""
+    rng, count = np.random.default_rng(seed), len(hypotheses.prior)
+    known = np.repeat(1e-6 * np.eye(6)[None], count, axis=0)
+    noise = model.sigma * rng.normal(size=(trials, *model.sigma.shape))
+    beyond = 0
+    for error in noise:
+        pull = model.pull(error + bias)
+        found = separate(pull, model.information, model.information, hypotheses.keep, known, np.zeros((count, 6)))
+        beyond += float(np.linalg.norm(found.shift[0, :3])) > promised(found, hypotheses, risk)
+    return beyond / trials
+
+
+MODEL = Model(np.random.default_rng(6), rows=12)
+DOUBTED = [k for k, name in enumerate(of_two_fingers().name) if "edge" in name]
+
+
+@pytest.mark.parametrize("risk", [1e-1, 1e-2])
+def test_with_nothing_wrong_errors_exceed_the_bound_no_more_often_than_stated(risk: float):
+    trials = 5000
+    hypotheses = of_two_fingers()
+    share = exceeded(MODEL, hypotheses, risk, trials, np.zeros((9, 12)), seed=7)
+    assert share <= risk + 3.0 * np.sqrt(risk / trials)
+
+
+@pytest.mark.parametrize("risk", [1e-2, 1e-3])
+def test_whatever_one_edge_shows_errors_exceed_the_bound_no_more_often_than_its_prior_allows(risk: float):
+    """Each hypothesis has its share of the risk: times its prior, its errors beyond the bound are within that, from a
+    bias that hides in the noise to one that nobody can miss.
+    """
+    hypotheses, trials, worst = of_two_fingers(), 300, 0.0
+    allowed = risk / len(hypotheses.prior) / EDGE
+    for k in DOUBTED:
+        edge = int(np.flatnonzero(hypotheses.keep[k] == 0.0)[0])
+        for size in (0.3, 1.0, 2.0, 4.0, 30.0):
+            bias = np.zeros((9, 12))
+            bias[edge] = size
+            share = exceeded(MODEL, hypotheses, risk, trials, bias, seed=8 + k)
+            assert share <= allowed + 4.0 * np.sqrt(max(allowed, 1.0 / trials) / trials)
+            worst = max(worst, share * hypotheses.prior[k])
+    assert worst <= risk / len(hypotheses.prior) + 4.0 * EDGE / trials
+
+
+def test_an_edge_that_errs_is_beyond_a_bound_that_reckons_with_nothing():
+    """What the one before must be able to see."""
+    hypotheses, blind = of_two_fingers(), hypotheses_of(NAMES, np.zeros(9, dtype=int), ("a",), np.ones(9, bool), False)
+    blind = Hypotheses(blind.name[:1], blind.prior[:1], blind.keep[:1], blind.opening[:1], blind.sudden[:1], 0)
+    bias = np.zeros((9, 12))
+    bias[2] = 4.0
+    assert exceeded(MODEL, blind, 1e-2, 200, bias, seed=9) > 0.8
+    assert exceeded(MODEL, hypotheses, 1e-2, 200, bias, seed=9) < 0.1
+
+
+# --- what may be wrong ---
+
+
+def test_hypotheses_doubt_what_their_names_say():
+    found = of_two_fingers(has_opening=True)
+    doubted = {
+        name: {NAMES[e] for e in np.flatnonzero(keep == 0.0)} for name, keep in zip(found.name, found.keep, strict=True)
+    }
+    a, b = set(NAMES[:4]), set(NAMES[4:])
+    expected = {"nothing is wrong": set()}
+    expected |= {f"edge {name} belongs to something else": {name} for name in NAMES}
+    expected |= {
+        "the ends of finger a belong to something else": {"a_tip", "a_side"},
+        "the ends of finger b belong to something else": {"b_tip", "b_side", "b_back"},
+        "finger a is not where its model says": a,
+        "finger b is not where its model says": b,
+        "the jaw opening is wrong": set(),
+        "what looks like the fingers' ends is something else": {
+            n for n, along in zip(NAMES, ALONG, strict=True) if not along
+        },
+    }
+    assert doubted == expected
+    prior = dict(zip(found.name, found.prior.tolist(), strict=True))
+    assert prior["nothing is wrong"] == prior["what looks like the fingers' ends is something else"] == 1.0
+    assert {p for n, p in prior.items() if n.startswith("edge ")} == {EDGE}
+    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {ONE_FINGERS_ENDS}
+    assert {p for n, p in prior.items() if n.startswith("finger ")} == {FINGER}
+    assert prior["the jaw opening is wrong"] == OPENING
+
+
+def test_hypotheses_say_which_doubt_the_opening_which_begin_suddenly_and_which_is_about_the_ends():
+    found = of_two_fingers(has_opening=True)
+    assert [found.name[k] for k in np.flatnonzero(found.opening)] == ["the jaw opening is wrong"]
+    assert {found.name[k] for k in np.flatnonzero(found.sudden)} == {
+        "finger a is not where its model says",
+        "finger b is not where its model says",
+        "what looks like the fingers' ends is something else",
+    }
+    assert found.name[0] == "nothing is wrong"
+    assert found.name[found.ends] == "what looks like the fingers' ends is something else"
+    np.testing.assert_array_equal(found.keep[found.ends], ALONG)
+    assert not of_two_fingers().opening.any()
+
+
+def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():
+    one = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a", "b"), ALONG[:3], False)
+    assert not any(name.startswith(("finger", "the ends of")) for name in one.name), "one finger, one edge at its end"
+    assert len(one.name) == 1 + 3 + 1 and one.keep.shape == (5, 3)
+    every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), False)
+    np.testing.assert_array_equal(every.keep[every.ends], 1.0)
