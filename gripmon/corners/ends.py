@@ -1,8 +1,8 @@
 """Whether the ends of the fingers are seen as ends: edges that meet in a corner, and none that goes on beyond it.
 
 Edges along a finger say nothing about a motion along it; only its ends do, and a rim, a fold or a plate's border
-parallel to them looks like them.  But such a border goes on beside the finger, and a finger that reaches farther goes on
-beyond it.
+parallel to them looks like them.  But such a border goes on beside the finger, and a finger that reaches farther goes
+on beyond it.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ CLEAR = 2
 """Probes next to a corner that another edge of the finger may run through."""
 
 FROM_THE_CORNER = 3
-"""Probes next to a corner that all show an edge where it doesn't end there but goes on a little: a step on the finger."""
+"""Probes next to a corner that all show an edge where it goes on a little: beyond a step on the finger."""
 
 REACH_PX = 4.0
-"""How far they reach to both sides, px: the shortest that the edge filter takes and that shows the response's decline."""
+"""How far they reach to both sides, px: the shortest that shows the decline of the edge filter's response."""
 
 NEAR_PX = 1.0
 """An edge this near to the continued line is its continuation, px."""
@@ -73,8 +73,8 @@ def along_fingers(gripper: Gripper) -> tuple[Array, NDArray[np.bool_]]:
 
 @dataclass(frozen=True, slots=True)
 class FingerEndsSeen:
-    """(f,) corners at the end of each finger: ``seen`` with nothing that goes on beyond them, and those that ``might`` be
-    seen in this view.
+    """(f,) corners at the end of each finger: ``seen`` with nothing that goes on beyond them, and those that ``might``
+    be seen in this view.
     """
 
     seen: NDArray[np.intp]
@@ -119,7 +119,7 @@ class FingerEnds:
     def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
         """Look beyond the measured corners; takes as long as a fourth of a measurement.
 
-        ``strict``: an edge must not go on by a few pixels either, as beside a step on the finger; clutter looks so, too.
+        ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
         gripper, prediction, corners = self._gripper, measurement.prediction, measurement.corners
         if self._kept is None or self._kept[0] is not prediction:

@@ -167,7 +167,7 @@ class FingertipMeter(FingerMeter):
     def measure_held(
         self, image: Image, cam_T_grip: Array, sigma: Array, jaw_opening_m: float, usual_share: float
     ) -> Measurement:
-        """Measure at a pose (4, 4), with what lies within the standard deviations (6,) of it, m and rad; nowhere else."""
+        """Measure at a pose (4, 4), with what lies within the standard deviations (6,) of it, m and rad, alone."""
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
         held = Expected(cam_T_grip, jaw_opening_m, jaw_opening_m, cam_T_grip, sigma)
         measurement = self._settle(image, held)

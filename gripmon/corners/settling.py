@@ -87,9 +87,11 @@ class Measurement:
     ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_surprise``: the seen jaw opening against the
     reported one (``jaw_reported_m``), in standard deviations of the latter.
 
-    ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far as
-    it is known without the image; ``contradiction``: how much stretches of edges contradict each
-    other, about 1 where they don't.  ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
+    ``normal``: the fit's normal equations edge by edge; ``contradiction``: how much stretches of edges contradict each
+    other, about 1 where they don't; ``jaw_known_m`` with its standard deviation: the opening as far as it is known
+    without the image.
+
+    ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
     """
 

@@ -14,7 +14,7 @@ EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else: a border parallel to it, a pad, a shadow."""
 
 ONE_FINGERS_ENDS = 1e-2
-"""That the ends of one finger do, though corners are seen there; that a finger that shows such corners has others."""
+"""Probability that the ends of one finger do."""
 
 FINGER = 1e-3
 """That a finger isn't where the model has it: bent, shifted in its holder, exchanged."""
@@ -23,11 +23,15 @@ OPENING = 1e-3
 """That the reported jaw opening is wrong by more than its stated standard deviation allows."""
 
 
+MODEL = 1e-2
+"""That the fingers are longer or shorter than the gripper file says: worn, rounded, measured by hand."""
+
+
 @dataclass(frozen=True, slots=True)
 class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
-    the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
+    the gripper was before still counts; ``model`` the number of the one that the gripper file is wrong.  The first is that nothing is wrong; ``ends`` is the number of the one that no
     end of a finger is what it seems.
     """
 
@@ -37,6 +41,7 @@ class Hypotheses:
     opening: NDArray[np.bool_]
     sudden: NDArray[np.bool_]
     ends: int
+    model: int
 
 
 def hypotheses_of(
@@ -46,7 +51,7 @@ def hypotheses_of(
     along: NDArray[np.bool_],
     has_opening: bool,
 ) -> Hypotheses:
-    """All that a fit of these edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) it or an end."""
+    """All that a fit of v edges has to reckon with: ``finger`` (v,) of each, ``along`` (v,) the finger or an end."""
     count = len(edge_names)
     rows: list[tuple[str, float, NDArray[Any], bool, bool]] = []
     whole = np.ones(count)
@@ -62,9 +67,11 @@ def hypotheses_of(
             rows.append((f"finger {name} is not where its model says", FINGER, ~own, False, True))
     if has_opening:
         rows.append(("the jaw opening is wrong", OPENING, whole, True, False))
+    model = len(rows)
+    rows.append(("the fingers are longer or shorter than the gripper file says", MODEL, whole, False, False))
     ends = len(rows)
     rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
     names, prior, keep, opening, sudden = zip(*rows, strict=True)
     return Hypotheses(
-        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends
+        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends, model
     )

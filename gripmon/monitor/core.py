@@ -320,6 +320,7 @@ class Monitor:
             doubtful,
             self._standing.protection,
             self._standing.where_it_was,
+            self._trust.swing,
         )
 
     def _since_start(self, shift: Array) -> Array | None:

@@ -102,7 +102,7 @@ class Refits:
             return Protection(0.0, 0.0, risk, "")
         shift, covariance = separation.shift[counted, :6], separation.covariance[counted, :6, :6].copy()
         covariance[:, range(6), range(6)] += self._floor
-        covariance += self._of_model / INFLATION**2
+        covariance[counted == self._hypotheses.model] += self._of_model / INFLATION**2
         position, rotation = levels(shift - self._published, covariance, risk / len(prior) / prior[counted], INFLATION)
         worst = int(np.argmax(position))
         return Protection(

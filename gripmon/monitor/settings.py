@@ -68,7 +68,7 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             description="standard deviation of each finger's length in the gripper file, for the protection level; none "
             "where edges were taught (m)",
         ),
-    ] = 5e-5
+    ] = 1e-4
     corners: MeasurementSettings = MeasurementSettings()
     smoothing: SmoothingSettings = SmoothingSettings()
     drift: DriftSettings = DriftSettings()

@@ -118,7 +118,8 @@ class Integrity:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self._swing: Array = np.zeros(6)
+        self.swing: Array = np.zeros(6)
+        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
         self._unexplained: Array | None = None
         self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
         self._kept: tuple[bytes, Hypotheses] | None = None
@@ -143,16 +144,32 @@ class Integrity:
         self._frames += 1
         if due or self._short(trust) or trust.displaced or self.anchor is None:
             trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        if trust.displaced:
-            if trust.proven:
-                ends = self._tracker.ends(frame, measurement, strict=True)
-                trust = self.weigh(measurement, cam_T_grip, ends, now_s)
-            if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
-                trust = replace(trust, proven=False)
-            rival = self._at_its_place(frame, now_s)
-            if rival is not None and (rival[3].proven or not trust.proven):
-                measurement, cam_T_grip, covariance, trust = rival
-        return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        if not trust.displaced:
+            return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        confirmed = self._confirmations(measurement, trust.ends, None) >= CORNERS_WHERE_EXPECTED
+        if trust.proven:
+            ends = self._tracker.ends(frame, measurement, strict=True)
+            trust = self.weigh(measurement, cam_T_grip, ends, now_s)
+        if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
+            trust = replace(trust, proven=False)
+        rival = self._at_its_place(frame, now_s)
+        if rival is None or (trust.proven and not rival[3].proven):
+            standing = self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
+        else:
+            standing = self._conclude(frame, *rival, now_s)
+            confirmed = confirmed and not rival[3].proven
+        return self._between(standing, cam_T_grip) if confirmed and not trust.proven else standing
+
+    def _between(self, standing: Standing, other_T: Array) -> Standing:
+        """The same where the gripper may as well be at another pose (4, 4)."""
+        away, bound = perturbation_between(standing.cam_T_grip, other_T), standing.protection
+        farther = Protection(
+            bound.position_m + float(np.linalg.norm(away[:3])),
+            bound.rotation_rad + float(np.linalg.norm(away[3:])),
+            bound.risk,
+            "the fingers' ends are seen elsewhere, too",
+        )
+        return replace(standing, protection=farther, believed=False)
 
     def held(self, frame: Frame, now_s: float) -> Standing | None:
         """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
@@ -278,7 +295,7 @@ class Integrity:
         lasting[hypotheses.ends] = misread
         alone = now = fits.bound(fits.free, lasting, risk)
         if anchor is None:
-            return Trust(now, now, proven, displaced)
+            return Trust(now, now, proven, displaced, ends=ends)
         jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
         possible = np.where(holds, prior, 0.0)
         sudden = fits.bound(anchored, possible, risk)
@@ -315,8 +332,8 @@ class Integrity:
         if self.anchor is not None:
             square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
             # A knock is no vibration, but what rings after it is.
-            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self._swing
-            self._swing = self._swing + (np.minimum(square, DISPLACED * noise) - self._swing) / SWINGS
+            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
+            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
         bound = trust.alone
         if self.anchor is None and trust.displaced:
             # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
@@ -345,8 +362,8 @@ class Integrity:
     def _wander(self, now_s: float) -> Array:
         """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
         if self.anchor is None:
-            return self._swing
-        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self._swing
+            return self.swing
+        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
 
     def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
         key = edges.tobytes()

@@ -52,6 +52,9 @@ _MOTION_KINDS = {AlertKind.STEP: "a step", AlertKind.CREEP: "a creep", AlertKind
 
 NO_EXPLANATION = Explanation()
 
+SWINGS = 3.0
+"""Standard deviations of a vibrating camera's way that are no drift."""
+
 RELIEF = 0.8
 """Part of a limit below which what was said to be past it no longer is."""
 
@@ -64,6 +67,7 @@ class Evidence:
     the jaw is not where it should be), and whether the stream of frames is at fault (so that stamps or the camera's
     calibration may not hold).  ``protection``: bounds on the transform's error; None where there are none.
     ``where_it_was``: the gripper is where it proved to be before, so that no second frame has to say so.
+    ``swing`` (6,): variance of the way between one proven pose and the next, m² and rad²; None where that isn't known.
     """
 
     shift: Array
@@ -77,6 +81,16 @@ class Evidence:
     stream_at_fault: bool = False
     protection: Protection | None = None
     where_it_was: bool = False
+    swing: Array | None = None
+
+    @property
+    def moved(self) -> bool:
+        """Whether the camera has moved, by more than it swings to and fro anyway."""
+        if not self.motion.present or self.swing is None:
+            return self.motion.present
+        # Of whole vectors: a slow beat along one axis belongs to the vibration along another.
+        way, swing = np.square(self.motion.shift), SWINGS**2 * self.swing
+        return bool(way[:3].sum() > swing[:3].sum() or way[3:].sum() > swing[3:].sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +118,7 @@ class Policy:
 
     def measured(self, evidence: Evidence, now_s: float, stamp_ns: int) -> Judgement:
         """A frame from which a transform could be measured."""
-        settings, motion, probable = self._settings, evidence.motion, evidence.explanation.probable
+        settings, probable = self._settings, evidence.explanation.probable
         self._bad_since_s = None
         self._since_jump = 1 if evidence.jumped else self._since_jump + 1
         self._count_still(evidence)
@@ -117,7 +131,7 @@ class Policy:
         elif past_limit and self._may_recalibrate and not unreliable:
             state = State.RECALIBRATING
             recalibrate = self._still >= settings.settle_frames
-        elif motion.present:
+        elif evidence.moved:
             state = State.DRIFTING
         else:
             state = State.TRACKING
@@ -276,7 +290,7 @@ class Policy:
         alerts = book.absent(VIEW, "the gripper is measured again", now_s)
         alerts += book.absent(IMAGE, "images are good again", now_s)
         # What lies in the gripper or the lens is told once, as that.
-        if motion.present and (not not_the_camera or book.about(MOTION) is not None):
+        if evidence.moved and (not not_the_camera or book.about(MOTION) is not None):
             alerts += book.present(MOTION, self._motion_alert(evidence), now_s, stamp_ns)
         else:
             alerts += book.absent(MOTION, "the camera is where the reference has it", now_s)
