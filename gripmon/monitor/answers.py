@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -47,11 +48,15 @@ def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
 
 
-def protection_of(covariance: Array, risk: float) -> Protection:
-    """Bounds where nothing but the covariance (6, 6) is known of the error."""
-    both = np.stack([covariance[:3, :3], covariance[3:, 3:]])
-    position_m, rotation_rad = bounds(both, np.full(2, risk)).tolist()
-    return Protection(position_m, rotation_rad, risk, "nothing is wrong")
+def grown(protection: Protection, growth: Array) -> Protection:
+    """The bounds of a transform that is held, with the covariance (6, 6) of what may have happened since on top."""
+    both = np.stack([growth[:3, :3], growth[3:, 3:]])
+    position_m, rotation_rad = bounds(both, np.full(2, protection.risk)).tolist()
+    return msgspec.structs.replace(
+        protection,
+        position_m=protection.position_m + position_m,
+        rotation_rad=protection.rotation_rad + rotation_rad,
+    )
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:
