@@ -43,7 +43,7 @@ that the rate of knocks over all the time says too little.
 """
 
 CORNERS_WHERE_EXPECTED = 3
-"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere it takes two fingers' four."""
+"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
 from gripmon.geometry import invert, rotation_angle, to_record
+from gripmon.gripper import Gripper
 from gripmon.integrity import bounds
-from gripmon.policy import Evidence
+from gripmon.monitor.trust import Standing
+from gripmon.policy import Evidence, Judgement
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -20,6 +22,9 @@ from gripmon.records import (
     CornerRecord,
     Drift,
     Explanation,
+    Frame,
+    FrameRecord,
+    Origin,
     Protection,
     ReferenceRecord,
     Refusal,
@@ -79,6 +84,38 @@ def corner_records(
         for name, (u, v), sigma, fault, used in zip(
             names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, taken.tolist(), strict=True
         )
+    )
+
+
+def measured_record(
+    frame: Frame,
+    reference: ReferenceRecord,
+    judgement: Judgement,
+    standing: Standing,
+    gripper: Gripper,
+    taken: NDArray[np.bool_],
+) -> FrameRecord:
+    """The record of a frame whose pose stands, without what rests on other frames; ``taken`` (c,): corners used."""
+    measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
+    return FrameRecord(
+        seq=frame.seq,
+        stamp_ns=frame.stamp_ns,
+        verdict=judgement.verdict,
+        state=judgement.state,
+        source=Origin.UPDATE,
+        cam_T_grip=to_record(cam_T_grip),
+        covariance=flat(standing.covariance),
+        smoothed=None,
+        drift=None,
+        reference_id=reference.reference_id,
+        revision=reference.revision,
+        rms_px=measurement.corner_rms_px(cam_T_grip),
+        jaw_opening_m=measurement.jaw_opening_m if gripper.has_jaw else None,
+        corners=corner_records(measurement, gripper.corner_ids, taken),
+        alerts=(),
+        reason=judgement.reason,
+        name=frame.name,
+        protection=standing.protection,
     )
 
 

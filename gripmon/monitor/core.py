@@ -19,12 +19,12 @@ from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
 from gripmon.monitor.answers import (
     after_restart,
-    corner_records,
     drift_between,
     flat,
     frozen,
     gripper_astray,
     grown,
+    measured_record,
     of_stream,
     smoothed_record,
     unmeasured_corners,
@@ -203,9 +203,9 @@ class Monitor:
                 self._restarted = False
                 alerts = (after_restart(self.reference, evidence), *alerts)
         before = self.reference
-        alerts += self._renew(frame, measurement, evidence, judgement)
+        alerts += self._renew(frame, standing, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
-        return self._record(frame, judgement, origin, alerts, measurement)
+        return self._record(frame, judgement, origin, alerts, standing)
 
     def _follow(self, measurement: Measurement, evidence: Evidence) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
@@ -219,22 +219,14 @@ class Monitor:
         if motion.stepped and not evidence.jumped:
             self._average.step(motion.step_frames)
 
-    def _renew(
-        self, frame: Frame, measurement: Measurement, evidence: Evidence, judgement: Judgement
-    ) -> tuple[Alert, ...]:
+    def _renew(self, frame: Frame, standing: Standing, evidence: Evidence, judgement: Judgement) -> tuple[Alert, ...]:
         """Past the limit, or when an operator wants it: still frames are collected, and become a new reference."""
-        assert self._covariance is not None and self._standing is not None
-        renewal, still_frames = self._renewal, self._policy.still_frames
-        collects = judgement.state is State.RECALIBRATING or renewal.wanted
-        if not collects or still_frames <= 1:
-            renewal.moved()
-        if not collects or not self._standing.believed:
-            return ()
-        renewal.still(frame, measurement, self._cam_T_grip, self._covariance)
-        if not (judgement.recalibrate or (renewal.wanted and still_frames >= self._settings.policy.settle_frames)):
-            return ()
         before = self.reference
-        alerts = renewal.recalibrate(self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns)
+        if not self._renewal.collect(frame, standing, judgement):
+            return ()
+        alerts = self._renewal.recalibrate(
+            self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns
+        )
         if self.reference is not before:
             self._begin()
         return alerts
@@ -404,34 +396,15 @@ class Monitor:
         )
 
     def _record(
-        self,
-        frame: Frame,
-        judgement: Judgement,
-        origin: Origin,
-        alerts: tuple[Alert, ...],
-        measurement: Measurement,
+        self, frame: Frame, judgement: Judgement, origin: Origin, alerts: tuple[Alert, ...], standing: Standing
     ) -> FrameRecord:
-        assert self._covariance is not None
-        taken = self._tracker.taken(measurement, self._settings.update_corners)
-        return FrameRecord(
-            seq=frame.seq,
-            stamp_ns=frame.stamp_ns,
-            verdict=judgement.verdict,
-            state=judgement.state,
+        taken = self._tracker.taken(standing.measurement, self._settings.update_corners)
+        return msgspec.structs.replace(
+            measured_record(frame, self.reference, judgement, standing, self._gripper, taken),
             source=origin,
-            cam_T_grip=to_record(self._cam_T_grip),
-            covariance=flat(self._covariance),
             smoothed=smoothed_record(self._average, self._tracker.floor),
             drift=self._drift(),
-            reference_id=self.reference.reference_id,
-            revision=self.reference.revision,
-            rms_px=measurement.corner_rms_px(self._cam_T_grip),
-            jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
-            corners=corner_records(measurement, self._gripper.corner_ids, taken),
             alerts=(*self._noted(), *alerts),
-            reason=judgement.reason,
-            name=frame.name,
-            protection=None if self._standing is None else self._standing.protection,
         )
 
     def _noted(self) -> list[Alert]:
