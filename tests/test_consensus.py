@@ -170,6 +170,80 @@ def test_an_edge_of_the_background_instead_of_one_of_the_gripper_is_noticed(name
     assert miss_px(consensus) < 0.35 or nees < 25.0 or consensus.share < SETTINGS.trusted_share
 
 
+def left_out(offset_px: np.ndarray) -> tuple[float, str | None]:
+    """How much the edges contradict each other, and which one is left out for it."""
+    votes = votes_for(candidates(np.arange(SAMPLES), offset_px), NO_FLOORS)
+    contradiction = assess(votes, agree(votes, REPORTED, np.zeros(7), SETTINGS), PRIOR).contradiction
+    found = without_one_edge(votes, REPORTED, np.zeros(7), SETTINGS, contradiction)
+    if found is None:
+        return contradiction, None
+    gone = [e for e in SAMPLED if not found[0].weight[PREDICTION.layout.edge == e].any()]
+    assert len(gone) == 1 and found[2].contradiction < contradiction / 3.0
+    return contradiction, GRIPPER.edge_ids[gone[0]]
+
+
+def test_the_one_edge_that_contradicts_all_others_is_left_out():
+    """A quarter of a px beside its place, with which the fit bends a little: less than a third of it stays then."""
+    rng, right, wrong, trials = np.random.default_rng(11), 0, 0, 0
+    for edge in [e for e in SAMPLED if not GRIPPER.edge_ids[e].endswith("tip_near")] * 4:
+        offset_px = PREDICTION.jacobian @ XI + rng.normal(scale=0.1, size=SAMPLES)
+        offset_px[PREDICTION.layout.edge == edge] += 0.25
+        contradiction, name = left_out(offset_px)
+        if contradiction > CONTRADICTION:
+            trials += 1
+            right += name == GRIPPER.edge_ids[edge]
+            wrong += name not in (None, GRIPPER.edge_ids[edge])
+    assert trials > 12 and right > 0.8 * trials and wrong <= 0.1 * trials
+
+
+def test_no_edge_is_left_out_where_all_of_them_contradict_each_other():
+    """Stretches err together everywhere: some edge is the worst, but without it hardly less is left."""
+    rng = np.random.default_rng(12)
+    for _ in range(8):
+        of_stretch = rng.normal(scale=0.2, size=PREDICTION.layout.stretch.max() + 1)
+        noise = rng.normal(scale=0.1, size=SAMPLES) + of_stretch[PREDICTION.layout.stretch]
+        contradiction, name = left_out(PREDICTION.jacobian @ XI + noise)
+        assert contradiction > CONTRADICTION and name is None
+
+
+def in_texture(rng: np.random.Generator, edge: int, true_share: float, texture: int) -> Candidates:
+    """All edges where they are but one, of which a share of the profiles shows it, each among so many random ones."""
+    mine = np.flatnonzero(PREDICTION.layout.edge == edge)
+    offset_px = PREDICTION.jacobian @ XI + rng.normal(scale=0.1, size=SAMPLES)
+    shown = np.setdiff1d(np.arange(SAMPLES), mine[rng.random(len(mine)) >= true_share])
+    random = np.repeat(mine, texture)
+    random_px = rng.uniform(-REACH_PX, REACH_PX, len(random))
+    return candidates(np.concatenate([shown, random]), np.concatenate([offset_px[shown], random_px]))
+
+
+def seen_in_texture(true_share: float, texture: int, trials: int = 40) -> float:
+    """How often the edge in the texture counts as seen."""
+    rng, seen = np.random.default_rng(5), 0
+    for trial in range(trials):
+        edge = int(SAMPLED[trial % len(SAMPLED)])
+        seen += bool(fit(in_texture(rng, edge, true_share, texture)).edge_seen[edge])
+    return seen / trials
+
+
+@pytest.mark.parametrize(
+    ("true_share", "texture", "least", "most"),
+    [
+        pytest.param(0.0, 1, 0.0, 0.0, id="sparse texture alone"),
+        pytest.param(0.0, 4, 0.0, 0.0, id="texture alone"),
+        pytest.param(0.0, 12, 0.0, 0.0, id="texture that supports four profiles of five by chance"),
+        pytest.param(0.5, 1, 0.95, 1.0, id="half an edge among few"),
+        pytest.param(0.9, 6, 0.95, 1.0, id="nearly all of it where chance supports half"),
+        pytest.param(0.5, 6, 0.0, 0.5, id="half of it where chance supports half"),
+        pytest.param(0.9, 12, 0.0, 0.2, id="nearly all of it where chance supports as much"),
+    ],
+)
+def test_an_edge_counts_as_seen_by_what_exceeds_chance_and_its_scatter(
+    true_share: float, texture: int, least: float, most: float
+):
+    """Four standard deviations of the number that chance supports, which is binomial: fewer where it supports most."""
+    assert least <= seen_in_texture(true_share, texture) <= most
+
+
 def test_an_edge_that_chance_alone_supports_does_not_count_as_seen():
     """In dense texture a third of the profiles has a candidate near any line at all."""
     rng = np.random.default_rng(10)
