@@ -98,6 +98,23 @@ def test_a_small_motion_is_no_contradiction():
     assert agreement.supports(RISK, 0) and not agreement.contradicts(RISK, 0)
 
 
+def test_a_pose_where_most_patches_agree_is_not_contradicted_by_a_slightly_better_one():
+    def agreement(here: int) -> LookAgreement:
+        agree = np.array([[here], [32]])
+        odds = 4.0 * agree - 21.0
+        return LookAgreement(np.ones((2, 1)), agree, np.full((2, 1), 32), odds)
+
+    assert not agreement(28).contradicts(RISK)
+    assert not agreement(16).contradicts(RISK)
+    assert agreement(15).contradicts(RISK) and not agreement(15).contradicts(RISK, 1)
+
+
+def test_one_finger_is_enough_to_contradict():
+    agree = np.array([[2, 12], [12, 12]])
+    agreement = LookAgreement(np.ones((2, 2)), agree, np.full((2, 2), 12), 4.0 * agree - 8.0)
+    assert agreement.contradicts(RISK) and not agreement.contradicts(RISK, 1)
+
+
 def test_one_pose_says_what_it_says_among_several():
     simulation, look = ordinary()
     truth = simulation.truth(24)

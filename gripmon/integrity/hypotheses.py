@@ -31,8 +31,8 @@ MODEL = 1e-2
 class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
-    the gripper was before still counts; ``model`` the number of the one that the gripper file is wrong.  The first is that nothing is wrong; ``ends`` is the number of the one that no
-    end of a finger is what it seems.
+    the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
+    end of a finger is what it seems, ``model`` that of a wrong gripper file.
     """
 
     name: tuple[str, ...]

@@ -140,7 +140,7 @@ class GripperLook:
 
     def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> bool:
         """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s.  About 1 ms, the
-        first time 40 ms.
+        first time 0.1 s, when the patches are laid out.
 
         False, and nothing learnt, while the background is the same as in the last frame that was: it would be taken for
         the gripper's; and while no finger is in view.

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.spatial import QhullError
 
 from gripmon.camera import Camera
 from gripmon.geometry import invert
@@ -136,9 +138,6 @@ def _fill_between_edges(camera: Camera, ends_cam_m: Array, depth_m: Array) -> No
     """Depths (h, w) inside the hull of a finger's visible edges (e, 2, 3), which has no faces: exact on planes that its
     edges surround.
     """
-    from scipy.interpolate import LinearNDInterpolator  # slow to load, and rarely needed
-    from scipy.spatial import QhullError
-
     share = np.linspace(0.0, 1.0, EDGE_SAMPLES)[:, None, None]
     along = ((1.0 - share) * ends_cam_m[:, 0] + share * ends_cam_m[:, 1]).reshape(-1, 3)
     uv_px = camera.project(along)

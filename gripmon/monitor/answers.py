@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
 from gripmon.geometry import invert, rotation_angle, to_record
+from gripmon.gripper import Gripper
 from gripmon.integrity import bounds
-from gripmon.policy import Evidence
+from gripmon.monitor.trust import Standing
+from gripmon.policy import Evidence, Judgement
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -19,6 +22,9 @@ from gripmon.records import (
     CornerRecord,
     Drift,
     Explanation,
+    Frame,
+    FrameRecord,
+    Origin,
     Protection,
     ReferenceRecord,
     Refusal,
@@ -47,11 +53,15 @@ def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
 
 
-def protection_of(covariance: Array, risk: float) -> Protection:
-    """Bounds where nothing but the covariance (6, 6) is known of the error."""
-    both = np.stack([covariance[:3, :3], covariance[3:, 3:]])
-    position_m, rotation_rad = bounds(both, np.full(2, risk)).tolist()
-    return Protection(position_m, rotation_rad, risk, "nothing is wrong")
+def grown(protection: Protection, growth: Array) -> Protection:
+    """The bounds of a transform that is held, with the covariance (6, 6) of what may have happened since on top."""
+    both = np.stack([growth[:3, :3], growth[3:, 3:]])
+    position_m, rotation_rad = bounds(both, np.full(2, protection.risk)).tolist()
+    return msgspec.structs.replace(
+        protection,
+        position_m=protection.position_m + position_m,
+        rotation_rad=protection.rotation_rad + rotation_rad,
+    )
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:
@@ -74,6 +84,38 @@ def corner_records(
         for name, (u, v), sigma, fault, used in zip(
             names, corners.uv_px.tolist(), corners.sigma_px.tolist(), corners.fault, taken.tolist(), strict=True
         )
+    )
+
+
+def measured_record(
+    frame: Frame,
+    reference: ReferenceRecord,
+    judgement: Judgement,
+    standing: Standing,
+    gripper: Gripper,
+    taken: NDArray[np.bool_],
+) -> FrameRecord:
+    """The record of a frame whose pose stands, without what rests on other frames; ``taken`` (c,): corners used."""
+    measurement, cam_T_grip = standing.measurement, standing.cam_T_grip
+    return FrameRecord(
+        seq=frame.seq,
+        stamp_ns=frame.stamp_ns,
+        verdict=judgement.verdict,
+        state=judgement.state,
+        source=Origin.UPDATE,
+        cam_T_grip=to_record(cam_T_grip),
+        covariance=flat(standing.covariance),
+        smoothed=None,
+        drift=None,
+        reference_id=reference.reference_id,
+        revision=reference.revision,
+        rms_px=measurement.corner_rms_px(cam_T_grip),
+        jaw_opening_m=measurement.jaw_opening_m if gripper.has_jaw else None,
+        corners=corner_records(measurement, gripper.corner_ids, taken),
+        alerts=(),
+        reason=judgement.reason,
+        name=frame.name,
+        protection=standing.protection,
     )
 
 

@@ -17,16 +17,15 @@ from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
 from gripmon.gripper import Gripper
 from gripmon.inspection import inspect
-from gripmon.look import LookRefused
 from gripmon.monitor.answers import (
     after_restart,
-    corner_records,
     drift_between,
     flat,
     frozen,
     gripper_astray,
+    grown,
+    measured_record,
     of_stream,
-    protection_of,
     smoothed_record,
     unmeasured_corners,
 )
@@ -119,13 +118,7 @@ class Monitor:
         last = None if state is None else state.cam_T_grip
         self._located = last is not None  # here, or before a restart
         self._cam_T_grip = self._ref_cam_T_grip if last is None else from_record(last)
-        self.look_refused: str | None = None
-        """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
-        if state is not None and state.look is not None:
-            try:
-                self._trust.look.restore(state.look, self.reference.reference_id)
-            except LookRefused as refused:
-                self.look_refused = str(refused)
+        self._trust.resume(None if last is None else self._cam_T_grip, self.reference, state)
         if state is not None:
             self._policy.alerts.restore(state.alerts, state.alerts_raised, self._now_s)
             self._watch.resume(moved=self._policy.drifting)
@@ -134,6 +127,11 @@ class Monitor:
     def reference(self) -> ReferenceRecord:
         """The calibration that drift is measured against now."""
         return self._renewal.book.current
+
+    @property
+    def look_refused(self) -> str | None:
+        """Why the look that was kept over a restart isn't used; None where it is, or none was kept."""
+        return self._trust.look_refused
 
     @property
     def proposal(self) -> ReferenceRecord | None:
@@ -160,7 +158,7 @@ class Monitor:
             self._renewal.book.proposal,
             alerts=self._policy.alerts.open,
             alerts_raised=self._policy.alerts.raised,
-            cam_T_grip=to_record(self._cam_T_grip) if self._located else None,
+            cam_T_grip=to_record(self._trust.last_known(self._cam_T_grip)) if self._located else None,
             reference_error=None if error is None else tuple(error.tolist()),
             look=self._trust.look.state(self.reference.reference_id),
         )
@@ -180,9 +178,10 @@ class Monitor:
                 refusal=refusal[0],
                 explanation=of_stream(faults),
             )
-        measurement = self._newest = self._tracker.measure(frame, self._cam_T_grip, self._rivals())
         before_T = self._cam_T_grip
-        standing = self._stand(frame, measurement)
+        rivals = self._trust.rivals(self._ref_cam_T_grip)
+        measurement = self._newest = self._tracker.measure(frame, before_T, rivals)
+        standing = self._trust.judge(frame, measurement, self._now_s)
         if standing is None:
             explanation = self._explain(frame, measurement, wrong=True)
             return self._unmeasured(
@@ -193,15 +192,8 @@ class Monitor:
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
-        motion = evidence.motion
         if standing.believed:
-            self._tracker.learn(measurement)
-            if evidence.jumped:
-                self._average.forget()
-            quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
-            self._average.add(self._cam_T_grip, self._covariance, quiet)
-            if motion.stepped and not evidence.jumped:
-                self._average.step(motion.step_frames)
+            self._follow(measurement, evidence)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
@@ -211,38 +203,30 @@ class Monitor:
                 self._restarted = False
                 alerts = (after_restart(self.reference, evidence), *alerts)
         before = self.reference
-        alerts += self._renew(frame, measurement, evidence, judgement)
+        alerts += self._renew(frame, standing, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
-        return self._record(frame, judgement, origin, alerts, measurement)
+        return self._record(frame, judgement, origin, alerts, standing)
 
-    def _stand(self, frame: Frame, measurement: Measurement) -> Standing | None:
-        """Where the gripper is by a measurement, and what may rest on it; None where it isn't seen."""
-        if not measurement.trusted:
-            return self._trust.held(frame, self._now_s)
-        measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
-        return self._trust.judge(frame, measurement, *self._tracker.update(measurement), self._now_s)
-
-    def _rivals(self) -> tuple[Array, ...]:
-        """Where else the gripper may be: where it proved to be last, and where the reference has it."""
-        anchor = self._trust.anchor
-        return (self._ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, self._ref_cam_T_grip)
-
-    def _renew(
-        self, frame: Frame, measurement: Measurement, evidence: Evidence, judgement: Judgement
-    ) -> tuple[Alert, ...]:
-        """Past the limit, or when an operator wants it: still frames are collected, and become a new reference."""
+    def _follow(self, measurement: Measurement, evidence: Evidence) -> None:
+        """The gripper is where it was measured: averages and what is learnt follow."""
         assert self._covariance is not None
-        renewal, still_frames = self._renewal, self._policy.still_frames
-        collects = judgement.state is State.RECALIBRATING or renewal.wanted
-        if not collects or still_frames <= 1:
-            renewal.moved()
-        if not collects:
-            return ()
-        renewal.still(frame, measurement, self._cam_T_grip, self._covariance)
-        if not (judgement.recalibrate or (renewal.wanted and still_frames >= self._settings.policy.settle_frames)):
-            return ()
+        self._tracker.learn(measurement)
+        motion = evidence.motion
+        if evidence.jumped:
+            self._average.forget()
+        quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
+        self._average.add(self._cam_T_grip, self._covariance, quiet)
+        if motion.stepped and not evidence.jumped:
+            self._average.step(motion.step_frames)
+
+    def _renew(self, frame: Frame, standing: Standing, evidence: Evidence, judgement: Judgement) -> tuple[Alert, ...]:
+        """Past the limit, or when an operator wants it: still frames are collected, and become a new reference."""
         before = self.reference
-        alerts = renewal.recalibrate(self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns)
+        if not self._renewal.collect(frame, standing, judgement):
+            return ()
+        alerts = self._renewal.recalibrate(
+            self._drift(), self._cam_T_grip, evidence.explanation, self._now_s, frame.stamp_ns
+        )
         if self.reference is not before:
             self._begin()
         return alerts
@@ -321,6 +305,7 @@ class Monitor:
             self._standing.protection,
             self._standing.where_it_was,
             self._trust.swing,
+            self._standing.believed,
         )
 
     def _since_start(self, shift: Array) -> Array | None:
@@ -356,12 +341,9 @@ class Monitor:
             done, text = False, str(refusal)
         if self.reference is not before:
             self._begin()
-        state = self._told_state() if command.name in (CommandName.STATE, CommandName.SNAPSHOT) else None
+        wanted = command.name in (CommandName.STATE, CommandName.SNAPSHOT)
+        state = msgspec.structs.replace(self.state(), look=None) if wanted else None  # nobody reads a look
         return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision, state)
-
-    def _told_state(self) -> MonitorState:
-        """The state for people: without what only a restart needs."""
-        return msgspec.structs.replace(self.state(), look=None)
 
     def _begin(self) -> None:
         """Drift is reckoned from the reference in force."""
@@ -410,38 +392,19 @@ class Monitor:
             covariance=flat(self._covariance + growth),
             smoothed=smoothed_record(self._average, self._tracker.floor + growth),
             drift=self._drift(),
-            protection=protection_of(self._covariance + growth, self._settings.policy.integrity_risk),
+            protection=grown(self._standing.protection, growth) if self._standing else None,
         )
 
     def _record(
-        self,
-        frame: Frame,
-        judgement: Judgement,
-        origin: Origin,
-        alerts: tuple[Alert, ...],
-        measurement: Measurement,
+        self, frame: Frame, judgement: Judgement, origin: Origin, alerts: tuple[Alert, ...], standing: Standing
     ) -> FrameRecord:
-        assert self._covariance is not None
-        taken = self._tracker.taken(measurement, self._settings.update_corners)
-        return FrameRecord(
-            seq=frame.seq,
-            stamp_ns=frame.stamp_ns,
-            verdict=judgement.verdict,
-            state=judgement.state,
+        taken = self._tracker.taken(standing.measurement, self._settings.update_corners)
+        return msgspec.structs.replace(
+            measured_record(frame, self.reference, judgement, standing, self._gripper, taken),
             source=origin,
-            cam_T_grip=to_record(self._cam_T_grip),
-            covariance=flat(self._covariance),
             smoothed=smoothed_record(self._average, self._tracker.floor),
             drift=self._drift(),
-            reference_id=self.reference.reference_id,
-            revision=self.reference.revision,
-            rms_px=measurement.corner_rms_px(self._cam_T_grip),
-            jaw_opening_m=measurement.jaw_opening_m if self._gripper.has_jaw else None,
-            corners=corner_records(measurement, self._gripper.corner_ids, taken),
             alerts=(*self._noted(), *alerts),
-            reason=judgement.reason,
-            name=frame.name,
-            protection=None if self._standing is None else self._standing.protection,
         )
 
     def _noted(self) -> list[Alert]:

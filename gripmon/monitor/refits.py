@@ -38,8 +38,8 @@ class ModelError(NamedTuple):
     def of_pose(self, inverse: Array, information: Array, edge: NDArray[np.intp], rotation: Array) -> Array:
         """(6, 6) covariance of the pose by that: a finger that is longer pulls by all its edges together.
 
-        ``inverse`` (m, m) of the normal matrix, ``information`` (v, m, m) of the edges ``edge`` (v,), ``rotation`` (3, 3)
-        from gripper to camera.
+        ``inverse`` (m, m) of the normal matrix, ``information`` (v, m, m) of the edges ``edge`` (v,), ``rotation``
+        (3, 3) from gripper to camera.
         """
         out = np.zeros((6, 6))
         finger = self.finger[edge]

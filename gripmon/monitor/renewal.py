@@ -11,7 +11,8 @@ from gripmon.geometry import from_record, perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
-from gripmon.policy import NO_REFERENCE, Policy
+from gripmon.monitor.trust import Standing
+from gripmon.policy import NO_REFERENCE, Judgement, Policy
 from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
 from gripmon.records import (
     Alert,
@@ -26,6 +27,7 @@ from gripmon.records import (
     MonitorState,
     ReferenceRecord,
     Severity,
+    State,
 )
 from gripmon.references import CommandRefused, ReferenceBook
 
@@ -44,6 +46,7 @@ class Renewal:
     ):
         """``floor`` (6, 6): covariance of the systematic error.  ValueError for a state that doesn't hold together."""
         self._gripper, self._policy, self._settings = gripper, policy, settings.recalibration
+        self._settle_frames = settings.policy.settle_frames
         self._recalibrator = Recalibrator(
             settings.recalibration, gripper, floor, CORNER_COUNTS[settings.recalibrate_corners]
         )
@@ -59,6 +62,19 @@ class Renewal:
     def moved(self) -> None:
         """The camera doesn't stand still, or needs no new reference: begin to collect anew."""
         self._recalibrator.forget()
+
+    def collect(self, frame: Frame, standing: Standing, judgement: Judgement) -> bool:
+        """Past the limit, or when an operator wants it, collect a frame whose pose is believed: whether there are
+        enough to measure the reference anew.
+        """
+        still_frames = self._policy.still_frames
+        collects = judgement.state is State.RECALIBRATING or self.wanted
+        if not collects or still_frames <= 1:
+            self.moved()
+        if not collects or not standing.believed:
+            return False
+        self.still(frame, standing.measurement, standing.cam_T_grip, standing.covariance)
+        return judgement.recalibrate or (self.wanted and still_frames >= self._settle_frames)
 
     def still(self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array) -> None:
         """One more frame of a camera that stands still."""

@@ -65,8 +65,8 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         Meta(
             ge=0.0,
             le=0.01,
-            description="standard deviation of each finger's length in the gripper file, for the protection level; none "
-            "where edges were taught (m)",
+            description="standard deviation of each finger's length in the gripper file, for the protection level; "
+            "none where edges were taught (m)",
         ),
     ] = 1e-4
     corners: MeasurementSettings = MeasurementSettings()

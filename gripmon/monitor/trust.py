@@ -1,96 +1,49 @@
-"""How far a measured transform may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+"""Which pose is published, and what may rest on it: where a measurement and the anchor differ, one has to prove itself.
 
-Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
-looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
-creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+A pose that isn't where the gripper was is believed when the fingers' ends are seen there as ends and the gripper's
+learned look doesn't contradict: mounts are knocked rarely, objects hide fingers in every grasp.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.camera import Camera
-from gripmon.corners import Effort, FingerEndsSeen, Measurement
-from gripmon.geometry import from_record, perturbation_between
+from gripmon.corners import Effort, Measurement
+from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
-from gripmon.integrity import Hypotheses, bounds, hypotheses_of
-from gripmon.look import GripperLook
-from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, Refits, larger
+from gripmon.look import GripperLook, LookRefused
+from gripmon.monitor.anchor import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.policy import past_alert_limit
-from gripmon.records import Array, Frame, Protection, ReferenceRecord
-
-SECONDS_A_MONTH = 30.0 * 86400.0
+from gripmon.records import Array, Frame, MonitorState, Protection, ReferenceRecord
 
 PROOF_EVERY = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""
 
-SWINGS = 20.0
-"""Proven frames over which the mount's vibration is learnt."""
-
-DISPLACED = 33.1
-"""Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
-
-MISREAD_END = 0.1
-"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
-border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
-"""
-
-LOOK_RISK = 1e-3
-"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
-
 ALONG_Z = np.array([0.0, 0.0, 1.0])
 """The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
 
-KNOCKED_UNSEEN = 5e-4
-"""Probability that the mount is knocked while something hides the fingers' ends: that is when the gripper touches things,
-so that the rate of knocks over all the time says too little.
-"""
 
-CORNERS_WHERE_EXPECTED = 3
-"""Such corners that prove a pose where the gripper is expected: two fingers' four do anywhere."""
+class _Candidate(NamedTuple):
+    """A place where the gripper may be: its measurement, the pose (4, 4) with its covariance (6, 6), and its worth."""
 
-
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """A pose (4, 4) that has proved itself, the ``covariance`` (6, 6) of its error, bounds of position and rotation that
-    rest on its frame alone, and when.
-    """
-
+    measurement: Measurement
     cam_T_grip: Array
     covariance: Array
-    position_m: float
-    rotation_rad: float
-    now_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Trust:
-    """What one measurement is worth.
-
-    ``protection`` of the pose that was asked about, ``alone`` what the frame by itself bounds; ``proven``: the fingers' ends are seen as such; ``displaced``: the
-    pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
-    ``instead``: pose and covariance that the anchor and the rest of the edges give under the most probable hypothesis,
-    with its number; None where there is none.
-    """
-
-    protection: Protection
-    alone: Protection
-    proven: bool
-    displaced: bool = False
-    ambiguous: bool = False
-    instead: tuple[int, Array, Array] | None = None
-    ends: FingerEndsSeen | None = None
+    trust: Trust
 
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``; ``believed``: the gripper may be taken to be
-    there, so that averages, the drift test and what is learnt may rest on it; ``where_it_was``: the anchor has it there.
+    """What is published of a ``measurement``: pose (4, 4), covariance (6, 6) and ``protection``.
+
+    ``believed``: the gripper may be taken to be there, so that averages, the drift test and what is learnt may rest on
+    it; ``where_it_was``: the anchor has it there.
     """
 
     measurement: Measurement
@@ -102,7 +55,7 @@ class Standing:
 
 
 class Integrity:
-    """Bounds for one monitor's frames, and the anchor that they rest on."""
+    """Decides for one monitor's frames, one after the other."""
 
     def __init__(
         self,
@@ -112,284 +65,164 @@ class Integrity:
         settings: MonitorSettings,
         reference: ReferenceRecord,
     ):
-        self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
-        self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
-        self._floor = np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
-        creep = settings.smoothing
-        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self.swing: Array = np.zeros(6)
-        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
-        self._unexplained: Array | None = None
-        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
-        self._kept: tuple[bytes, Hypotheses] | None = None
-        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
-        axis = tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z
-        self.look = GripperLook(camera, gripper, axis)
-        """The gripper's own look, the second witness."""
+        self._tracker, self._policy = tracker, settings.policy
+        self._weigher = Weigher(tracker, gripper, settings, reference)
+        self._look = GripperLook(camera, gripper, tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z)
+        self.look_refused: str | None = None
+        """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._frames = 0
         self._moved = 0
-        self.anchor: Anchor | None = None
+        self._believed = False
 
-    def forget(self) -> None:
-        """Nothing is known of where the gripper is."""
-        self.anchor = None
+    @property
+    def look(self) -> GripperLook:
+        """The gripper's own look, the second witness."""
+        return self._look
 
-    def judge(
-        self, frame: Frame, measurement: Measurement, cam_T_grip: Array, covariance: Array, now_s: float
-    ) -> Standing:
-        """What to publish of a measured pose (4, 4) with its covariance (6, 6), and what may rest on it."""
-        trust = self.weigh(measurement, cam_T_grip, None, now_s)
+    @property
+    def swing(self) -> Array:
+        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
+        return self._weigher.swing
+
+    def rebase(self, reference: ReferenceRecord) -> None:
+        """There is a new reference."""
+        self._weigher.rebase(reference)
+
+    def resume(self, last_T: Array | None, reference: ReferenceRecord, state: MonitorState | None) -> None:
+        """Go on after a restart: from the pose (4, 4) that was known last, with the look that was learnt."""
+        self._weigher.rebase(reference, last_T)
+        if state is not None and state.look is not None:
+            try:
+                self._look.restore(state.look, reference.reference_id)
+            except LookRefused as refused:
+                self.look_refused = str(refused)
+
+    def last_known(self, cam_T_grip: Array) -> Array:
+        """The newest pose (4, 4) if it was believed, else the anchor's."""
+        anchor = self._weigher.anchor
+        return cam_T_grip if self._believed or anchor is None else anchor.cam_T_grip
+
+    def rivals(self, ref_cam_T_grip: Array) -> tuple[Array, ...]:
+        """Where else the gripper may be: where it proved to be last, and where the reference has it."""
+        anchor = self._weigher.anchor
+        return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
+
+    def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
+        """What to publish of a measurement, and what may rest on it; None where the gripper isn't seen."""
+        if measurement.trusted:
+            measurement = self._tracker.with_known_jaw(measurement, frame.jaw_opening_m)
+            standing: Standing | None = self._judge(frame, measurement, now_s)
+        else:
+            standing = self._held(frame, now_s)
+        self._believed = standing is not None and standing.believed
+        return standing
+
+    def _judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing:
+        weigh = self._weigher.weigh
+        cam_T_grip, covariance = self._tracker.update(measurement)
+        trust = weigh(measurement, cam_T_grip, None, now_s)
         due = self._frames % PROOF_EVERY == 0
         self._frames += 1
-        if due or self._short(trust) or trust.displaced or self.anchor is None:
-            trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+        if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
+            trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+        here = _Candidate(measurement, cam_T_grip, covariance, trust)
         if not trust.displaced:
-            return self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
-        confirmed = self._confirmations(measurement, trust.ends, None) >= CORNERS_WHERE_EXPECTED
+            return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
-            trust = self.weigh(measurement, cam_T_grip, ends, now_s)
-        if trust.proven and self._look_contradicts(frame, measurement, cam_T_grip):
-            trust = replace(trust, proven=False)
-        rival = self._at_its_place(frame, now_s)
-        if rival is None or (trust.proven and not rival[3].proven):
-            standing = self._conclude(frame, measurement, cam_T_grip, covariance, trust, now_s)
-        else:
-            standing = self._conclude(frame, *rival, now_s)
-            confirmed = confirmed and not rival[3].proven
-        return self._between(standing, cam_T_grip) if confirmed and not trust.proven else standing
+            strictly = weigh(measurement, cam_T_grip, ends, now_s)
+            proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
+            here = here._replace(trust=replace(strictly, proven=proven))
+        return self._against_its_place(frame, here, trust, now_s)
 
-    def _between(self, standing: Standing, other_T: Array) -> Standing:
-        """The same where the gripper may as well be at another pose (4, 4)."""
-        away, bound = perturbation_between(standing.cam_T_grip, other_T), standing.protection
-        farther = Protection(
-            bound.position_m + float(np.linalg.norm(away[:3])),
-            bound.rotation_rad + float(np.linalg.norm(away[3:])),
-            bound.risk,
-            "the fingers' ends are seen elsewhere, too",
-        )
-        return replace(standing, protection=farther, believed=False)
-
-    def held(self, frame: Frame, now_s: float) -> Standing | None:
-        """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing proved
-        that place, or nothing of the fingers' ends is seen there.
+    def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
+        """A displaced pose against the gripper's place: the one that is proven, else the place, where the mount rarely
+        leaves it.  ``at_first``: what the displaced one was worth at the first look.
         """
-        rival = None if self.anchor is None else self._at_its_place(frame, now_s)
-        if rival is None or (self._short(rival[3]) and rival[3].instead is None):
+        there = self._at_its_place(frame, now_s)
+        proven = here.trust.proven
+        if there is None or (proven and not there.trust.proven):
+            standing = self._conclude(frame, here, now_s)
+        else:
+            standing, proven = self._conclude(frame, there, now_s), there.trust.proven
+        seen = self._weigher.confirmations(here.measurement, at_first.ends)
+        if proven or seen < CORNERS_WHERE_EXPECTED:
+            return standing
+        return _reaching(standing, here.cam_T_grip)
+
+    def _held(self, frame: Frame, now_s: float) -> Standing | None:
+        """For a frame in which the gripper wasn't found: what it shows where the gripper was.  None where nothing
+        proved that place, or too little is seen there.
+        """
+        there = None if self._weigher.anchor is None else self._at_its_place(frame, now_s)
+        if there is None:
             return None
-        standing = self._conclude(frame, *rival, now_s)
+        standing = self._conclude(frame, there, now_s)
         return None if past_alert_limit(standing.protection, self._policy) else standing
 
-    def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
-        """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""
-        if not self.look.ready or frame.image is None:
-            return False
-        expected_T = self._expected[0] if self.anchor is None else self.anchor.cam_T_grip
-        poses = np.stack([cam_T_grip, expected_T])
-        return self.look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
-
-    def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
-        """Whether the gripper's look is seen at a pose (4, 4)."""
-        if not self.look.ready or frame.image is None:
-            return False
-        return self.look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_RISK)
-
-    def _conclude(
-        self,
-        frame: Frame,
-        measurement: Measurement,
-        cam_T_grip: Array,
-        covariance: Array,
-        trust: Trust,
-        now_s: float,
-    ) -> Standing:
-        """What to publish of a weighed pose, and whether it becomes the anchor."""
-        rests_on_anchor = False
-        if trust.instead is not None and (trust.displaced or self._short(trust)) and not trust.proven:
-            # What the frame leaves open the anchor tells.
-            number, cam_T_grip, covariance = trust.instead
-            seen = self._look_supports(frame, measurement, cam_T_grip)
-            trust = self.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
-            rests_on_anchor = True
-        # A knock is rare: it must be seen, twice where the gripper had to be looked for.
-        where_it_was = self.anchor is not None and not trust.displaced
-        self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
-        near = measurement.effort is Effort.NARROW
-        moved = self._moved >= (1 if near else self._policy.confirm_frames)
-        if trust.proven and (moved or not trust.displaced):
-            self._settle(trust, cam_T_grip, covariance, now_s)
-            if frame.image is not None and not moved:
-                self.look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
-        believed = moved or not (trust.displaced or rests_on_anchor) or (trust.proven and trust.ambiguous)
-        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
-
-    def _at_its_place(self, frame: Frame, now_s: float) -> tuple[Measurement, Array, Array, Trust] | None:
+    def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
         """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
         look like their ends elsewhere.
         """
-        anchor = self.anchor
-        expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
-        sigma = np.sqrt(covariance.diagonal() + self._wander(now_s) + self._floor)
-        measurement = self._tracker.measure_held(frame, expected_T, sigma)
+        weigher = self._weigher
+        measurement = self._tracker.measure_held(frame, weigher.expected[0], weigher.sigma(now_s))
         if measurement.consensus.share == 0.0:
             return None
         measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
-        trust = self.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        return None if trust.displaced else (measurement, cam_T_grip, covariance, trust)
+        trust = weigher.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
+        return None if trust.displaced else _Candidate(measurement, cam_T_grip, covariance, trust)
 
-    def _confirmations(
-        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None
-    ) -> int:
-        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
-        further corner.  ``kept`` (v,): the measured edges that count.
-        """
-        fingers = len(self._gripper.finger_ids)
-        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
-        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
-        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
-        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
-        return int((by_edge * np.maximum(corners, 1)).sum())
+    def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
+        """What to publish of a place, and whether it becomes the anchor."""
+        measurement, cam_T_grip, covariance, trust = candidate
+        if trust.instead is not None and not trust.proven and (trust.displaced or self._short(trust)):
+            return self._by_anchor(frame, measurement, trust, now_s)
+        where_it_was = self._weigher.anchor is not None and not trust.displaced
+        # A knock is rare: it must be seen, twice where the gripper had to be looked for.
+        self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
+        moved = self._moved >= (1 if measurement.effort is Effort.NARROW else self._policy.confirm_frames)
+        if trust.proven and (moved or not trust.displaced):
+            self._weigher.settle(trust, cam_T_grip, covariance, now_s)
+            if frame.image is not None and not moved:
+                self._look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
+        believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
+        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
+
+    def _by_anchor(self, frame: Frame, measurement: Measurement, trust: Trust, now_s: float) -> Standing:
+        """What the frame leaves open the anchor tells."""
+        assert trust.instead is not None
+        number, cam_T_grip, covariance = trust.instead
+        self._moved = 0
+        seen = self._look_supports(frame, measurement, cam_T_grip)
+        trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
+        return Standing(measurement, cam_T_grip, covariance, trust.protection, believed=False, where_it_was=True)
+
+    def _look_contradicts(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen where the gripper was, and so much less here that it can't be here."""
+        if not self._look.ready or frame.image is None:
+            return False
+        poses = np.stack([cam_T_grip, self._weigher.expected[0]])
+        return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
+
+    def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
+        """Whether the gripper's look is seen at a pose (4, 4)."""
+        if not self._look.ready or frame.image is None:
+            return False
+        return self._look.compare(frame.image, cam_T_grip, measurement.jaw_opening_m).supports(LOOK_RISK)
 
     def _short(self, trust: Trust) -> bool:
         """Whether the bound is above the alert limit."""
         return past_alert_limit(trust.protection, self._policy) is not None
 
-    def weigh(
-        self,
-        measurement: Measurement,
-        cam_T_grip: Array,
-        ends: FingerEndsSeen | None,
-        now_s: float,
-        explained: int | None = None,
-        look_seen: bool = False,
-    ) -> Trust:
-        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
 
-        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
-        """
-        risk, edges = self._policy.integrity_risk, measurement.normal.edge
-        if not len(edges):
-            nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
-            return Trust(nothing, nothing, False)
-        hypotheses = self._hypotheses(edges)
-        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor, self._model)
-        anchor = self.anchor
-        wander = self._wander(now_s)
-        expected_T, covariance = self._expected if anchor is None else (anchor.cam_T_grip, anchor.covariance)
-        anchored = fits.anchored(expected_T, covariance + np.diag(wander))
-        # What would need a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= DISPLACED
-        displaced = not holds[0] and explained is None
-        corners = 0 if ends is None else int(ends.seen.sum())
-        proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
-        kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else MISREAD_END ** self._confirmations(measurement, ends, kept)
-        if look_seen:
-            misread *= LOOK_RISK
-        prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread
-        lasting = np.where(hypotheses.sudden, 0.0, prior)
-        lasting[hypotheses.ends] = misread
-        alone = now = fits.bound(fits.free, lasting, risk)
-        if anchor is None:
-            return Trust(now, now, proven, displaced, ends=ends)
-        jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
-        possible = np.where(holds, prior, 0.0)
-        sudden = fits.bound(anchored, possible, risk)
-        as_then = self._as_then(fits, anchor, wander)
-        if not displaced:
-            alone = min(alone, as_then, key=lambda bound: bound.position_m)
-        if not (displaced or jumped):
-            # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
-            lasting[hypotheses.ends] = 0.0
-            now = as_then
-            if explained is None:
-                now = min(now, fits.bound(fits.free, lasting, risk), key=lambda bound: bound.position_m)
-        ambiguous = bool((possible[1:] > 0.0).any())
-        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
-        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
-        protection = larger(larger(now, sudden), self._as_found())
-        return Trust(protection, alone, proven, displaced, displaced and ambiguous, instead, ends)
-
-    def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
-        """The anchor's own bounds for a pose near it."""
-        away = perturbation_between(anchor.cam_T_grip, fits.cam_T_grip)
-        risk = self._policy.integrity_risk
-        crept = np.stack([np.diag(wander[:3]), np.diag(wander[3:])])
-        crept_m, crept_rad = bounds(crept, np.full(2, risk)).tolist()
-        return Protection(
-            anchor.position_m + float(np.linalg.norm(away[:3])) + crept_m,
-            anchor.rotation_rad + float(np.linalg.norm(away[3:])) + crept_rad,
-            risk,
-            "where it was is as uncertain",
-        )
-
-    def _settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
-        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one, bounded by itself."""
-        if self.anchor is not None:
-            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
-            # A knock is no vibration, but what rings after it is.
-            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
-        bound = trust.alone
-        if self.anchor is None and trust.displaced:
-            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
-            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
-        self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
-
-    def rebase(self, reference: ReferenceRecord) -> None:
-        """There is a new reference: what an older one left unexplained is over."""
-        self._expected = from_record(reference.cam_T_grip), np.reshape(reference.covariance, (6, 6))
-        self._unexplained = None
-
-    def _as_found(self) -> Protection:
-        """The bound by what the first frames differed from the reference."""
-        away, risk = self._unexplained, self._policy.integrity_risk
-        if away is None:
-            return Protection(0.0, 0.0, risk)
-        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
-        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
-        return Protection(
-            position_m + float(np.linalg.norm(away[:3])),
-            rotation_rad + float(np.linalg.norm(away[3:])),
-            risk,
-            "at the start it wasn't where the reference has it: knocked before, or the model is off",
-        )
-
-    def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
-        if self.anchor is None:
-            return self.swing
-        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
-
-    def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
-        key = edges.tobytes()
-        if self._kept is None or self._kept[0] != key:
-            self._kept = key, _about(edges, self._gripper, self._tracker, self._may_open)
-        return self._kept[1]
-
-
-def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
-    names = tuple(gripper.edge_ids[edge] for edge in edges)
-    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
-
-
-def foresee_protection(
-    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
-) -> Protection:
-    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
-    if not len(measurement.normal.edge):
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
-    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
-    prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
-    fits = Refits(
-        measurement,
-        measurement.cam_T_grip,
-        hypotheses,
-        np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3),
-        ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger),
+def _reaching(standing: Standing, other_T: Array) -> Standing:
+    """The same where the gripper may as well be at another pose (4, 4)."""
+    away, bound = perturbation_between(standing.cam_T_grip, other_T), standing.protection
+    farther = Protection(
+        bound.position_m + float(np.linalg.norm(away[:3])),
+        bound.rotation_rad + float(np.linalg.norm(away[3:])),
+        bound.risk,
+        "the fingers' ends are seen elsewhere, too",
     )
-    return fits.bound(fits.free, prior, settings.policy.integrity_risk)
+    return replace(standing, protection=farther, believed=False)

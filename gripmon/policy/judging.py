@@ -68,6 +68,7 @@ class Evidence:
     calibration may not hold).  ``protection``: bounds on the transform's error; None where there are none.
     ``where_it_was``: the gripper is where it proved to be before, so that no second frame has to say so.
     ``swing`` (6,): variance of the way between one proven pose and the next, m² and rad²; None where that isn't known.
+    ``believed``: the gripper may be taken to be there.
     """
 
     shift: Array
@@ -82,6 +83,7 @@ class Evidence:
     protection: Protection | None = None
     where_it_was: bool = False
     swing: Array | None = None
+    believed: bool = True
 
     @property
     def moved(self) -> bool:
@@ -124,6 +126,7 @@ class Policy:
         self._count_still(evidence)
         confirmed = evidence.where_it_was or self._since_jump >= settings.confirm_frames
         past_limit = evidence.d_m > settings.limit_m or evidence.delta_rad > settings.limit_rad
+        past_limit = past_limit and evidence.believed
         unreliable = probable.cause in NO_REFERENCE
         recalibrate = False
         if not confirmed and self.state in (State.ACQUIRING, State.LOST, State.OCCLUDED):

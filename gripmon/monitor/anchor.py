@@ -1,0 +1,264 @@
+"""How far a measured pose may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+
+Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
+looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
+creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.geometry import from_record, perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, Refits, larger
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.records import Array, Protection, ReferenceRecord
+
+SECONDS_A_MONTH = 30.0 * 86400.0
+
+SWINGS = 20.0
+"""Proven frames over which the mount's vibration is learnt."""
+
+DISPLACED = 33.1
+"""Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
+
+MISREAD_END = 0.1
+"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
+border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
+"""
+
+LOOK_RISK = 1e-3
+"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+
+KNOCKED_UNSEEN = 5e-4
+"""Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
+that the rate of knocks over all the time says too little.
+"""
+
+CORNERS_WHERE_EXPECTED = 3
+"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """A pose (4, 4) that has proved itself, the ``covariance`` (6, 6) of its error, bounds of position and rotation
+    that rest on its frame alone, and when.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    position_m: float
+    rotation_rad: float
+    now_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What one measurement is worth.
+
+    ``protection`` of the pose that was asked about, ``alone`` what the frame by itself bounds; ``proven``: the fingers'
+    ends are seen as such; ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a
+    knock of the mount explains that, too.  ``instead``: pose and covariance that the anchor and the rest of the edges
+    give under the most probable hypothesis, with its number; None where there is none.  ``ends``: as they were seen.
+    """
+
+    protection: Protection
+    alone: Protection
+    proven: bool
+    displaced: bool = False
+    ambiguous: bool = False
+    instead: tuple[int, Array, Array] | None = None
+    ends: FingerEndsSeen | None = None
+
+
+class Weigher:
+    """Bounds for one monitor's measurements, and the anchor that they rest on."""
+
+    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+        self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
+        self._floor = _floor(settings)
+        creep = settings.smoothing
+        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
+        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
+        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
+        self._kept: tuple[bytes, Hypotheses] | None = None
+        self.swing: Array = np.zeros(6)
+        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
+        self.anchor: Anchor | None = None
+        self.rebase(reference)
+
+    def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
+        """Where to expect the gripper before anything proves it: at a reference, or at the pose (4, 4) that was known
+        last.  What an older reference left unexplained is over.
+        """
+        expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
+        self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
+        self._unexplained: Array | None = None
+
+    @property
+    def expected(self) -> tuple[Array, Array]:
+        """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
+        return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
+
+    def sigma(self, now_s: float) -> Array:
+        """(6,) standard deviations of where it is expected, m and rad."""
+        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor))
+
+    def weigh(
+        self,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        ends: FingerEndsSeen | None,
+        now_s: float,
+        explained: int | None = None,
+        look_seen: bool = False,
+    ) -> Trust:
+        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
+
+        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
+        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
+        """
+        risk, edges = self._policy.integrity_risk, measurement.normal.edge
+        if not len(edges):
+            nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
+            return Trust(nothing, nothing, False)
+        hypotheses = self._hypotheses(edges)
+        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor, self._model)
+        anchor = self.anchor
+        wander = self._wander(now_s)
+        expected_T, covariance = self.expected
+        anchored = fits.anchored(expected_T, covariance + np.diag(wander))
+        # What would need a knock of the mount besides is not what happened.
+        holds = anchored.surprise <= DISPLACED
+        displaced = not holds[0] and explained is None
+        corners = 0 if ends is None else int(ends.seen.sum())
+        proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
+        kept = None if explained is None else hypotheses.keep[explained] > 0.0
+        misread = 0.0 if proven else MISREAD_END ** self.confirmations(measurement, ends, kept)
+        if look_seen:
+            misread *= LOOK_RISK
+        prior = hypotheses.prior.copy()
+        prior[hypotheses.ends] = misread
+        lasting = np.where(hypotheses.sudden, 0.0, prior)
+        lasting[hypotheses.ends] = misread
+        alone = now = fits.bound(fits.free, lasting, risk)
+        if anchor is None:
+            return Trust(now, now, proven, displaced, ends=ends)
+        jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
+        possible = np.where(holds, prior, 0.0)
+        sudden = fits.bound(anchored, possible, risk)
+        as_then = self._as_then(fits, anchor, wander)
+        if not displaced:
+            alone = min(alone, as_then, key=lambda bound: bound.position_m)
+        if not (displaced or jumped):
+            # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
+            lasting[hypotheses.ends] = 0.0
+            now = as_then
+            if explained is None:
+                now = min(now, fits.bound(fits.free, lasting, risk), key=lambda bound: bound.position_m)
+        ambiguous = bool((possible[1:] > 0.0).any())
+        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
+        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
+        protection = larger(larger(now, sudden), self._as_found())
+        return Trust(protection, alone, proven, displaced, displaced and ambiguous, instead, ends)
+
+    def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
+        """The anchor's own bounds for a pose near it."""
+        away = perturbation_between(anchor.cam_T_grip, fits.cam_T_grip)
+        risk = self._policy.integrity_risk
+        crept = np.stack([np.diag(wander[:3]), np.diag(wander[3:])])
+        crept_m, crept_rad = bounds(crept, np.full(2, risk)).tolist()
+        return Protection(
+            anchor.position_m + float(np.linalg.norm(away[:3])) + crept_m,
+            anchor.rotation_rad + float(np.linalg.norm(away[3:])) + crept_rad,
+            risk,
+            "where it was is as uncertain",
+        )
+
+    def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
+        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one, bounded by itself."""
+        if self.anchor is not None:
+            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
+            # A knock is no vibration, but what rings after it is.
+            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
+            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
+        bound = trust.alone
+        if self.anchor is None and trust.displaced:
+            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
+            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
+        self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
+
+    def confirmations(
+        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
+    ) -> int:
+        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
+        further corner.  ``kept`` (v,): the measured edges that count.
+        """
+        fingers = len(self._gripper.finger_ids)
+        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
+        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
+        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
+        return int((by_edge * np.maximum(corners, 1)).sum())
+
+    def _as_found(self) -> Protection:
+        """The bound by what the first frames differed from the reference."""
+        away, risk = self._unexplained, self._policy.integrity_risk
+        if away is None:
+            return Protection(0.0, 0.0, risk)
+        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
+        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
+        return Protection(
+            position_m + float(np.linalg.norm(away[:3])),
+            rotation_rad + float(np.linalg.norm(away[3:])),
+            risk,
+            "at the start it wasn't where the reference has it: knocked before, or the model is off",
+        )
+
+    def _wander(self, now_s: float) -> Array:
+        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
+        if self.anchor is None:
+            return self.swing
+        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
+
+    def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
+        key = edges.tobytes()
+        if self._kept is None or self._kept[0] != key:
+            self._kept = key, _about(edges, self._gripper, self._tracker, self._may_open)
+        return self._kept[1]
+
+
+def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
+    names = tuple(gripper.edge_ids[edge] for edge in edges)
+    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
+
+
+def _floor(settings: MonitorSettings) -> Array:
+    """(6,) variances of the error that no averaging removes."""
+    return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+
+
+def foresee_protection(
+    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
+) -> Protection:
+    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
+    if not len(measurement.normal.edge):
+        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
+    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
+    prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
+    fits = Refits(
+        measurement,
+        measurement.cam_T_grip,
+        hypotheses,
+        _floor(settings),
+        ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger),
+    )
+    return fits.bound(fits.free, prior, settings.policy.integrity_risk)
