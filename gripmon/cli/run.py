@@ -147,6 +147,8 @@ def run_daemon(
         monitor = Monitor(
             config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
         )
+        if monitor.look_refused is not None:
+            _log.warning("%s", monitor.look_refused)
         network = open_network(config)
         opened.callback(network.publisher.close)
         publisher = with_metrics(config, network.publisher)
