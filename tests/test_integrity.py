@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from gripmon.integrity import Hypotheses, Separation, bounds, hypotheses_of, levels, separate
-from gripmon.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
+from gripmon.integrity.hypotheses import EDGE, FINGER, MODEL, ONE_FINGERS_ENDS, OPENING
 
 # --- quantiles ---
 
@@ -200,7 +200,7 @@ def exceeded(model: Model, hypotheses: Hypotheses, risk: float, trials: int, bia
     return beyond / trials
 
 
-MODEL = Model(np.random.default_rng(6), rows=12)
+LINEAR = Model(np.random.default_rng(6), rows=12)
 DOUBTED = [k for k, name in enumerate(of_two_fingers().name) if "edge" in name]
 
 
@@ -208,7 +208,7 @@ DOUBTED = [k for k, name in enumerate(of_two_fingers().name) if "edge" in name]
 def test_with_nothing_wrong_errors_exceed_the_bound_no_more_often_than_stated(risk: float):
     trials = 5000
     hypotheses = of_two_fingers()
-    share = exceeded(MODEL, hypotheses, risk, trials, np.zeros((9, 12)), seed=7)
+    share = exceeded(LINEAR, hypotheses, risk, trials, np.zeros((9, 12)), seed=7)
     assert share <= risk + 3.0 * np.sqrt(risk / trials)
 
 
@@ -224,7 +224,7 @@ def test_whatever_one_edge_shows_errors_exceed_the_bound_no_more_often_than_its_
         for size in (0.3, 1.0, 2.0, 4.0, 30.0):
             bias = np.zeros((9, 12))
             bias[edge] = size
-            share = exceeded(MODEL, hypotheses, risk, trials, bias, seed=8 + k)
+            share = exceeded(LINEAR, hypotheses, risk, trials, bias, seed=8 + k)
             assert share <= allowed + 4.0 * np.sqrt(max(allowed, 1.0 / trials) / trials)
             worst = max(worst, share * hypotheses.prior[k])
     assert worst <= risk / len(hypotheses.prior) + 4.0 * EDGE / trials
@@ -233,11 +233,11 @@ def test_whatever_one_edge_shows_errors_exceed_the_bound_no_more_often_than_its_
 def test_an_edge_that_errs_is_beyond_a_bound_that_reckons_with_nothing():
     """What the one before must be able to see."""
     hypotheses, blind = of_two_fingers(), hypotheses_of(NAMES, np.zeros(9, dtype=int), ("a",), np.ones(9, bool), False)
-    blind = Hypotheses(blind.name[:1], blind.prior[:1], blind.keep[:1], blind.opening[:1], blind.sudden[:1], 0)
+    blind = Hypotheses(blind.name[:1], blind.prior[:1], blind.keep[:1], blind.opening[:1], blind.sudden[:1], 0, 0)
     bias = np.zeros((9, 12))
     bias[2] = 4.0
-    assert exceeded(MODEL, blind, 1e-2, 200, bias, seed=9) > 0.8
-    assert exceeded(MODEL, hypotheses, 1e-2, 200, bias, seed=9) < 0.1
+    assert exceeded(LINEAR, blind, 1e-2, 200, bias, seed=9) > 0.8
+    assert exceeded(LINEAR, hypotheses, 1e-2, 200, bias, seed=9) < 0.1
 
 
 # --- what may be wrong ---
@@ -257,6 +257,7 @@ def test_hypotheses_doubt_what_their_names_say():
         "finger a is not where its model says": a,
         "finger b is not where its model says": b,
         "the jaw opening is wrong": set(),
+        "the fingers are longer or shorter than the gripper file says": set(),
         "what looks like the fingers' ends is something else": {
             n for n, along in zip(NAMES, ALONG, strict=True) if not along
         },
@@ -268,6 +269,7 @@ def test_hypotheses_doubt_what_their_names_say():
     assert {p for n, p in prior.items() if n.startswith("the ends of")} == {ONE_FINGERS_ENDS}
     assert {p for n, p in prior.items() if n.startswith("finger ")} == {FINGER}
     assert prior["the jaw opening is wrong"] == OPENING
+    assert prior[found.name[found.model]] == MODEL and found.name[found.model].startswith("the fingers are longer")
 
 
 def test_hypotheses_say_which_doubt_the_opening_which_begin_suddenly_and_which_is_about_the_ends():
@@ -287,6 +289,6 @@ def test_hypotheses_say_which_doubt_the_opening_which_begin_suddenly_and_which_i
 def test_what_a_gripper_cannot_be_wrong_about_is_no_hypothesis():
     one = hypotheses_of(NAMES[:3], np.zeros(3, dtype=int), ("a", "b"), ALONG[:3], False)
     assert not any(name.startswith(("finger", "the ends of")) for name in one.name), "one finger, one edge at its end"
-    assert len(one.name) == 1 + 3 + 1 and one.keep.shape == (5, 3)
+    assert len(one.name) == 1 + 3 + 2 and one.keep.shape == (6, 3)
     every = hypotheses_of(NAMES, FINGER_OF, ("a", "b"), np.ones(9, dtype=bool), False)
     np.testing.assert_array_equal(every.keep[every.ends], 1.0)

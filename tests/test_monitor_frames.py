@@ -29,7 +29,8 @@ def test_what_the_frame_brings_is_in_the_record():
     record = new_monitor().process(frames[3])
     assert (record.seq, record.stamp_ns, record.name) == (frames[3].seq, frames[3].stamp_ns, frames[3].name)
     assert record.jaw_opening_m == pytest.approx(0.034, abs=1e-4)
-    assert record.latency_ns == 0 and record.reason is None
+    assert record.latency_ns == 0
+    assert (record.verdict, record.reason) == (Verdict.SUSPECT, "not yet confirmed by a second frame")
 
 
 def test_the_trace_belongs_to_the_newest_frame():
@@ -56,4 +57,5 @@ def test_time_is_the_frames_own_and_never_runs_backwards():
     [alert] = earlier.alerts
     assert (alert.kind, alert.cause, earlier.verdict) == (AlertKind.STREAM, Cause.CLOCK, Verdict.SUSPECT)
     assert (same.alerts, same.verdict) == ((), Verdict.VALID)
-    assert to_json(same) == to_json(msgspec.structs.replace(earlier, alerts=(), verdict=Verdict.VALID))
+    assert earlier.reason == "the stream of frames is at fault" and same.reason is None
+    assert to_json(same) == to_json(msgspec.structs.replace(earlier, alerts=(), verdict=Verdict.VALID, reason=None))
