@@ -36,6 +36,7 @@ from test_run_on_the_network import PREFIX, configured, refused, running
 
 from gripmon.cli import main
 from gripmon.metrics import LATENCY_BOUNDS_S, MetricsError, MetricsServer, MetricsSettings
+from gripmon.policy import PolicySettings
 from gripmon.records import AlertEvent, Severity, State, StateRecord, Verdict
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -98,7 +99,7 @@ def test_a_daemon_tells_prometheus_what_it_tells_the_network(tmp_path: Path):
             ("gripmon_frames_per_second", state.frames_per_s),
             ("gripmon_sigma_meters", state.sigma_m),
             ("gripmon_protection_meters", state.protection_m),
-            ("gripmon_alert_limit_meters", 5e-4),
+            ("gripmon_alert_limit_meters", PolicySettings().alert_limit_m),
             ("gripmon_camera_connected", state.camera_connected),
         ):
             assert only(found, name) == value, name

@@ -253,7 +253,7 @@ def test_a_hand_hides_the_fingers_held_then_unknown_then_recovered():
         assert record.cam_T_grip is record.covariance is record.smoothed is record.drift is None
     assert (seen.records[max(held)].stamp_ns - seen.records[held[0]].stamp_ns) <= 1e9, "held for a second"
     back = unknown[-1] + 1
-    assert [r.state for r in seen.records[back : back + 2]] == [State.ACQUIRING, State.TRACKING]
+    assert {r.state for r in seen.records[back : back + 2]} == {State.TRACKING}, "where it was: no second frame says so"
     assert set(seen.verdicts()[back + 1 :]) == {Verdict.VALID}
     assert np.abs(seen.errors()[back:, :2]).max() < 3e-5
     covered = [t.index for t in seen.truths if not any(t.visible)]
