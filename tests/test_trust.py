@@ -1,0 +1,230 @@
+"""What a monitor promises of its transforms while the fingers' ends are hidden, look like something else, or jump.
+
+Whatever happens, no frame is valid, nor any bound stated, that the truth is beyond.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+import pytest
+from meters import box_gripper
+from simulated import PAPER_LENS, nominal_cam_T_grip
+from watched import Watched, new_monitor, watch
+
+from gripmon.camera import make_camera
+from gripmon.monitor import MonitorSettings
+from gripmon.policy import PolicySettings
+from gripmon.recalibrate import RecalibrationSettings
+from gripmon.records import Frame, State, Verdict, to_json
+from gripmon.simulator import FrameTruth, Scenario, Simulator
+from gripmon.simulator.scenario import BentFinger, Bump, ObjectLook, Prop
+
+FPS, BEGINS = 20.0, 16
+"""Frame in which something begins to happen: until then the view is free, and the gripper's place has proved itself."""
+
+BEGINS_S = (BEGINS + 0.4) / FPS
+PLAIN = ObjectLook(pattern="plain", level_dn=120.0)
+RIM = Prop(size_m=(0.2, 0.01, 0.03), centre_m=(0.0, -0.02, -0.010), look=PLAIN, start_s=BEGINS_S)
+"""A bar before the tips, its rims parallel to them: it hides both."""
+
+
+def along_fingers(size_m: float, at_s: float) -> Bump:
+    """The mount is knocked so that the gripper moves along its own fingers in the image."""
+    x, y, z = (size_m * nominal_cam_T_grip()[:3, 2]).tolist()
+    return Bump(at_s=at_s, ring_fraction=0.0, translation_m=(x, y, z))
+
+
+@lru_cache(maxsize=8)
+def frames_of(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
+    simulator = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
+    indices = range(simulator.frame_count)
+    return tuple(simulator.frame(i) for i in indices), tuple(simulator.truth(i) for i in indices)
+
+
+def watched(scenario: Scenario, settings: MonitorSettings | None = None) -> Watched:
+    return watch(*frames_of(scenario), new_monitor(settings))
+
+
+def scene(frames: int, **sections: object) -> Scenario:
+    return Scenario(name="trust", fps=FPS, duration_s=frames / FPS, **sections)  # type: ignore[arg-type]
+
+
+def errors_m(seen: Watched) -> np.ndarray:
+    """(n,) of the published position; NaN where it is held or nothing is published."""
+    return np.asarray(np.linalg.norm(seen.errors()[:, :3], axis=1))
+
+
+def bounds_m(seen: Watched) -> np.ndarray:
+    """(n,) protection levels; NaN where there are none."""
+    return np.array([np.nan if r.protection is None else r.protection.position_m for r in seen.records])
+
+
+def valid(seen: Watched) -> np.ndarray:
+    return np.array([verdict is Verdict.VALID for verdict in seen.verdicts()])
+
+
+def assert_nothing_misleads(seen: Watched) -> None:
+    """Neither a bound that the error exceeds, nor a valid frame with an error beyond its limit."""
+    error, bound = errors_m(seen), bounds_m(seen)
+    known = np.isfinite(error)
+    assert (error[known] <= bound[known]).all(), np.flatnonzero(known)[error[known] > bound[known]]
+    assert (error[valid(seen) & known] <= PolicySettings().alert_limit_m).all()
+
+
+def knocked_behind_a_bar(size_m: float) -> Scenario:
+    """The bar is there for a second, the knock along the fingers in its midst."""
+    hidden = msgspec.structs.replace(RIM, end_s=36.4 / FPS)
+    return scene(48, props=(hidden,), mount=(along_fingers(size_m, 24.4 / FPS),))
+
+
+# --- motions along the fingers ---
+
+
+@pytest.mark.parametrize(("size_m", "within"), [(1e-3, 3), (-1e-3, 3), (-3e-3, 3), (-5e-3, 3), (3e-3, 6), (5e-3, 6)])
+def test_a_knock_along_the_fingers_in_free_view_is_followed_and_never_promised_away(size_m: float, within: int):
+    """Valid again within three frames; towards the background, where the fingers' own long edges lie beside the place
+    that they left, within six.
+    """
+    seen = watched(scene(28, mount=(along_fingers(size_m, BEGINS_S),)))
+    assert_nothing_misleads(seen)
+    assert valid(seen)[2 : BEGINS + 1].all()
+    assert valid(seen)[BEGINS + 1 + within :].all()
+    assert errors_m(seen)[BEGINS + 1 + within :].max() < 2e-4
+
+
+NEVER_FOUND = pytest.mark.xfail(
+    reason="after some doubtful frames nothing is searched for, and a proof needs four corners in one frame: a gripper "
+    "that was knocked by some millimetres behind a bar stays suspect for long after the bar has gone",
+    strict=True,
+)
+
+
+@pytest.mark.parametrize("size_m", [-3e-3, -1e-3, 1e-3, 3e-3])
+def test_a_motion_along_the_fingers_that_nothing_proves_is_suspect_and_not_followed(size_m: float):
+    """The mount is knocked while a bar hides the tips: nobody can know by how much, until they are seen."""
+    seen = watched(knocked_behind_a_bar(size_m))
+    assert_nothing_misleads(seen)
+    assert not valid(seen)[25:37].any()
+    shift_m = [np.linalg.norm(r.drift.tcp_shift_m) for r in seen.records[25:37] if r.drift is not None]
+    assert max(shift_m) < 2e-4 and bounds_m(seen)[25:37].min() > 3e-3
+
+
+@pytest.mark.parametrize(
+    "size_m", [pytest.param(-3e-3, marks=NEVER_FOUND), 1e-3, pytest.param(3e-3, marks=NEVER_FOUND)]
+)
+def test_when_the_tips_are_seen_again_the_motion_is_followed(size_m: float):
+    seen = watched(knocked_behind_a_bar(size_m))
+    assert valid(seen)[40:].all() and errors_m(seen)[40:].max() < 2e-4
+
+
+@pytest.mark.parametrize("sway_m", [0.0, 0.004])
+def test_a_rim_that_stands_in_for_the_tips_moves_nothing(sway_m: float):
+    """It stays, or sways along the fingers by some millimetres: the transform stays where it is."""
+    rim = msgspec.structs.replace(RIM, end_s=32.4 / FPS, sway_m=(0.0, 0.0, sway_m), sway_hz=0.7)
+    seen = watched(scene(40, props=(rim,)))
+    assert_nothing_misleads(seen)
+    assert np.nanmax(errors_m(seen)) < 4e-4
+    assert valid(seen)[36:].all()
+
+
+# --- stills that mislead ---
+
+
+@pytest.mark.parametrize(
+    ("pattern", "frames"), [("lines_along_tips", 1), ("lines_along_tips", 8), ("lines_along_fingers", 3), ("fold", 3)]
+)
+def test_after_a_still_that_misleads_good_ones_are_valid_within_three_frames(pattern: str, frames: int):
+    plate = Prop(
+        size_m=(0.3, 0.002, 0.2),
+        centre_m=(0.0, -0.025, 0.0),
+        look=ObjectLook(pattern=pattern),  # type: ignore[arg-type]
+        start_s=BEGINS_S,
+        end_s=BEGINS_S + frames / FPS,
+    )
+    seen = watched(scene(BEGINS + frames + 6, props=(plate,)))
+    assert_nothing_misleads(seen)
+    shown = slice(BEGINS + 1, BEGINS + 1 + frames)
+    assert not valid(seen)[shown].any()
+    assert valid(seen)[BEGINS + 1 + frames + 2 :].all()
+    assert errors_m(seen)[BEGINS + 1 + frames + 2 :].max() < 2e-4
+
+
+# --- references ---
+
+
+def test_no_reference_is_taken_while_the_ends_are_hidden_and_one_is_when_they_are_seen():
+    """Past the limit, and standing still for long enough, but for the proof."""
+    policy = PolicySettings(settle_frames=4, limit_m=5e-4)
+    settings = MonitorSettings(policy=policy, recalibration=RecalibrationSettings(frames=4, sure_sigma_m=1e-4))
+    seen = watched(knocked_behind_a_bar(1e-3), settings)
+    assert_nothing_misleads(seen)
+    revisions = [reference.revision for reference in seen.references]
+    assert set(revisions[:37]) == {1} and revisions[-1] == 2
+    reference = np.array(seen.references[-1].cam_T_grip.translation_m)
+    assert np.linalg.norm(reference - seen.truths[-1].cam_T_grip[:3, 3]) < 2e-4
+
+
+# --- time ---
+
+EDGES_ONLY = Prop(
+    size_m=(0.25, 0.01, 0.012),
+    centre_m=(0.0, -0.02, -0.010),
+    look=ObjectLook(pattern="printed"),
+    start_s=BEGINS_S,
+)
+"""Hides the tips' near corners; their inner edges are seen, which by themselves may be anything."""
+
+
+def test_without_proof_a_pose_is_worth_less_the_oftener_mounts_are_knocked():
+    """At once a month it holds for long; at ten thousand times it doesn't outlast a second without the ends' proof."""
+    scenario = scene(60, props=(EDGES_ONLY,))
+    hidden = slice(BEGINS + 1, 60)
+    seldom, often = (
+        watched(scenario, MonitorSettings(policy=PolicySettings(mount_jumps_per_month=rate))) for rate in (1.0, 1e5)
+    )
+    assert_nothing_misleads(seldom)
+    assert_nothing_misleads(often)
+    assert valid(seldom)[hidden].mean() > 0.9
+    assert valid(often)[2 : BEGINS + 1].all(), "in free view each frame proves itself"
+    assert valid(often)[hidden][20:].mean() < 0.5 * valid(seldom)[hidden][20:].mean()
+
+
+def test_while_nothing_is_measured_the_bound_grows_with_time():
+    plate = Prop(size_m=(0.3, 0.002, 0.2), centre_m=(0.0, -0.025, 0.0), look=ObjectLook(pattern="lines_along_tips"))
+    seen = watched(scene(36, props=(msgspec.structs.replace(plate, start_s=BEGINS_S),)))
+    held = [i for i, r in enumerate(seen.records) if r.state is State.OCCLUDED and r.cam_T_grip is not None]
+    assert len(held) >= 10 and not valid(seen)[held].any()
+    bound = bounds_m(seen)[held]
+    assert (np.diff(bound) > 0.0).all() and bound[-1] > 1.5 * bound[0]
+
+
+def test_with_both_tips_hidden_the_bound_is_never_smaller_than_before():
+    seen = watched(scene(40, props=(RIM,)))
+    assert_nothing_misleads(seen)
+    before = bounds_m(seen)[BEGINS]
+    assert (bounds_m(seen)[BEGINS + 1 :] > 0.99 * before).all()
+    assert not valid(seen)[BEGINS + 1], "nobody has seen yet that it is still there"
+
+
+# --- fingers ---
+
+
+@pytest.mark.parametrize("tip_shift_m", [(5e-4, 7e-4, 0.0), (-1.5e-3, 0.0, 0.0), (3e-4, 0.0, 0.0)])
+def test_a_bent_finger_makes_no_frame_worse_than_its_bound(tip_shift_m: tuple[float, float, float]):
+    bent = BentFinger(finger="left", tip_shift_m=tip_shift_m, start_s=BEGINS_S, time_s=0.2)
+    seen = watched(scene(36, bent_fingers=(bent,)))
+    assert_nothing_misleads(seen)
+    assert valid(seen)[2 : BEGINS + 1].all()
+
+
+# --- again ---
+
+
+def test_the_same_frames_give_the_same_records_to_the_byte():
+    hidden = msgspec.structs.replace(RIM, end_s=30.4 / FPS)
+    scenario = scene(40, props=(hidden,), mount=(along_fingers(-2e-3, 34.4 / FPS),))
+    one, other = watched(scenario), watched(scenario)
+    assert [to_json(r) for r in one.records] == [to_json(r) for r in other.records]
