@@ -120,7 +120,7 @@ class Refits:
         return Anchored(fits, surprise)
 
     def levels(self, prior: Array, risk: float, anchored: Anchored) -> tuple[Levels, Levels]:
-        """Bounds under each hypothesis, by the frame alone and by the anchor too; ``prior`` (h,) shares it."""
+        """Bounds under each hypothesis, by the frame alone and by the anchor too; ``prior`` (h,) of each."""
         count = len(prior)
         shift = np.concatenate([self.free.shift[:, :6], anchored.fits.shift[:, :6]])
         covariance = np.concatenate([self.free.covariance[:, :6, :6], anchored.fits.covariance[:, :6, :6]])
