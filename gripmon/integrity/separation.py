@@ -50,8 +50,9 @@ def levels(shift: Array, covariance: Array, risk: Array, inflation: float) -> tu
 
     ``inflation``: factor on standard deviations with which a normal distribution bounds the tails of real errors.
     """
-    out = []
-    for part in (slice(0, 3), slice(3, 6)):
-        away = np.sqrt(np.einsum("hi,hi->h", shift[:, part], shift[:, part]))
-        out.append(away + inflation * bounds(covariance[:, part, part], risk))
-    return out[0], out[1]
+    parts = shift.reshape(-1, 2, 3)
+    away = np.sqrt(np.einsum("hpi,hpi->hp", parts, parts))
+    blocks = np.stack([covariance[:, :3, :3], covariance[:, 3:, 3:]], axis=1)
+    radius = bounds(blocks.reshape(-1, 3, 3), np.repeat(risk, 2)).reshape(-1, 2)
+    both = away + inflation * radius
+    return both[:, 0], both[:, 1]

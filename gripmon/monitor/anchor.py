@@ -130,45 +130,39 @@ class Weigher:
         if not len(edges):
             nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
             return Trust(nothing, nothing, False)
-        hypotheses = self._hypotheses(edges)
+        hypotheses, wander = self._hypotheses(edges), self._wander(now_s)
         fits = Refits(measurement, cam_T_grip, hypotheses, self._floor, self._model)
-        anchor = self.anchor
-        wander = self._wander(now_s)
-        expected_T, covariance = self.expected
-        anchored = fits.anchored(expected_T, covariance + np.diag(wander))
+        anchored = fits.anchored(self.expected[0], self.expected[1] + np.diag(wander))
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
         displaced = not holds[0] and explained is None
-        corners = 0 if ends is None else int(ends.seen.sum())
-        proven = ends is not None and (ends.sure or (corners >= CORNERS_WHERE_EXPECTED and not displaced))
+        proven = _proven(ends, displaced)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven else MISREAD_END ** self.confirmations(measurement, ends, kept)
-        if look_seen:
-            misread *= LOOK_RISK
         prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread
-        lasting = np.where(hypotheses.sudden, 0.0, prior)
-        lasting[hypotheses.ends] = misread
-        alone = now = fits.bound(fits.free, lasting, risk)
-        if anchor is None:
+        prior[hypotheses.ends] = misread * (LOOK_RISK if look_seen else 1.0)
+        free, by_anchor = fits.levels(prior, risk, anchored)
+        # What begins suddenly the anchor bounds; the ends may have been something else from the first frame on.
+        lasting = ~hypotheses.sudden
+        lasting[hypotheses.ends] = True
+        alone = now = free.worst(lasting)
+        if self.anchor is None:
             return Trust(now, now, proven, displaced, ends=ends)
-        jumped = max(self._jumps_per_s * (now_s - anchor.now_s), KNOCKED_UNSEEN) * misread > risk
-        possible = np.where(holds, prior, 0.0)
-        sudden = fits.bound(anchored, possible, risk)
-        as_then = self._as_then(fits, anchor, wander)
+        as_then = self._as_then(fits, self.anchor, wander)
         if not displaced:
-            alone = min(alone, as_then, key=lambda bound: bound.position_m)
+            alone = _smaller(alone, as_then)
+        unseen_s = now_s - self.anchor.now_s
+        jumped = max(self._jumps_per_s * unseen_s, KNOCKED_UNSEEN) * prior[hypotheses.ends] > risk
         if not (displaced or jumped):
             # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
-            lasting[hypotheses.ends] = 0.0
-            now = as_then
-            if explained is None:
-                now = min(now, fits.bound(fits.free, lasting, risk), key=lambda bound: bound.position_m)
-        ambiguous = bool((possible[1:] > 0.0).any())
+            lasting[hypotheses.ends] = False
+            now = as_then if explained is not None else _smaller(as_then, free.worst(lasting))
+        possible = np.where(holds, prior, 0.0)
         number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
         instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
-        protection = larger(larger(now, sudden), self._as_found())
-        return Trust(protection, alone, proven, displaced, displaced and ambiguous, instead, ends)
+        protection = larger(larger(now, by_anchor.worst(holds)), self._as_found())
+        ambiguous = displaced and bool((possible[1:] > 0.0).any())
+        return Trust(protection, alone, proven, displaced, ambiguous, instead, ends)
 
     def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
         """The anchor's own bounds for a pose near it."""
@@ -236,6 +230,17 @@ class Weigher:
         return self._kept[1]
 
 
+def _proven(ends: FingerEndsSeen | None, displaced: bool) -> bool:
+    """Whether the fingers' ends are seen as ends: where the gripper is expected fewer of their corners do."""
+    if ends is None:
+        return False
+    return ends.sure or (not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED)
+
+
+def _smaller(one: Protection, other: Protection) -> Protection:
+    return one if one.position_m <= other.position_m else other
+
+
 def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
     names = tuple(gripper.edge_ids[edge] for edge in edges)
     return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
@@ -253,7 +258,6 @@ def foresee_protection(
     if not len(measurement.normal.edge):
         return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
     hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
-    prior = np.where(hypotheses.sudden, 0.0, hypotheses.prior)
     fits = Refits(
         measurement,
         measurement.cam_T_grip,
@@ -261,4 +265,5 @@ def foresee_protection(
         _floor(settings),
         ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger),
     )
-    return fits.bound(fits.free, prior, settings.policy.integrity_risk)
+    nowhere = fits.anchored(measurement.cam_T_grip, np.diag(np.square([UNBOUNDED_M] * 3 + [UNBOUNDED_RAD] * 3)))
+    return fits.levels(hypotheses.prior, settings.policy.integrity_risk, nowhere)[0].worst(~hypotheses.sudden)

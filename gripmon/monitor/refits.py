@@ -49,6 +49,31 @@ class ModelError(NamedTuple):
         return out
 
 
+class Levels(NamedTuple):
+    """Bounds of ``position`` and ``rotation`` (h,) under hypotheses; ``counted`` (h,): those whose probability isn't
+    below their share of the ``risk``.
+    """
+
+    position: Array
+    rotation: Array
+    counted: NDArray[np.bool_]
+    risk: float
+    name: tuple[str, ...]
+
+    def worst(self, among: NDArray[np.bool_]) -> Protection:
+        """The largest of those ``among`` (h,) that count."""
+        counted = np.flatnonzero(self.counted & among)
+        if not len(counted):
+            return Protection(0.0, 0.0, self.risk, "")
+        worst = int(counted[np.argmax(self.position[counted])])
+        return Protection(
+            min(float(self.position[worst]), UNBOUNDED_M),
+            min(float(self.rotation[counted].max()), UNBOUNDED_RAD),
+            self.risk,
+            self.name[worst],
+        )
+
+
 class Refits:
     """One measurement's fits under h hypotheses, about the published pose ``cam_T_grip`` (4, 4)."""
 
@@ -94,22 +119,19 @@ class Refits:
         surprise = np.einsum("hi,hi->h", way, np.linalg.solve(both, way[:, :, None])[:, :, 0])
         return Anchored(fits, surprise)
 
-    def bound(self, fits: Separation | Anchored, prior: Array, risk: float) -> Protection:
-        """The largest bound under the hypotheses whose ``prior`` (h,) isn't below their share of the risk."""
-        separation = fits.fits if isinstance(fits, Anchored) else fits
-        counted = np.flatnonzero(prior > risk / len(prior))
-        if not len(counted):
-            return Protection(0.0, 0.0, risk, "")
-        shift, covariance = separation.shift[counted, :6], separation.covariance[counted, :6, :6].copy()
+    def levels(self, prior: Array, risk: float, anchored: Anchored) -> tuple[Levels, Levels]:
+        """Bounds under each hypothesis, by the frame alone and by the anchor too; ``prior`` (h,) of each."""
+        count = len(prior)
+        shift = np.concatenate([self.free.shift[:, :6], anchored.fits.shift[:, :6]])
+        covariance = np.concatenate([self.free.covariance[:, :6, :6], anchored.fits.covariance[:, :6, :6]])
         covariance[:, range(6), range(6)] += self._floor
-        covariance[counted == self._hypotheses.model] += self._of_model / INFLATION**2
-        position, rotation = levels(shift - self._published, covariance, risk / len(prior) / prior[counted], INFLATION)
-        worst = int(np.argmax(position))
-        return Protection(
-            min(float(position[worst]), UNBOUNDED_M),
-            min(float(rotation.max()), UNBOUNDED_RAD),
-            risk,
-            self._hypotheses.name[counted[worst]],
+        covariance[[self._hypotheses.model, count + self._hypotheses.model]] += self._of_model / INFLATION**2
+        share = risk / count / np.maximum(prior, 1e-300)
+        position, rotation = levels(shift - self._published, covariance, np.tile(share, 2), INFLATION)
+        counted = prior > risk / count
+        return (
+            Levels(position[:count], rotation[:count], counted, risk, self._hypotheses.name),
+            Levels(position[count:], rotation[count:], counted, risk, self._hypotheses.name),
         )
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
