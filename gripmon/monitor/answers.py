@@ -124,9 +124,10 @@ def unmeasured_corners(names: tuple[str, ...], fault: CornerFault) -> tuple[Corn
     return tuple(CornerRecord(name, None, None, False, fault) for name in names)
 
 
-def after_restart(reference: ReferenceRecord, evidence: Evidence) -> Alert:
-    """Whether the picture fits the reference from which the monitor went on."""
-    fits = not evidence.motion.present
+def after_restart(reference: ReferenceRecord, evidence: Evidence, worth_m: float) -> Alert:
+    """Whether the picture fits the reference from which the monitor went on: by what is worth a warning, m."""
+    off_m = float(np.linalg.norm(evidence.shift[:3]))
+    fits = not evidence.motion.present and off_m <= worth_m + 5.0 * float(np.linalg.norm(evidence.sigma[:3]))
     text = f"restarted from {reference.reference_id}, revision {reference.revision}; the picture " + (
         "fits it" if fits else "does not fit it: the camera has moved"
     )

@@ -53,6 +53,7 @@ from gripmon.records import (
     MeasurementTrace,
     MonitorNotes,
     MonitorState,
+    Motion,
     Origin,
     ReferenceRecord,
     Refusal,
@@ -108,6 +109,7 @@ class Monitor:
         self._stamp_s: float | None = None
         self._newest: Measurement | None = None
         self._astray = 0
+        self._jumped = False  # since the last frame that was believed
         self._baseline_weighed = False
         self._restarted = state is not None  # and not yet said whether the picture fits
         self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state)
@@ -192,31 +194,32 @@ class Monitor:
         self._cam_T_grip, self._covariance = standing.cam_T_grip, standing.covariance
         self._measured_s, self._located = self._now_s, True
         evidence = self._evidence(frame, measurement, before_T, doubtful=bool(faults))
+        self._jumped = self._jumped or evidence.jumped
         if standing.believed:
-            self._follow(measurement, evidence)
+            self._follow(measurement, evidence.motion)
         judgement = self._policy.measured(evidence, self._now_s, frame.stamp_ns)
         alerts = judgement.alerts
         if self._restarted and judgement.state is not State.ACQUIRING:
-            if evidence.motion.frames == 0:
+            if evidence.motion.frames == 0 or not standing.believed:
                 judgement = replace(judgement, verdict=Verdict.SUSPECT, reason=RESTARTED)
             else:
                 self._restarted = False
-                alerts = (after_restart(self.reference, evidence), *alerts)
+                alerts = (after_restart(self.reference, evidence, self._settings.policy.warn_m), *alerts)
         before = self.reference
         alerts += self._renew(frame, standing, evidence, judgement)
         origin = Origin.UPDATE if self.reference is before else Origin.RECALIBRATION
         return self._record(frame, judgement, origin, alerts, standing)
 
-    def _follow(self, measurement: Measurement, evidence: Evidence) -> None:
+    def _follow(self, measurement: Measurement, motion: Motion) -> None:
         """The gripper is where it was measured: averages and what is learnt follow."""
         assert self._covariance is not None
         self._tracker.learn(measurement)
-        motion = evidence.motion
-        if evidence.jumped:
+        jumped, self._jumped = self._jumped, False
+        if jumped:
             self._average.forget()
         quiet = self._policy.state is State.TRACKING and not motion.stepped and not self._watch.vibrates_anew
         self._average.add(self._cam_T_grip, self._covariance, quiet)
-        if motion.stepped and not evidence.jumped:
+        if motion.stepped and not jumped:
             self._average.step(motion.step_frames)
 
     def _renew(self, frame: Frame, standing: Standing, evidence: Evidence, judgement: Judgement) -> tuple[Alert, ...]:

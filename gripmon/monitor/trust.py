@@ -25,6 +25,9 @@ from gripmon.records import Array, Frame, MonitorState, Protection, ReferenceRec
 PROOF_EVERY = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""
 
+ONE_EDGE_PX = 2.0
+"""Edges of an image that are nearer than this to each other are one: no mark on a finger is taken for its end then."""
+
 ALONG_Z = np.array([0.0, 0.0, 1.0])
 """The way that fingers without a direction of their own are slid along for the look: out of the gripper."""
 
@@ -126,7 +129,7 @@ class Integrity:
         if due or self._short(trust) or trust.displaced or self._weigher.anchor is None:
             trust = weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
         here = _Candidate(measurement, cam_T_grip, covariance, trust)
-        if not trust.displaced:
+        if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
@@ -134,6 +137,10 @@ class Integrity:
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
+
+    def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
+        """How far the edges show from where the gripper is expected, px."""
+        return measurement.prediction.moved_px(perturbation_between(self._weigher.expected[0], cam_T_grip))
 
     def _against_its_place(self, frame: Frame, here: _Candidate, at_first: Trust, now_s: float) -> Standing:
         """A displaced pose against the gripper's place: the one that is proven, else the place, where the mount rarely

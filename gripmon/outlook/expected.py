@@ -27,9 +27,9 @@ from gripmon.records import Array, Image, Protection, ReferenceRecord
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""
 
-CLUTTER_PX = 0.2
+CLUTTER_PX = 0.1
 """What the background is assumed to shift a stretch of an edge by, beside that, for the protection level: with it the
-bound is about that of the usual frame before clutter; one frame in twenty has twice as much (tools/bench integrity).
+bound is that of the usual frame before clutter; one in twenty has up to four times as much (tools/bench integrity).
 """
 
 _STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0

@@ -191,8 +191,8 @@ def _short(value: float) -> float:
 
 
 def _settings(watched: Watched) -> MonitorSettings:
-    """As an integrator sets them up: an alert limit that the view can't keep in most frames is raised to twice what
-    ``check`` foretells.
+    """As an integrator sets them up: an alert limit that the view can't keep in most frames is raised to three
+    times what ``check`` foretells.
     """
     known = {} if watched.jaw_sigma_m is None else {"jaw_sigma_m": watched.jaw_sigma_m}
     settings = MonitorSettings(drift=DriftSettings(frames_per_s=watched.fps), **known)
@@ -200,8 +200,8 @@ def _settings(watched: Watched) -> MonitorSettings:
     foretold = foresee_frame(rig, watched.start_cam_T_grip, None).protection
     policy = msgspec.structs.replace(
         settings.policy,
-        alert_limit_m=max(settings.policy.alert_limit_m, 2.0 * foretold.position_m),
-        alert_limit_rad=max(settings.policy.alert_limit_rad, 2.0 * foretold.rotation_rad),
+        alert_limit_m=max(settings.policy.alert_limit_m, 3.0 * foretold.position_m),
+        alert_limit_rad=max(settings.policy.alert_limit_rad, 3.0 * foretold.rotation_rad),
     )
     return msgspec.structs.replace(settings, policy=policy)
 
