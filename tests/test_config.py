@@ -360,5 +360,5 @@ def test_a_largest_sigma_beside_an_alert_limit_is_refused(folder: Path):
 
 def test_the_limits_are_the_defaults_without_a_word(folder: Path, caplog: pytest.LogCaptureFixture):
     policy = load_config(folder / "config.yaml").settings.monitor.policy
-    assert (policy.alert_limit_m, policy.alert_limit_rad, policy.integrity_risk) == (5e-4, 0.02, 1e-5)
+    assert (policy.alert_limit_m, policy.alert_limit_rad, policy.integrity_risk) == (1e-3, 0.035, 1e-5)
     assert not caplog.messages

@@ -29,7 +29,7 @@ def test_protection_levels_stand_with_their_limits_and_shares():
     told_run = Run(run, configuration=RecordedConfiguration("main.yaml", {"main.yaml": RecordedFile(text)}))
     report, told = build([told_run])
     (recording,) = report.recordings
-    assert (recording.limits.alert_limit_m, recording.limits.alert_limit_rad) == (1e-3, 0.02)
+    assert (recording.limits.alert_limit_m, recording.limits.alert_limit_rad) == (1e-3, 0.035)
     found = recording.integrity
     assert (found.frames, found.valid, found.within, found.risk) == (360, 260 / 400, 260 / 400, 1e-5)
     assert (found.median_m, found.p99_m, found.median_rad) == (2e-4, 4e-3, 0.005)

@@ -210,8 +210,8 @@ def _worst(rig: Rig, cam_T_grip: Array, openings_m: list[float], usual: tuple[fl
     """Over the usual and some more openings."""
     each = [usual, *((m, foresee_frame(rig, cam_T_grip, m)) for m in openings_m)]
     sigma_m, at_m = max((float(np.sqrt(np.linalg.eigvalsh(f.covariance[:3, :3])[-1])), o) for o, f in each)
-    promises = [(promise(frame.protection, rig.settings.policy), opening_m) for opening_m, frame in each]
-    return _Worst(sigma_m, at_m, *max(promises, key=lambda pair: pair[0].excess))
+    opening_m, frame = usual
+    return _Worst(sigma_m, at_m, promise(frame.protection, rig.settings.policy), opening_m)
 
 
 def _blind(openings_m: Array, sights: list[Sight], sight: Sight) -> tuple[Fault, ...]:

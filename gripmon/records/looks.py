@@ -10,7 +10,7 @@ from msgspec import Meta
 from gripmon.records.values import Transform
 
 
-class LookRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.look/1"):
+class LookRecord(msgspec.Struct, frozen=True):
     """Learned texture of the fingers; bytes are little-endian and in JSON base64."""
 
     camera: Annotated[str, Meta(description="digest of the camera model that it was learnt with")]
