@@ -87,9 +87,8 @@ class Measurement:
     ``covariance`` (6 or 7, 6 or 7) of ``xi`` (and the opening); ``jaw_surprise``: the seen jaw opening against the
     reported one (``jaw_reported_m``), in standard deviations of the latter.
 
-    ``normal``: the fit's normal equations edge by edge; ``contradiction``: how much stretches of edges contradict each
-    other, about 1 where they don't; ``jaw_known_m`` with its standard deviation: the opening as far as it is known
-    without the image.
+    ``normal``: the fit's normal equations edge by edge; ``jaw_known_m`` with its standard deviation: the opening as far
+    as it is known without the image.
 
     ``trusted``: enough profiles agree; fewer suffice where the gripper was expected than where it was looked for.
     ``effort``: what found it; ``looked_far``: whether more than the narrow way was tried.
@@ -108,7 +107,6 @@ class Measurement:
     normal: NormalEquations
     jaw_known_m: float
     jaw_known_sigma_m: float
-    contradiction: float = 1.0
     trusted: bool = False
     looked_far: bool = False
 
@@ -218,7 +216,6 @@ class Settler:
             uncertainty.normal,
             expected.jaw_reported_m,
             float(self._prior[6] ** -0.5) if len(self._prior) == 7 else 0.0,
-            uncertainty.contradiction,
         )
 
     def _fitting_zoom(self, measurement: Measurement) -> int:

@@ -198,7 +198,7 @@ def _closer(openings_m: Array, sights: list[Sight]) -> list[tuple[float, Sight]]
 
 
 class _Worst(NamedTuple):
-    """Largest standard deviation of the TCP in any direction and at which opening; largest bounds and at which."""
+    """Largest standard deviation of the TCP in any direction and at which opening; what the usual one promises."""
 
     sigma_m: float
     at_m: float
