@@ -52,13 +52,14 @@ class Shown:
         outliers: int = 0,
         blur_px: float = 0.7,
         hidden: tuple[str, ...] = (),
+        endless: tuple[str, ...] = (),
         noise: float = 0.004,
         brightest: float = 0.7,
         steepest: float = 0.3,
         grey: float = 0.4,
     ) -> EdgeEvidence:
         """``bent``: 4x4 motion of a finger's points in the gripper frame; ``camera``: the one that really looks;
-        ``outliers``: so many pieces are off by up to 5 px.
+        ``outliers``: so many pieces are off by up to 5 px; ``endless``: fingers whose ends something hides.
         """
         gripper, reference = self.gripper, self.reference
         pose = reference if cam_T_grip is None else cam_T_grip
@@ -80,6 +81,8 @@ class Shown:
                 fraction.append(f)
                 uv.append(0.5 * (ends[0] + ends[1]))
                 across.append([-along[1], along[0]])
+        corner_finger = gripper.point_finger[gripper.corner_points]
+        ending = ~np.isin(corner_finger, [gripper.finger_ids.index(name) for name in (*hidden, *endless)])
         off_px = self.rng.normal(0.0, sigma_px, len(edge))
         wrong = self.rng.permutation(len(edge))[:outliers]
         off_px[wrong] += self.rng.uniform(-5.0, 5.0, len(wrong))
@@ -99,6 +102,8 @@ class Shown:
             blur_px2=np.full(len(edge), blur_px**2),
             across=across_px,
             finger_share=np.array([0.05 if name in hidden else 0.8 for name in gripper.finger_ids]),
+            ends=ending,
+            ends_in_view=np.ones(len(ending), dtype=bool),
             noise=noise,
             brightest=brightest,
             steepest=steepest,
@@ -144,3 +149,10 @@ def told(shown: Shown, judge: CauseJudge, **scene: Any) -> tuple[Cause, str | No
 def ill_seen(evidence: EdgeEvidence, *shares: float) -> EdgeEvidence:
     """With other shares of the fingers' profiles that agree."""
     return dataclasses.replace(evidence, finger_share=np.array(shares))
+
+
+def beside(shown: Shown, evidence: EdgeEvidence, edges: tuple[str, ...], off_px: float) -> EdgeEvidence:
+    """With a line beside each of some edges taken for them."""
+    own = np.isin([shown.gripper.edge_ids[e] for e in evidence.edge], edges)
+    uv_px = shown.camera.distort(evidence.xy) + np.where(own, off_px, 0.0)[:, None] * evidence.across
+    return dataclasses.replace(evidence, xy=shown.camera.undistort_with_jacobian(uv_px)[0])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
-from shown_edges import FRAMES, OPENING_M, Shown, bend, ill_seen, knocked, two_fingers
+from shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.camera import LensSettings
@@ -33,6 +33,57 @@ def test_a_finger_that_most_of_its_profiles_contradict_is_not_called_bent(well_s
     assert explanation.probable.cause is cause
     assert sum(c.probability for c in explanation.causes) == pytest.approx(1.0)
     assert ("too little of the fingers is seen" in explanation.text) == (cause is Cause.UNKNOWN)
+
+
+BORDERS = ("L_tip_in", "L_in_far_along")
+"""One contour of the left finger, for which something else's border may be taken."""
+
+
+@pytest.mark.parametrize("off_px", [2.0, -4.0])
+@pytest.mark.parametrize(
+    ("edges", "endless", "cause"),
+    [
+        (BORDERS, True, Cause.UNKNOWN),
+        ((*BORDERS, "L_tip_near"), True, Cause.UNKNOWN),
+        ((*BORDERS, "L_tip_near"), False, Cause.FINGER_BENT),
+        ((*BORDERS, "L_out_near_along"), True, Cause.FINGER_BENT),
+    ],
+)
+def test_a_finger_of_which_a_side_stays_is_bent_only_if_it_shows_its_ends(
+    edges: tuple[str, ...], endless: bool, cause: Cause, off_px: float
+):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for _ in range(FRAMES):
+        judge.add(beside(shown, shown.evidence(endless=("left",) if endless else ()), edges, off_px))
+    explanation = judge.explanation(shown.reference)
+    assert explanation.probable.cause is cause
+    assert ("too little of the fingers is seen" in explanation.text) == (cause is Cause.UNKNOWN)
+
+
+@pytest.mark.parametrize("size_m", [1.5e-4, 1.5e-3])
+def test_a_bent_finger_is_named_before_clutter_that_hides_its_ends(size_m: float):
+    shown = Shown(sharp_gripper())
+    bent = {"left": bend(shown.gripper, "left", (size_m, size_m))}
+    assert told(shown, shown.judge(), bent=bent, endless=("left",))[:2] == (Cause.FINGER_BENT, "left")
+
+
+def test_ends_that_were_never_seen_are_not_missed():
+    shown = Shown(sharp_gripper())
+    never = {"endless": ("left",)}
+    judge = shown.judge(**never)
+    for _ in range(FRAMES):
+        judge.add(beside(shown, shown.evidence(**never), BORDERS, 2.0))
+    assert judge.explanation(shown.reference).probable.cause is Cause.FINGER_BENT
+
+
+@pytest.mark.parametrize(("often", "cause"), [(3, Cause.FINGER_BENT), (2, Cause.UNKNOWN)])
+def test_ends_have_to_be_seen_in_a_third_of_the_frames(often: int, cause: Cause):
+    shown = Shown(sharp_gripper())
+    judge = shown.judge()
+    for k in range(FRAMES):
+        judge.add(beside(shown, shown.evidence(endless=() if k < often else ("left",)), BORDERS, 2.0))
+    assert judge.explanation(shown.reference).probable.cause is cause
 
 
 @pytest.mark.parametrize(("share", "cause"), [(0.7, Cause.JAW_OPENING), (0.4, Cause.UNKNOWN)])

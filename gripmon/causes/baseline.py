@@ -20,8 +20,8 @@ from gripmon.records import Array
 @dataclass(frozen=True, slots=True)
 class Baseline:
     """``motion`` (m,) of the unknowns from the reference; ``bias_px`` of each piece of an edge beyond that, and
-    ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then; blur,
-    noise, ``steepest``, ``cells`` and ``wander`` as in :class:`Pooled`.
+    ``sigma_px`` of it, both (pieces,), NaN where none was seen; the openings that were reported and seen then;
+    ``ends``, blur, noise, ``steepest``, ``cells`` and ``wander`` as in :class:`Pooled`.
     """
 
     motion: Array
@@ -29,6 +29,7 @@ class Baseline:
     sigma_px: Array
     jaw_reported_m: float | None
     jaw_opening_m: float
+    ends: NDArray[np.bool_]
     blur_px2: float | None
     noise: float
     steepest: float
@@ -40,7 +41,7 @@ class Baseline:
         bias_px, sigma_px = np.full(edges * PIECES, np.nan), np.full(edges * PIECES, np.nan)
         bias_px[pooled.piece], sigma_px[pooled.piece] = residual_px, pooled.evidence.sigma_px
         then = pooled.evidence
-        image = pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
+        image = pooled.ends, pooled.blur_px2, pooled.noise, pooled.steepest, pooled.cells, pooled.wander
         return cls(motion, bias_px, sigma_px, then.jaw_reported_m, then.jaw_opening_m, *image)
 
     def start(self, state: State, reported: bool, gripper: Gripper) -> State:

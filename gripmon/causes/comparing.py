@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.causes.baseline import Baseline
@@ -51,6 +52,9 @@ ABSENT = {Cause.VIEW_BLOCKED: 0.5, Cause.FINGER_BENT: 0.2, Cause.UNKNOWN: 0.1}
 several things happened; with every other cause it is a ``STRAY``."""
 STRAY = 0.02
 
+STANDS_SIGMAS = 4.0
+"""Standard deviations within which a piece of an edge stands at a place: one in 16,000 is farther off by chance."""
+
 BLOCKED = 0.15
 """Probability of a blocked view beforehand, where a finger isn't seen."""
 
@@ -65,13 +69,15 @@ class Report:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """``log`` evidence of each model with its prior, how each fits, and by how much the blur has changed (None: it
-    can't be told).
+    """``log`` evidence of each model with its prior, how each fits, by how much the blur has changed (None: it can't be
+    told), and ``elsewhere`` (f,): share of each finger's pieces that stand where the finger is if it is bent, and not
+    where it was.
     """
 
     log: Mapping[Key, float]
     fits: Mapping[Key, Weighed]
     blur_change_px: float | None
+    elsewhere: Array
 
 
 def compare(
@@ -118,6 +124,7 @@ def compare(
         openings_m.append(baseline.jaw_opening_m)
     # What even the freest model doesn't explain all pieces share as an error.
     edge = np.unique(evidence.edge, return_inverse=True)[1]
+    alone_px = np.hypot(sigma_px, spread_px)
     sigma_px = np.hypot(sigma_px, _shared_px(fitted(models[-1]).residual_px, sigma_px))
     fits = {(suspect.cause, suspect.part): fitted(suspect) for suspect in models}
     log = {(s.cause, s.part): fits[s.cause, s.part].log_evidence + math.log(s.prior) for s in models}
@@ -131,7 +138,8 @@ def compare(
         for cause, part in log:
             chance = ABSENT.get(cause, STRAY) if cause is not None else STRAY
             log[cause, part] += math.log(STRAY if part is not None and part not in pooled.absent else chance)
-    return Comparison(log, fits, change_px)
+    finger = gripper.edge_finger[evidence.edge]
+    return Comparison(log, fits, change_px, _elsewhere(fits, alone_px, finger, len(gripper.finger_ids)))
 
 
 def _knowledge(
@@ -159,6 +167,17 @@ def _shared_px(residual_px: Array, sigma_px: Array) -> float:
     """
     excess = float(np.median(residual_px**2 / sigma_px**2)) / (0.6745**2 * 0.5) - 1.0
     return math.sqrt(max(excess, 0.0) * float(np.median(sigma_px**2)))
+
+
+def _elsewhere(fits: Mapping[Key, Weighed], sigma_px: Array, finger: NDArray[np.intp], fingers: int) -> Array:
+    """See :class:`Comparison`; ``sigma_px`` (s,) of the pieces by themselves, ``finger`` (s,) of each."""
+    shares = np.zeros(fingers)
+    stands = {key: np.abs(fit.residual_px) <= STANDS_SIGMAS * sigma_px for key, fit in fits.items()}
+    for part in range(fingers):
+        own = finger == part
+        if (Cause.FINGER_BENT, part) in stands and own.any():
+            shares[part] = (stands[Cause.FINGER_BENT, part] & ~stands[None, None])[own].mean()
+    return shares
 
 
 def _blur_change_px(pooled: Pooled, baseline: Baseline | None) -> float | None:

@@ -10,6 +10,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from gripmon.camera import Camera
 from gripmon.causes.baseline import Baseline
@@ -17,7 +18,7 @@ from gripmon.causes.comparing import Comparison, Key, Report, compare
 from gripmon.causes.pooling import Pooled, pool
 from gripmon.causes.words import sentence
 from gripmon.gripper import Gripper
-from gripmon.records import Array, Cause, CauseWeight, EdgeEvidence, Explanation
+from gripmon.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""
@@ -47,6 +48,11 @@ that were steady show what they showed: a blur leaves grey levels as they were, 
 MOST = 0.5
 """Share of a finger's profiles that must agree with where it is said to be.  What fewer show may be anything that has
 an edge or two: a shadow, a finger's other side, what lies behind.
+"""
+
+GONE = 2.0 / 3.0
+"""Share of the pieces of a finger's edges beyond which it has gone elsewhere, though its ends aren't seen: its outline
+has two sides and a tip, and a thing before one corner of it shows borders of its own for two of these.
 """
 
 
@@ -144,7 +150,8 @@ class CauseJudge:
         total = sum(math.exp(value - top) for value in comparison.log.values())
         shares = {key: math.exp(value - top) / total for key, value in comparison.log.items()}
         text = sentence(shares, comparison, pooled.absent, self._settings.probable, self._gripper)
-        for key in [key for key in shares if _ill_founded(key, pooled)]:
+        unseen = _not_seen_elsewhere(pooled, baseline, comparison, self._gripper)
+        for key in [key for key in shares if _ill_founded(key, pooled, unseen)]:
             if shares[key] >= self._settings.probable:
                 text = f"too little of the fingers is seen to tell what moved; what is seen would fit if {text}"
             shares[Cause.UNKNOWN, None] += shares.pop(key)
@@ -203,15 +210,33 @@ def _unsharp(pooled: Pooled, baseline: Baseline) -> bool:
     return bool((np.abs(pooled.cells - baseline.cells)[steady] < ALIKE).mean() >= MOSTLY)
 
 
-def _ill_founded(key: Key, pooled: Pooled) -> bool:
-    """Whether a cause is told from fingers that most of their own profiles contradict.
+def _not_seen_elsewhere(
+    pooled: Pooled, baseline: Baseline | None, comparison: Comparison, gripper: Gripper
+) -> NDArray[np.bool_]:
+    """(f,) fingers of which something else may hide a part, as far as one can see.
+
+    A finger that is bent is seen elsewhere: it shows its ends there, or most of its edges have left their place for
+    one that the finger as a whole can have.  One that a bar, a box or a hand hides shows a border or two of that beside
+    its own edges, which stay where they were, and the border goes on beyond its end.  What was never seen as an end,
+    before clutter or because the fingertips are round, can't be missed.
+    """
+    expected = pooled.ends_in_view if baseline is None else pooled.ends_in_view & baseline.ends
+    finger, fingers = gripper.point_finger[gripper.corner_points], len(gripper.finger_ids)
+    wanted = np.bincount(finger[expected], minlength=fingers)
+    endless = np.bincount(finger[pooled.ends], minlength=fingers) < np.minimum(wanted, END_CORNERS)
+    return np.asarray(endless & (comparison.elsewhere <= GONE))
+
+
+def _ill_founded(key: Key, pooled: Pooled, unseen: NDArray[np.bool_]) -> bool:
+    """Whether a cause is told from fingers that most of their own profiles contradict, or is about one that is
+    ``unseen`` (f,) where it would be then.
 
     A finger that isn't seen at all is weighed as such.  Of an opening and of the lens two fingers have to tell: what
     one does may as well be its own.
     """
     cause, part = key
     if cause is Cause.FINGER_BENT and part is not None:
-        return part not in pooled.absent and not pooled.share[part] >= MOST
+        return part not in pooled.absent and (not pooled.share[part] >= MOST or bool(unseen[part]))
     several = min(len(pooled.share), 2)
     return cause in (Cause.JAW_OPENING, Cause.LENS) and int((pooled.share >= MOST).sum()) < several
 

@@ -18,7 +18,7 @@ PIECES = 5
 """Pieces that an edge is divided into."""
 
 SEEN_IN = 1.0 / 3.0
-"""Part of the frames in which a piece has to be seen, and which have to show so much of a finger."""
+"""Part of the frames in which a piece has to be seen, or an end, and which have to show so much of a finger."""
 
 CONSTANT = 0.5
 """Part of a stretch's own standard deviation that is the same in all frames: the texture on it."""
@@ -31,15 +31,18 @@ FEWEST_STRETCHES, FEWEST_EDGES, FEWEST_SHARE = 3, 2, 0.25
 class Pooled:
     """``evidence`` as of the frame in their midst (see :func:`pool`) with a stretch for each piece ``piece`` (s,) of an
     edge; ``absent``: fingers in view that are not seen; ``share`` (f,) of each finger's profiles that agree with the
-    finger's own place in enough of the frames, NaN where it isn't in view; ``blur_px2``: of the lens, None where it
-    can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander`` (12, 16)
-    of the cells from frame to frame; ``frames`` that it was made of.
+    finger's own place in enough of the frames, NaN where it isn't in view; ``ends`` (c,) corners seen there as ends of
+    their finger in enough of the frames, and ``ends_in_view`` (c,) those that might be; ``blur_px2``: of the lens, None
+    where it can't be told; ``noise``, ``brightest``, ``steepest`` and ``cells`` as in ``EdgeEvidence``, and ``wander``
+    (12, 16) of the cells from frame to frame; ``frames`` that it was made of.
     """
 
     evidence: EdgeEvidence
     piece: NDArray[np.intp]
     absent: tuple[int, ...]
     share: Array
+    ends: NDArray[np.bool_]
+    ends_in_view: NDArray[np.bool_]
     blur_px2: float | None
     noise: float
     brightest: float
@@ -76,6 +79,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     absences = [absent_fingers(frame, gripper) for frame in frames]
     often = tuple(f for f in range(len(gripper.finger_ids)) if 2 * sum(f in a for a in absences) > len(frames))
     share = _share(frames)
+    ends, ends_in_view = _often([f.ends for f in frames]), _often([f.ends_in_view for f in frames])
     noise = float(np.median([frame.noise for frame in frames]))
     brightest = float(np.median([frame.brightest for frame in frames]))
     steepest = float(np.median([frame.steepest for frame in frames]))
@@ -83,7 +87,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
     image = noise, brightest, steepest, np.median(cells, axis=0), np.ptp(cells, axis=0)
     if not places:
         nothing = _only(midst, np.zeros(len(midst.edge), dtype=bool))
-        return Pooled(nothing, np.zeros(0, np.intp), often, share, None, *image, len(frames))
+        return Pooled(nothing, np.zeros(0, np.intp), often, share, ends, ends_in_view, None, *image, len(frames))
     piece, residual, fraction = np.concatenate(places), np.concatenate(residuals), np.concatenate(fractions)
     sigma, detail = np.concatenate(sigmas), np.concatenate(details)
     numbers, count = np.unique(piece, return_counts=True)
@@ -116,7 +120,7 @@ def pool(frames: Sequence[EdgeEvidence], camera: Camera, gripper: Gripper) -> Po
         across=other[:, 3:],
     )
     blur_px2 = isotropic_blur_px2(evidence)
-    return Pooled(evidence, numbers, often, share, blur_px2, *image, len(frames))
+    return Pooled(evidence, numbers, often, share, ends, ends_in_view, blur_px2, *image, len(frames))
 
 
 def _share(frames: Sequence[EdgeEvidence]) -> Array:
@@ -124,6 +128,11 @@ def _share(frames: Sequence[EdgeEvidence]) -> Array:
     shares = np.sort(np.nan_to_num([frame.finger_share for frame in frames], nan=-1.0), axis=0)
     reached = shares[-math.ceil(SEEN_IN * len(frames))]
     return np.where(reached >= 0.0, reached, np.nan)
+
+
+def _often(flags: Sequence[NDArray[np.bool_]]) -> NDArray[np.bool_]:
+    """(c,) what holds in as many of the frames as a piece has to be seen in."""
+    return np.asarray(np.mean(flags, axis=0) >= SEEN_IN)
 
 
 def absent_fingers(evidence: EdgeEvidence, gripper: Gripper) -> tuple[int, ...]:

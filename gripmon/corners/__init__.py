@@ -6,6 +6,7 @@ from gripmon.corners.measure import FingertipMeter, Patience
 from gripmon.corners.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
 from gripmon.corners.sums import edge_sums
 from gripmon.corners.taught import TaughtEdges, TaughtModel
+from gripmon.corners.uncertainty import NormalEquations
 from gripmon.corners.views import agreeing_fingers, trace_of
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "FingertipMeter",
     "Measurement",
     "MeasurementSettings",
+    "NormalEquations",
     "Patience",
     "TaughtEdges",
     "TaughtModel",

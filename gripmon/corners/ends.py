@@ -16,7 +16,7 @@ from gripmon.corners.prediction import STEP_PX, Prediction
 from gripmon.corners.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.corners.settling import Measurement
 from gripmon.gripper import Gripper
-from gripmon.records import Array, Image
+from gripmon.records import END_CORNERS, Array, Image
 
 ALONG_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""
@@ -46,9 +46,6 @@ NEAR_PX = 1.0
 
 AS_STRONG = 0.4
 """Step of a continuation over the edge's own, from which it is one."""
-
-END_CORNERS = 2
-"""Corners that make an end: a border that crosses a finger seems to make one, or two with more of it beside them."""
 
 GOES_ON = 0.5
 """Share of the probes that must show it: half of them, as for an edge beside a corner."""
@@ -90,6 +87,12 @@ class FingerEndsSeen:
             return fingers == 1 and int(self.seen.max()) >= END_CORNERS
         return int(np.count_nonzero(self.seen)) >= 2 and int(self.seen.sum()) >= 2 * END_CORNERS
 
+    @property
+    def at_each(self) -> bool:
+        """Whether one is seen of each of the fingers whose ends the view has, which are two or more."""
+        in_view = self.might > 0
+        return bool(np.count_nonzero(in_view) >= 2 and (self.seen[in_view] > 0).all())
+
 
 @dataclass(frozen=True, slots=True)
 class _Probes:
@@ -117,11 +120,27 @@ class FingerEnds:
         self._kept: tuple[Prediction, _Probes] | None = None
 
     def seen(self, image: Image, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
-        """Look beyond the measured corners; takes as long as a fourth of a measurement.
+        """How many of each finger's ends are seen; takes as long as a fourth of a measurement.  ``strict``: see
+        :meth:`at_corners`.
+        """
+        gripper = self._gripper
+        finger = gripper.point_finger[gripper.corner_points]
+        fingers = len(gripper.finger_ids)
+        return FingerEndsSeen(
+            np.bincount(finger[self.at_corners(image, measurement, strict)], minlength=fingers),
+            np.bincount(finger[self.in_view(measurement.prediction)], minlength=fingers),
+        )
+
+    def in_view(self, prediction: Prediction) -> NDArray[np.bool_]:
+        """(c,) the corners that might be seen as ends in this view."""
+        return self._at_end & prediction.corners.visible
+
+    def at_corners(self, image: Image, measurement: Measurement, strict: bool = False) -> NDArray[np.bool_]:
+        """(c,) the measured corners that are ends: looks beyond them.
 
         ``strict``: an edge must not go on by a few pixels either, as beyond a step on the finger; clutter does, too.
         """
-        gripper, prediction, corners = self._gripper, measurement.prediction, measurement.corners
+        prediction, corners = measurement.prediction, measurement.corners
         if self._kept is None or self._kept[0] is not prediction:
             self._kept = prediction, self._lay_out(prediction)
         probes = self._kept[1]
@@ -129,12 +148,7 @@ class FingerEnds:
         goes_on = np.zeros(len(measured), dtype=bool)
         if len(probes.corner) and measured.any():
             goes_on[probes.corner[self._going_on(image, measurement, probes, strict)]] = True
-        finger = gripper.point_finger[gripper.corner_points]
-        fingers = len(gripper.finger_ids)
-        return FingerEndsSeen(
-            np.bincount(finger[measured & ~goes_on], minlength=fingers),
-            np.bincount(finger[self._at_end & prediction.corners.visible], minlength=fingers),
-        )
+        return measured & ~goes_on
 
     def _going_on(self, image: Image, measurement: Measurement, probes: _Probes, strict: bool) -> NDArray[np.bool_]:
         """(c,) which of the extended edges go on."""

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -18,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners.consensus import Consensus, Prior, Votes, agree
+from gripmon.corners.ends import FingerEnds
+from gripmon.corners.lines import CornerGeometry, intersect_edges
 from gripmon.corners.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
 from gripmon.geometry import perturb, perturbation_between
 from gripmon.records import Array, EdgeEvidence, Image
@@ -56,11 +59,15 @@ class _Place(NamedTuple):
 class FingerMeter(Settler):
     """Looks at the fingers one by one, in a frame that was measured."""
 
+    @cached_property
+    def _ends(self) -> FingerEnds:
+        return FingerEnds(self._gripper, self._settings.edges)
+
     def evidence(
         self, image: Image, measurement: Measurement, *elsewhere: Array, jaw_reported: bool = True
     ) -> EdgeEvidence:
         """What the fingers show one by one in a measured frame; takes about as long as the measurement, some times
-        longer where a finger has to be looked for.
+        longer where a finger has to be looked for, and again as long where one has moved.
 
         ``elsewhere``: poses (4, 4) that a finger may have stayed at while the others moved, the reference for one.
         ``jaw_reported``: the robot reported the opening of this frame.  A frame in which nothing agrees gives evidence
@@ -72,6 +79,7 @@ class FingerMeter(Settler):
             for finger in range(len(self._gripper.finger_ids))
         ]
         found = [place for place in places if place is not None]
+        ends, ends_in_view = self._ends_at(image, measurement, places)
         kernel_px = self._settings.edges.blur_px
         stretches = [_Stretches.of(place, kernel_px) for place in found]
         zoom = measurement.candidates.zoom
@@ -84,6 +92,8 @@ class FingerMeter(Settler):
                 for name, empty in _EMPTY._asdict().items()
             },
             finger_share=np.array([np.nan if place is None else place.share for place in places]),
+            ends=ends,
+            ends_in_view=ends_in_view,
             noise=measurement.candidates.noise / measurement.candidates.full_scale,
             brightest=_brightest(image) / measurement.candidates.full_scale,
             steepest=_steepest(image) / measurement.candidates.full_scale,
@@ -147,6 +157,42 @@ class FingerMeter(Settler):
         with self._zoomed(present):
             votes = self._look(image, self._predict(self._lay_out(there), there))
             return self._best(votes, finger, [start])
+
+    def _ends_at(
+        self, image: Image, measurement: Measurement, places: list[_Place | None]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(c,) corners that are seen as ends of their finger at its own place of ``places``, one for each finger, and
+        (c,) those that might be.
+        """
+        gripper = self._gripper
+        seen, in_view = np.zeros((2, len(gripper.corner_ids)), dtype=bool)
+        for finger, place in enumerate(places):
+            if place is None:
+                continue
+            own = gripper.point_finger[gripper.corner_points] == finger
+            there = self._measured_at(image, measurement, place, finger)
+            in_view |= own & self._ends.in_view(there.prediction)
+            seen |= own & self._ends.at_corners(image, there)
+        return seen, in_view
+
+    def _measured_at(self, image: Image, measurement: Measurement, place: _Place, finger: int) -> Measurement:
+        """The measurement as if the gripper were where a finger shows, with the corners of that finger alone.
+
+        A corner is looked for beside where it is predicted: farther off it is predicted, and its edges are seen, anew.
+        """
+        prediction, xi = place.votes.prediction, place.fit.xi
+        if prediction.moved_px(xi) > self._settings.relinearise_px:
+            opening_m = measurement.jaw_opening_m
+            there = self._moved(prediction, xi, Expected(prediction.cam_T_grip, opening_m, opening_m))
+            prediction = self._predict(self._lay_out(there), there)
+            again = self._best(self._look(image, prediction), finger, [np.zeros(len(self._prior))])
+            place = place if again is None else again
+        votes, fit = place.votes, place.fit
+        geometry = CornerGeometry.of(self._gripper, votes.prediction, self._settings.corners)
+        corners = intersect_edges(votes, fit, fit.weight, geometry, self._settings.corners)
+        return replace(
+            measurement, prediction=votes.prediction, candidates=votes.candidates, consensus=fit, corners=corners
+        )
 
     @contextmanager
     def _zoomed(self, zoom: int) -> Iterator[None]:

@@ -12,22 +12,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
 from gripmon.corners.consensus import (
     Consensus,
     agree,
     agree_from_grid,
     grid_of_starts,
 )
-from gripmon.corners.ends import FingerEnds, FingerEndsSeen
+from gripmon.corners.ends import FingerEndsSeen
 from gripmon.corners.evidence import FingerMeter
 from gripmon.corners.look import unevenness
 from gripmon.corners.prediction import EdgeLayout, Prediction
 from gripmon.corners.search import search_poses
-from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement, MeasurementSettings
-from gripmon.corners.taught import TaughtEdges
+from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement
 from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
 from gripmon.records import Array, Image
 
 FOUND_EDGES = 0.85
@@ -75,17 +72,6 @@ class _Place:
 
 class FingertipMeter(FingerMeter):
     """Measures one gripper with one camera, and looks for it elsewhere when it isn't seen where it is expected."""
-
-    def __init__(
-        self,
-        camera: Camera,
-        gripper: Gripper,
-        settings: MeasurementSettings,
-        jaw_sigma_m: float,
-        taught: TaughtEdges | None = None,
-    ):
-        super().__init__(camera, gripper, settings, jaw_sigma_m, taught)
-        self._ends = FingerEnds(gripper, settings.edges)
 
     @property
     def finger_axis(self) -> Array:

@@ -23,7 +23,7 @@ from gripmon.records.commands import (
     Snapshot,
     SnapshotImage,
 )
-from gripmon.records.evidence import EdgeEvidence, EdgeSums
+from gripmon.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
     CornerFault,
     CornerRecord,
@@ -48,6 +48,7 @@ from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest
 from gripmon.records.values import Array, Drift, Image, Protection, Smoothed, Transform, to_json
 
 __all__ = [
+    "END_CORNERS",
     "MESSAGES",
     "Alert",
     "AlertEvent",

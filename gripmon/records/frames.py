@@ -135,7 +135,8 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     reason: Annotated[str | None, Meta(description="why the verdict isn't valid; null when it is")] = None
     name: Annotated[str, Meta(description="file or stream that the frame came from")] = ""
     protection: Annotated[
-        Protection | None, Meta(description="bounds on the error of cam_T_grip, null with it; a held one's grow")
+        Protection | None,
+        Meta(description="bounds on the error of cam_T_grip, null with it; a held one's grow, or end"),
     ] = None
 
     @property
