@@ -292,7 +292,7 @@ def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: P
     ):
         wait_until(lambda: daemon.publisher.connected and daemon.frames, "a frame of a monitor on the network")
         with Client("arm", "wrist", zenoh_config_file=str(tmp_path / "operator.json5")) as operator:
-            reply, data = operator.snapshot(WAIT_S)
+            reply, data = operator.snapshot(5.0 * WAIT_S)
     assert reply.snapshot is not None and data is not None and len(data) > 5_000_000
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), noise)
 

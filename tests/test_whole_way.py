@@ -197,7 +197,7 @@ def _held_against_the_truth(user: new_user.NewUser, records: list[dict[str, Any]
     """No alert before the knock, one after it with the right size; the TCP within what is stated, before and after."""
     assert len(records) == len(user.cam_T_grip)
     raised = [k for k, record in enumerate(records) if any(a["kind"] == "drift" for a in record["alerts"])]
-    assert raised and STEP <= raised[0] <= STEP + 20, raised
+    assert raised and STEP <= raised[0] <= STEP + 25, raised
     assert records[STEP - 1]["state"] == "tracking" and records[-1]["state"] == "drifting"
     errors, sizes = [], []
     for record, true in zip(records, user.cam_T_grip, strict=True):

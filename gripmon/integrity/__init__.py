@@ -2,6 +2,6 @@
 
 from gripmon.integrity.hypotheses import Hypotheses, hypotheses_of
 from gripmon.integrity.quantiles import bounds
-from gripmon.integrity.separation import Separation, levels, separate
+from gripmon.integrity.separation import Doubts, Separation, separate
 
-__all__ = ["Hypotheses", "Separation", "bounds", "hypotheses_of", "levels", "separate"]
+__all__ = ["Doubts", "Hypotheses", "Separation", "bounds", "hypotheses_of", "separate"]

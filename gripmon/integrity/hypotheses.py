@@ -23,16 +23,12 @@ OPENING = 1e-3
 """That the reported jaw opening is wrong by more than its stated standard deviation allows."""
 
 
-MODEL = 1e-2
-"""That the fingers are longer or shorter than the gripper file says: worn, rounded, measured by hand."""
-
-
 @dataclass(frozen=True, slots=True)
 class Hypotheses:
     """h hypotheses about v edges: ``name``, ``prior`` (h,), ``keep`` (h, v) 1 for the edges that are not doubted,
     ``opening`` (h,) whether the reported opening is, too, and ``sudden`` (h,): it begins at some moment, so that where
     the gripper was before still counts.  The first is that nothing is wrong; ``ends`` is the number of the one that no
-    end of a finger is what it seems, ``model`` that of a wrong gripper file.
+    end of a finger is what it seems.
     """
 
     name: tuple[str, ...]
@@ -41,7 +37,6 @@ class Hypotheses:
     opening: NDArray[np.bool_]
     sudden: NDArray[np.bool_]
     ends: int
-    model: int
 
 
 def hypotheses_of(
@@ -67,11 +62,9 @@ def hypotheses_of(
             rows.append((f"finger {name} is not where its model says", FINGER, ~own, False, True))
     if has_opening:
         rows.append(("the jaw opening is wrong", OPENING, whole, True, False))
-    model = len(rows)
-    rows.append(("the fingers are longer or shorter than the gripper file says", MODEL, whole, False, False))
     ends = len(rows)
     rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
     names, prior, keep, opening, sudden = zip(*rows, strict=True)
     return Hypotheses(
-        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends, model
+        tuple(names), np.array(prior), np.array(keep, dtype=float), np.array(opening), np.array(sudden), ends
     )

@@ -1,269 +1,157 @@
-"""How far a measured pose may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+"""Where the gripper has proved to be: the average of the poses that did, once under each thing that may have been wrong
+all along.
 
-Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
-looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
-creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+An edge that has belonged to something else since the first frame bends the average, too, so that the average is kept
+without it as well: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
+time).  Frames err together before a background that stands still: what their scatter doesn't show stays in the
+average's covariance, as in :mod:`gripmon.smoothing`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners import FingerEndsSeen, Measurement
-from gripmon.geometry import from_record, perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.integrity import Hypotheses, bounds, hypotheses_of
-from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, ModelError, Refits, larger
-from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.tracker import Tracker
-from gripmon.records import Array, Protection, ReferenceRecord
+from gripmon.geometry import perturb, perturbation_between
+from gripmon.integrity import Doubts, Hypotheses
+from gripmon.monitor.refits import INFLATION, Refits, of_fingers
+from gripmon.records import Array
+from gripmon.smoothing import LEAST_KEPT, MOST_SCATTER
 
-SECONDS_A_MONTH = 30.0 * 86400.0
+PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
+"""So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
 
-SWINGS = 20.0
-"""Proven frames over which the mount's vibration is learnt."""
+UNUSUAL = 12.6
+"""Squared normalised distance that six normal errors exceed once in twenty times (chi-square)."""
 
 DISPLACED = 33.1
-"""Squared normalised distance that six normal errors exceed once in 100,000 frames (chi-square)."""
+"""The same that they exceed once in 100,000 times."""
 
-MISREAD_END = 0.1
-"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
-border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
+LEAST_YOUNG = 0.2
+"""Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
+little more off than is believed of any average.
 """
 
-LOOK_RISK = 1e-3
-"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+CONFIRMED = 5
+"""Further frames that have to prove a place after a knock in full."""
 
-KNOCKED_UNSEEN = 5e-4
-"""Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
-that the rate of knocks over all the time says too little.
-"""
-
-CORNERS_WHERE_EXPECTED = 3
-"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
+NOTHING, UNKNOWN = -1, 1e12
+"""Stands for no fit, and the factor on another one's covariance that makes it tell nothing."""
 
 
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """A pose (4, 4) that has proved itself, the ``covariance`` (6, 6) of its error, bounds of position and rotation
-    that rest on its frame alone, and when.
+class Lasting(NamedTuple):
+    """What may have been wrong all along: g hypotheses about all of a gripper's edges with their ``name`` and ``prior``
+    (g,), and ``doubted``, the edges that each doubts; an opening that is doubted counts as one more edge.
     """
 
-    cam_T_grip: Array
-    covariance: Array
-    position_m: float
-    rotation_rad: float
-    now_s: float
+    name: tuple[str, ...]
+    prior: Array
+    doubted: tuple[frozenset[int], ...]
 
+    @classmethod
+    def of(cls, every: Hypotheses) -> Lasting:
+        """Those of hypotheses about all edges that don't begin at some moment."""
+        rows = np.flatnonzero(~every.sudden)
+        doubted = _doubted(every, np.arange(every.keep.shape[1]))
+        return cls(tuple(every.name[k] for k in rows), every.prior[rows], tuple(doubted[k] for k in rows))
 
-@dataclass(frozen=True, slots=True)
-class Trust:
-    """What one measurement is worth.
-
-    ``protection`` of the pose that was asked about, ``alone`` what the frame by itself bounds; ``proven``: the fingers'
-    ends are seen as such; ``displaced``: the pose is not where the anchor has it; ``ambiguous``: something else than a
-    knock of the mount explains that, too.  ``instead``: pose and covariance that the anchor and the rest of the edges
-    give under the most probable hypothesis, with its number; None where there is none.  ``ends``: as they were seen.
-    """
-
-    protection: Protection
-    alone: Protection
-    proven: bool
-    displaced: bool = False
-    ambiguous: bool = False
-    instead: tuple[int, Array, Array] | None = None
-    ends: FingerEndsSeen | None = None
-
-
-class Weigher:
-    """Bounds for one monitor's measurements, and the anchor that they rest on."""
-
-    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
-        self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
-        self._floor = _floor(settings)
-        creep = settings.smoothing
-        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
-        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
-        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
-        self._kept: tuple[bytes, Hypotheses] | None = None
-        self.swing: Array = np.zeros(6)
-        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
-        self.anchor: Anchor | None = None
-        self.rebase(reference)
-
-    def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
-        """Where to expect the gripper before anything proves it: at a reference, or at the pose (4, 4) that was known
-        last.  What an older reference left unexplained is over.
+    def rows(self, hypotheses: Hypotheses, edges: NDArray[np.intp]) -> NDArray[np.intp]:
+        """(g,) which of some hypotheses about the seen ``edges`` (v,) each of these is; -1 where nothing of what is
+        seen is beyond its doubt.
         """
-        expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
-        self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
-        self._unexplained: Array | None = None
+        number = {doubted: k for k, doubted in reversed([*enumerate(_doubted(hypotheses, edges))])}
+        known = frozenset[int]().union(*number)
+        return np.array([number.get(doubted & known, NOTHING) for doubted in self.doubted], dtype=np.intp)
+
+
+def _doubted(hypotheses: Hypotheses, edges: NDArray[np.intp]) -> list[frozenset[int]]:
+    own = [frozenset(edges[keep == 0.0].tolist()) for keep in hypotheses.keep]
+    for number in np.flatnonzero(hypotheses.opening).tolist():
+        own[number] = frozenset([-1])
+    return own
+
+
+class Anchor:
+    """The average of poses that proved themselves, from the first one on."""
+
+    def __init__(
+        self, lasting: Lasting, base_T: Array, fits: Refits, rows: NDArray[np.intp], now_s: float, knocked: bool = False
+    ):
+        """``knocked``: the first pose stands elsewhere than before."""
+        self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
+        self._to_confirm = CONFIRMED if knocked else 0
+        self._shift, self._filter, self._of_model = _chosen(fits, rows, base_T)
+        self._frames_variance = np.einsum("hii->hi", self._filter).copy()
+        self._scatter = np.zeros((len(rows), 6))
+        self._weight = PRIOR_FRAMES
+        self._conclude()
 
     @property
-    def expected(self) -> tuple[Array, Array]:
-        """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
-        return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
+    def confirmed(self) -> bool:
+        """Whether so many frames have proved the place that a further one needs to prove less."""
+        return self._to_confirm <= 0
 
-    def sigma(self, now_s: float) -> Array:
-        """(6,) standard deviations of where it is expected, m and rad."""
-        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor))
-
-    def weigh(
-        self,
-        measurement: Measurement,
-        cam_T_grip: Array,
-        ends: FingerEndsSeen | None,
-        now_s: float,
-        explained: int | None = None,
-        look_seen: bool = False,
-    ) -> Trust:
-        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
-
-        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
+    def add(self, fits: Refits, rows: NDArray[np.intp], creep: Array, now_s: float) -> None:
+        """One more proven pose, by its frame's fits; ``rows`` (g,) of those; ``creep`` (6,) variances of the way since
+        the last.
         """
-        risk, edges = self._policy.integrity_risk, measurement.normal.edge
-        if not len(edges):
-            nothing = Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen")
-            return Trust(nothing, nothing, False)
-        hypotheses, wander = self._hypotheses(edges), self._wander(now_s)
-        fits = Refits(measurement, cam_T_grip, hypotheses, self._floor, self._model)
-        anchored = fits.anchored(self.expected[0], self.expected[1] + np.diag(wander))
-        # What would need a knock of the mount besides is not what happened.
-        holds = anchored.surprise <= DISPLACED
-        displaced = not holds[0] and explained is None
-        proven = _proven(ends, displaced)
-        kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else MISREAD_END ** self.confirmations(measurement, ends, kept)
-        prior = hypotheses.prior.copy()
-        prior[hypotheses.ends] = misread * (LOOK_RISK if look_seen else 1.0)
-        free, by_anchor = fits.levels(prior, risk, anchored)
-        # What begins suddenly the anchor bounds; the ends may have been something else from the first frame on.
-        lasting = ~hypotheses.sudden
-        lasting[hypotheses.ends] = True
-        alone = now = free.worst(lasting)
-        if self.anchor is None:
-            return Trust(now, now, proven, displaced, ends=ends)
-        as_then = self._as_then(fits, self.anchor, wander)
-        if not displaced:
-            alone = _smaller(alone, as_then)
-        unseen_s = now_s - self.anchor.now_s
-        jumped = max(self._jumps_per_s * unseen_s, KNOCKED_UNSEEN) * prior[hypotheses.ends] > risk
-        if not (displaced or jumped):
-            # The ends belong to where it was: what else may have been wrong all along is judged by either frame.
-            lasting[hypotheses.ends] = False
-            now = as_then if explained is not None else _smaller(as_then, free.worst(lasting))
-        possible = np.where(holds, prior, 0.0)
-        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
-        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
-        protection = larger(larger(now, by_anchor.worst(holds)), self._as_found())
-        ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        return Trust(protection, alone, proven, displaced, ambiguous, instead, ends)
+        self.now_s = now_s
+        self._to_confirm -= 1
+        shift, covariance, of_model = _chosen(fits, rows, self._base_T)
+        self._filter[:, range(6), range(6)] += creep
+        innovation = shift - self._shift
+        gain = np.linalg.solve(self._filter + covariance, self._filter).transpose(0, 2, 1)
+        self._shift = self._shift + np.einsum("hij,hj->hi", gain, innovation)
+        self._of_model = self._of_model + np.einsum("hij,hfj->hfi", gain, of_model - self._of_model)
+        left = self._filter - gain @ self._filter
+        self._filter = 0.5 * (left + left.transpose(0, 2, 1))
+        variance = np.einsum("hii->hi", covariance)
+        share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filter)), MOST_SCATTER)
+        self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
+        self._scatter += (share - self._scatter) / self._weight
+        # A frame that leaves a direction open says little of what frames usually tell.
+        worth = np.minimum((self._frames_variance / variance).min(axis=1), 1.0)
+        usual = worth**2 * np.einsum("hii->h", gain) / 6.0
+        self._frames_variance += usual[:, None] * (variance - self._frames_variance)
+        self._conclude()
 
-    def _as_then(self, fits: Refits, anchor: Anchor, wander: Array) -> Protection:
-        """The anchor's own bounds for a pose near it."""
-        away = perturbation_between(anchor.cam_T_grip, fits.cam_T_grip)
-        risk = self._policy.integrity_risk
-        crept = np.stack([np.diag(wander[:3]), np.diag(wander[3:])])
-        crept_m, crept_rad = bounds(crept, np.full(2, risk)).tolist()
-        return Protection(
-            anchor.position_m + float(np.linalg.norm(away[:3])) + crept_m,
-            anchor.rotation_rad + float(np.linalg.norm(away[3:])) + crept_rad,
-            risk,
-            "where it was is as uncertain",
-        )
+    def _conclude(self) -> None:
+        young = np.einsum("hii->hi", self._filter) / self._frames_variance
+        scale = np.sqrt(np.maximum(LEAST_YOUNG / young, 1.0))
+        self._filter *= scale[:, :, None] * scale[:, None, :]
+        young = np.clip(young, LEAST_YOUNG, 1.0)
+        # Of errors that last, averaging takes away less than of independent ones.
+        kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT * self._scatter)
+        scale = np.sqrt(kept / young)
+        self._covariance = self._filter * (scale[:, :, None] * scale[:, None, :])
+        self.cam_T_grip = perturb(self._base_T, self._shift[0])
+        self.covariance = self._covariance[0]
+        self.of_model = self._of_model[0]
 
-    def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
-        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one, bounded by itself."""
-        if self.anchor is not None:
-            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
-            # A knock is no vibration, but what rings after it is.
-            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
-            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
-        bound = trust.alone
-        if self.anchor is None and trust.displaced:
-            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
-            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
-        self.anchor = Anchor(cam_T_grip, covariance, bound.position_m, bound.rotation_rad, now_s)
+    def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
+        """What may have been wrong all along with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,) of those,
+        ``wander`` (6,) being the variance of the way that the gripper may have gone since.
 
-    def confirmations(
-        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
-    ) -> int:
-        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
-        further corner.  ``kept`` (v,): the measured edges that count.
+        Under each hypothesis either the average or the frame tells: which knows more, but the frame where they differ.
         """
-        fingers = len(self._gripper.finger_ids)
-        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
-        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
-        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
-        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
-        return int((by_edge * np.maximum(corners, 1)).sum())
-
-    def _as_found(self) -> Protection:
-        """The bound by what the first frames differed from the reference."""
-        away, risk = self._unexplained, self._policy.integrity_risk
-        if away is None:
-            return Protection(0.0, 0.0, risk)
-        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
-        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
-        return Protection(
-            position_m + float(np.linalg.norm(away[:3])),
-            rotation_rad + float(np.linalg.norm(away[3:])),
-            risk,
-            "at the start it wasn't where the reference has it: knocked before, or the model is off",
-        )
-
-    def _wander(self, now_s: float) -> Array:
-        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
-        if self.anchor is None:
-            return self.swing
-        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
-
-    def _hypotheses(self, edges: NDArray[np.intp]) -> Hypotheses:
-        key = edges.tobytes()
-        if self._kept is None or self._kept[0] != key:
-            self._kept = key, _about(edges, self._gripper, self._tracker, self._may_open)
-        return self._kept[1]
+        away = self._shift - perturbation_between(self._base_T, cam_T_grip)
+        covariance = self._covariance + np.diag(wander / INFLATION**2)
+        shift, own, of_model = _chosen(fits, rows, cam_T_grip)
+        apart = shift - away
+        both = np.linalg.solve(own + covariance, apart[:, :, None])[:, :, 0]
+        frame = np.einsum("hi,hi->h", apart, both) > DISPLACED
+        frame |= np.einsum("hii->h", own[:, :3, :3]) < np.einsum("hii->h", covariance[:, :3, :3])
+        away = np.where(frame[:, None], shift, away)
+        covariance = np.where(frame[:, None, None], own, covariance)
+        of_model = np.where(frame[:, None, None], of_model, self._of_model)
+        covariance += of_fingers(of_model) / INFLATION**2
+        return Doubts.of(self._lasting.name, self._lasting.prior, away, covariance, INFLATION)
 
 
-def _proven(ends: FingerEndsSeen | None, displaced: bool) -> bool:
-    """Whether the fingers' ends are seen as ends: where the gripper is expected fewer of their corners do."""
-    if ends is None:
-        return False
-    return ends.sure or (not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED)
-
-
-def _smaller(one: Protection, other: Protection) -> Protection:
-    return one if one.position_m <= other.position_m else other
-
-
-def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
-    names = tuple(gripper.edge_ids[edge] for edge in edges)
-    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
-
-
-def _floor(settings: MonitorSettings) -> Array:
-    """(6,) variances of the error that no averaging removes."""
-    return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
-
-
-def foresee_protection(
-    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
-) -> Protection:
-    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
-    if not len(measurement.normal.edge):
-        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
-    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
-    fits = Refits(
-        measurement,
-        measurement.cam_T_grip,
-        hypotheses,
-        _floor(settings),
-        ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger),
-    )
-    nowhere = fits.anchored(measurement.cam_T_grip, np.diag(np.square([UNBOUNDED_M] * 3 + [UNBOUNDED_RAD] * 3)))
-    return fits.levels(hypotheses.prior, settings.policy.integrity_risk, nowhere)[0].worst(~hypotheses.sudden)
+def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> tuple[Array, Array, Array]:
+    """Shift (g, 6) from a pose (4, 4), covariance (g, 6, 6) and model's error (g, f, 6) of the fits ``rows`` (g,)."""
+    covariance = fits.free_covariance()[rows]
+    covariance[rows == NOTHING] *= UNKNOWN
+    return fits.shifts(base_T)[rows], covariance, fits.of_model[rows]

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
 from gripmon.geometry import invert, rotation_angle, to_record
 from gripmon.gripper import Gripper
-from gripmon.integrity import bounds
 from gripmon.monitor.trust import Standing
 from gripmon.policy import Evidence, Judgement
 from gripmon.records import (
@@ -25,7 +23,6 @@ from gripmon.records import (
     Frame,
     FrameRecord,
     Origin,
-    Protection,
     ReferenceRecord,
     Refusal,
     Severity,
@@ -51,17 +48,6 @@ def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     motion = cam_T_grip @ invert(ref_cam_T_grip)
     x, y, z = (cam_T_grip[:3, 3] - ref_cam_T_grip[:3, 3]).tolist()
     return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
-
-
-def grown(protection: Protection, growth: Array) -> Protection:
-    """The bounds of a transform that is held, with the covariance (6, 6) of what may have happened since on top."""
-    both = np.stack([growth[:3, :3], growth[3:, 3:]])
-    position_m, rotation_rad = bounds(both, np.full(2, protection.risk)).tolist()
-    return msgspec.structs.replace(
-        protection,
-        position_m=protection.position_m + position_m,
-        rotation_rad=protection.rotation_rad + rotation_rad,
-    )
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:

@@ -23,7 +23,6 @@ from gripmon.monitor.answers import (
     flat,
     frozen,
     gripper_astray,
-    grown,
     measured_record,
     of_stream,
     smoothed_record,
@@ -388,14 +387,16 @@ class Monitor:
         )
         if judgement.verdict is Verdict.UNKNOWN or self._covariance is None or self._measured_s is None:
             return blank
-        growth = np.diag(self._policy.hold_variance(self._now_s - self._measured_s))
+        unseen_s = self._now_s - self._measured_s
+        growth = np.diag(self._policy.hold_variance(unseen_s))
+        standing, hidden = self._standing, refusal is None
         return msgspec.structs.replace(
             blank,
             cam_T_grip=to_record(self._cam_T_grip),
             covariance=flat(self._covariance + growth),
             smoothed=smoothed_record(self._average, self._tracker.floor + growth),
             drift=self._drift(),
-            protection=grown(self._standing.protection, growth) if self._standing else None,
+            protection=None if standing is None else self._trust.held(standing, growth, unseen_s, hidden),
         )
 
     def _record(

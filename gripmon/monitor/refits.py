@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners import JAW_UNREPORTED_SIGMA_M, Measurement, prior_information
+from gripmon.corners import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
 from gripmon.geometry import perturb, perturbation_between
-from gripmon.integrity import Hypotheses, Separation, levels, separate
+from gripmon.integrity import Doubts, Hypotheses, Separation, separate
 from gripmon.records import Array, Protection
 
 INFLATION = 1.2
@@ -20,10 +20,13 @@ UNBOUNDED_M, UNBOUNDED_RAD = 1.0, 3.0
 
 
 class Anchored(NamedTuple):
-    """Fits with the anchor's pose as one more measurement, and how much that surprises each of them, (h,)."""
+    """Fits with the anchor's pose as one more measurement, how much that surprises each of them, (h,), and how they are
+    off by the model, (h, f, 6).
+    """
 
     fits: Separation
     surprise: Array
+    of_model: Array
 
 
 class ModelError(NamedTuple):
@@ -35,57 +38,35 @@ class ModelError(NamedTuple):
     axis_grip: Array
     finger: NDArray[np.intp]
 
-    def of_pose(self, inverse: Array, information: Array, edge: NDArray[np.intp], rotation: Array) -> Array:
-        """(6, 6) covariance of the pose by that: a finger that is longer pulls by all its edges together.
-
-        ``inverse`` (m, m) of the normal matrix, ``information`` (v, m, m) of the edges ``edge`` (v,), ``rotation``
-        (3, 3) from gripper to camera.
+    def pulls(self, normal: NormalEquations, rotation: Array) -> Array:
+        """(f, v, m) by which that pulls at a fit, finger by finger: one that is longer by all its edges together.
+        ``rotation`` (3, 3) from gripper to camera.
         """
-        out = np.zeros((6, 6))
-        finger = self.finger[edge]
-        for number in np.unique(finger):
-            pull = (inverse @ information[finger == number].sum(axis=0)[:, :3] @ (rotation @ self.axis_grip))[:6]
-            out += self.sigma_m**2 * np.outer(pull, pull)
-        return out
+        by_edge = self.sigma_m * normal.information[:, :, :3] @ (rotation @ self.axis_grip)
+        own = self.finger[normal.edge] == np.arange(self.finger.max() + 1)[:, None]
+        return np.asarray(own[:, :, None] * by_edge)
 
 
-class Levels(NamedTuple):
-    """Bounds of ``position`` and ``rotation`` (h,) under hypotheses; ``counted`` (h,): those whose probability isn't
-    below their share of the ``risk``.
-    """
+def of_fingers(away: Array) -> Array:
+    """(h, 6, 6) covariances of poses (h, f, 6) that are off by one standard deviation of each finger's length."""
+    return np.einsum("hfi,hfj->hij", away, away)
 
-    position: Array
-    rotation: Array
-    counted: NDArray[np.bool_]
-    risk: float
-    name: tuple[str, ...]
 
-    def worst(self, among: NDArray[np.bool_]) -> Protection:
-        """The largest of those ``among`` (h,) that count."""
-        counted = np.flatnonzero(self.counted & among)
-        if not len(counted):
-            return Protection(0.0, 0.0, self.risk, "")
-        worst = int(counted[np.argmax(self.position[counted])])
-        return Protection(
-            min(float(self.position[worst]), UNBOUNDED_M),
-            min(float(self.rotation[counted].max()), UNBOUNDED_RAD),
-            self.risk,
-            self.name[worst],
-        )
+def protection_of(doubts: Doubts, risk: float) -> Protection:
+    """The protection levels at a ``risk``."""
+    position_m, rotation_rad, name = doubts.levels(risk)
+    return Protection(min(position_m, UNBOUNDED_M), min(rotation_rad, UNBOUNDED_RAD), risk, name)
 
 
 class Refits:
-    """One measurement's fits under h hypotheses, about the published pose ``cam_T_grip`` (4, 4)."""
+    """One measurement's fits under h hypotheses."""
 
-    def __init__(
-        self, measurement: Measurement, cam_T_grip: Array, hypotheses: Hypotheses, floor: Array, model: ModelError
-    ):
+    def __init__(self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError):
         """``floor`` (6,): variances of the error that no averaging removes."""
-        self.cam_T_grip, self._hypotheses, self._floor = cam_T_grip, hypotheses, floor
+        self.hypotheses, self._floor = hypotheses, np.diag(floor)
         self._normal = measurement.normal
         xi = measurement.consensus.xi
         self._fit_T = perturb(measurement.prediction.cam_T_grip, xi[:6])
-        self._published = perturbation_between(self._fit_T, cam_T_grip)
         count, m = len(hypotheses.name), len(xi)
         self._known = np.zeros((count, m, m))
         self._pull = np.zeros((count, m))
@@ -97,17 +78,24 @@ class Refits:
             self._known[:, 6, 6] = told
             self._pull[:, 6] = told * (measurement.jaw_known_m - fitted_m)
         self.free = self._separate(self._known, self._pull)
-        normal = self._normal
-        inverse = np.linalg.inv(normal.information.sum(axis=0) + self._known[0])
-        self._of_model = model.of_pose(inverse, normal.information, normal.edge, cam_T_grip[:3, :3])
+        pulls = model.pulls(self._normal, self._fit_T[:3, :3])
+        self._pulls = np.einsum("hv,fvi->hfi", hypotheses.keep, pulls)
+        self.of_model = self._off(self.free, self._pulls)
+        """(h, f, 6) of how the fits are off where a finger is longer by its standard deviation."""
 
     def _separate(self, known: Array, pull: Array) -> Separation:
         normal = self._normal
-        return separate(normal.pull, normal.information, normal.middle, self._hypotheses.keep, known, pull)
+        return separate(normal.pull, normal.information, normal.middle, self.hypotheses.keep, known, pull)
 
-    def anchored(self, anchor_T: Array, covariance: Array) -> Anchored:
-        """The fits with the gripper known to be at ``anchor_T`` (4, 4) but for ``covariance`` (6, 6)."""
-        information = np.linalg.inv(covariance + np.diag(self._floor))
+    @staticmethod
+    def _off(fits: Separation, pulls: Array) -> Array:
+        return np.einsum("hij,hfj->hfi", fits.inverse, pulls)[:, :, :6]
+
+    def anchored(self, anchor_T: Array, covariance: Array, of_model: Array | float = 0.0) -> Anchored:
+        """The fits with the gripper known to be at ``anchor_T`` (4, 4) but for ``covariance`` (6, 6), and off by the
+        model by ``of_model`` (f, 6).
+        """
+        information = np.linalg.inv(covariance + self._floor)
         at = perturbation_between(self._fit_T, anchor_T)
         known, pull = self._known.copy(), self._pull.copy()
         known[:, :6, :6] += information
@@ -115,29 +103,38 @@ class Refits:
         fits = self._separate(known, pull)
         # The free fit's distance from the anchor, in units of both covariances.
         way = self.free.shift[:, :6] - at
-        both = INFLATION**2 * self.free.covariance[:, :6, :6] + covariance + np.diag(self._floor)
+        both = INFLATION**2 * self.free.covariance[:, :6, :6] + covariance + self._floor
         surprise = np.einsum("hi,hi->h", way, np.linalg.solve(both, way[:, :, None])[:, :, 0])
-        return Anchored(fits, surprise)
+        pulls = self._pulls.copy()
+        pulls[:, :, :6] += of_model @ information if isinstance(of_model, np.ndarray) else 0.0
+        return Anchored(fits, surprise, self._off(fits, pulls))
 
-    def levels(self, prior: Array, risk: float, anchored: Anchored) -> tuple[Levels, Levels]:
-        """Bounds under each hypothesis, by the frame alone and by the anchor too; ``prior`` (h,) of each."""
-        count = len(prior)
-        shift = np.concatenate([self.free.shift[:, :6], anchored.fits.shift[:, :6]])
-        covariance = np.concatenate([self.free.covariance[:, :6, :6], anchored.fits.covariance[:, :6, :6]])
-        covariance[:, range(6), range(6)] += self._floor
-        covariance[[self._hypotheses.model, count + self._hypotheses.model]] += self._of_model / INFLATION**2
-        share = risk / count / np.maximum(prior, 1e-300)
-        position, rotation = levels(shift - self._published, covariance, np.tile(share, 2), INFLATION)
-        counted = prior > risk / count
-        return (
-            Levels(position[:count], rotation[:count], counted, risk, self._hypotheses.name),
-            Levels(position[count:], rotation[count:], counted, risk, self._hypotheses.name),
-        )
+    @property
+    def edges(self) -> NDArray[np.intp]:
+        """(v,) that the fits are made of."""
+        return self._normal.edge
+
+    def shifts(self, base_T: Array) -> Array:
+        """(h, 6) from a pose (4, 4) near by to the fits by the frame alone."""
+        return perturbation_between(base_T, self._fit_T) + self.free.shift[:, :6]
+
+    def free_covariance(self) -> Array:
+        """(h, 6, 6) of the fits by the frame alone, without the model's error."""
+        return self.free.covariance[:, :6, :6] + self._floor
+
+    def doubts(self, cam_T_grip: Array, prior: Array, anchored: Anchored | None = None) -> Doubts:
+        """What may be wrong with a published pose (4, 4) under hypotheses of probability ``prior`` (h,), by the frame
+        alone or by the anchor too.
+        """
+        fits, of_model = (self.free, self.of_model) if anchored is None else (anchored.fits, anchored.of_model)
+        away = fits.shift[:, :6] - perturbation_between(self._fit_T, cam_T_grip)
+        covariance = fits.covariance[:, :6, :6] + self._floor + of_fingers(of_model) / INFLATION**2
+        return Doubts.of(self.hypotheses.name, prior, away, covariance, INFLATION)
 
     def solution(self, anchored: Anchored, number: int) -> tuple[Array, Array]:
         """Pose (4, 4) and covariance (6, 6) under one hypothesis."""
         pose = perturb(self._fit_T, anchored.fits.shift[number, :6])
-        return pose, anchored.fits.covariance[number, :6, :6] + np.diag(self._floor)
+        return pose, anchored.fits.covariance[number, :6, :6] + self._floor
 
 
 def larger(one: Protection, other: Protection) -> Protection:

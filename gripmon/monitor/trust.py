@@ -12,13 +12,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.camera import Camera
-from gripmon.corners import Effort, Measurement
+from gripmon.corners import Measurement
 from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
 from gripmon.look import GripperLook, LookRefused
-from gripmon.monitor.anchor import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
+from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.policy import past_alert_limit
 from gripmon.records import Array, Frame, MonitorState, Protection, ReferenceRecord
 
@@ -74,7 +74,7 @@ class Integrity:
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._frames = 0
-        self._moved = 0
+        self._elsewhere = 0
         self._believed = False
 
     @property
@@ -109,6 +109,12 @@ class Integrity:
         """Where else the gripper may be: where it proved to be last, and where the reference has it."""
         anchor = self._weigher.anchor
         return (ref_cam_T_grip,) if anchor is None else (anchor.cam_T_grip, ref_cam_T_grip)
+
+    def held(self, standing: Standing, growth: Array, unseen_s: float, hidden: bool) -> Protection:
+        """The bounds of what stood ``unseen_s`` ago, with the covariance (6, 6) of what may have happened since on top;
+        ``hidden``: the image is good, and nothing is seen of the gripper.
+        """
+        return self._weigher.held(standing.protection, growth, unseen_s, hidden)
 
     def judge(self, frame: Frame, measurement: Measurement, now_s: float) -> Standing | None:
         """What to publish of a measurement, and what may rest on it; None where the gripper isn't seen."""
@@ -186,9 +192,7 @@ class Integrity:
         if trust.instead is not None and not trust.proven and (trust.displaced or self._short(trust)):
             return self._by_anchor(frame, measurement, trust, now_s)
         where_it_was = self._weigher.anchor is not None and not trust.displaced
-        # A knock is rare: it must be seen, twice where the gripper had to be looked for.
-        self._moved = self._moved + 1 if trust.displaced and trust.proven and not trust.ambiguous else 0
-        moved = self._moved >= (1 if measurement.effort is Effort.NARROW else self._policy.confirm_frames)
+        moved = self._knocked(trust, self._beside_px(measurement, cam_T_grip))
         if trust.proven and (moved or not trust.displaced):
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if frame.image is not None and not moved:
@@ -196,11 +200,20 @@ class Integrity:
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
 
+    def _knocked(self, trust: Trust, beside_px: float) -> bool:
+        """Whether the mount was knocked, the edges showing ``beside_px`` from the old place: so rare that one lucky
+        frame doesn't say so, unless that is no farther than a creep takes them.  Another one has to prove it before the
+        old place is proven again, or something else explains it; it may ring meanwhile.
+        """
+        if not trust.proven:
+            return False
+        self._elsewhere = self._elsewhere + 1 if trust.displaced and not trust.ambiguous else 0
+        return self._elsewhere >= (1 if beside_px < ONE_EDGE_PX else self._policy.confirm_frames)
+
     def _by_anchor(self, frame: Frame, measurement: Measurement, trust: Trust, now_s: float) -> Standing:
         """What the frame leaves open the anchor tells."""
         assert trust.instead is not None
         number, cam_T_grip, covariance = trust.instead
-        self._moved = 0
         seen = self._look_supports(frame, measurement, cam_T_grip)
         trust = self._weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, number, seen)
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed=False, where_it_was=True)

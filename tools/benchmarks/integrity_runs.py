@@ -167,6 +167,7 @@ def _judged(record: FrameRecord, look: Look, risk: float) -> dict[str, Any]:
         "floor_m": None,
         "nees": None,
         "why": "",
+        "reason": record.reason or "",
     }
     if record.cam_T_grip is None or record.covariance is None:
         return out

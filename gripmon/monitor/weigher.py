@@ -1,0 +1,274 @@
+"""How far a measured pose may be off: bounds over everything that may be wrong (see ``docs/integrity.md``).
+
+Two things keep a fit honest beside its own residuals.  The fingers' ends alone tell a motion along the fingers: it is
+looked whether they are seen as ends.  And a mount that was seen to be somewhere a moment ago still is, but for its
+creep, unless it was knocked, which is rare: the last pose that proved itself is the anchor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.geometry import from_record, perturbation_between
+from gripmon.gripper import Gripper
+from gripmon.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
+from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.records import Array, Protection, ReferenceRecord
+
+SECONDS_A_MONTH = 30.0 * 86400.0
+
+SWINGS = 20.0
+"""Proven frames over which the mount's vibration is learnt."""
+
+MISREAD_END = 0.1
+"""Probability that a finger's end that is seen where it is expected is none, and for each further corner of it: what a
+border shows that may be anywhere within the profiles' reach, and is within a tenth of it.
+"""
+
+LOOK_RISK = 1e-3
+"""Odds from which the gripper's learned look counts as seen, or as seen elsewhere."""
+
+KNOCKED_UNSEEN = 5e-4
+"""Probability that the mount is knocked while something hides the fingers' ends: then the gripper touches things, so
+that the rate of knocks over all the time says too little.
+"""
+
+MOST_KEPT = 64
+"""Sets of seen edges whose hypotheses are remembered."""
+
+CORNERS_WHERE_EXPECTED = 3
+"""Corners at the fingers' ends that prove a pose where the gripper is expected; elsewhere four of two fingers do."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trust:
+    """What one measurement is worth.
+
+    ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such; ``displaced``: the
+    pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
+    ``instead``: pose and covariance that the anchor and the rest of the edges give under the most probable hypothesis,
+    with its number; None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where
+    no edge is seen.
+    """
+
+    protection: Protection
+    proven: bool
+    displaced: bool = False
+    ambiguous: bool = False
+    instead: tuple[int, Array, Array] | None = None
+    ends: FingerEndsSeen | None = None
+    fits: Refits | None = None
+
+
+class Weigher:
+    """Bounds for one monitor's measurements, and the anchor that they rest on."""
+
+    def __init__(self, tracker: Tracker, gripper: Gripper, settings: MonitorSettings, reference: ReferenceRecord):
+        self._tracker, self._gripper, self._policy = tracker, gripper, settings.policy
+        self._floor = _floor(settings)
+        creep = settings.smoothing
+        self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
+        self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
+        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+        self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
+        every = np.arange(len(gripper.edge_ids))
+        self._lasting = Lasting.of(_about(every, gripper, tracker, self._may_open))
+        self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
+        self._newest: tuple[Measurement, float, Refits, Anchored] | None = None
+        self.swing: Array = np.zeros(6)
+        """(6,) variance of the way between proven poses, m² and rad²: vibration."""
+        self.anchor: Anchor | None = None
+        self.rebase(reference)
+
+    def rebase(self, reference: ReferenceRecord, last_T: Array | None = None) -> None:
+        """Where to expect the gripper before anything proves it: at a reference, or at the pose (4, 4) that was known
+        last.  What an older reference left unexplained is over.
+        """
+        expected_T = from_record(reference.cam_T_grip) if last_T is None else last_T
+        self._expected = expected_T, np.reshape(reference.covariance, (6, 6))
+        self._unexplained: Array | None = None
+
+    @property
+    def expected(self) -> tuple[Array, Array]:
+        """Where the gripper is expected: pose (4, 4) and covariance (6, 6), of the anchor if there is one."""
+        return self._expected if self.anchor is None else (self.anchor.cam_T_grip, self.anchor.covariance)
+
+    def sigma(self, now_s: float) -> Array:
+        """(6,) standard deviations of where it is expected, m and rad."""
+        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor))
+
+    def weigh(
+        self,
+        measurement: Measurement,
+        cam_T_grip: Array,
+        ends: FingerEndsSeen | None,
+        now_s: float,
+        explained: int | None = None,
+        look_seen: bool = False,
+    ) -> Trust:
+        """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
+
+        ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
+        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
+        """
+        risk, edges = self._policy.integrity_risk, measurement.normal.edge
+        if not len(edges):
+            return Trust(Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "no edge is seen"), False)
+        wander = self._wander(now_s)
+        fits, anchored = self._refitted(measurement, now_s)
+        hypotheses = fits.hypotheses
+        # What would need a knock of the mount besides is not what happened.
+        holds = anchored.surprise <= DISPLACED
+        displaced = not holds[0] and explained is None
+        again = bool(anchored.surprise[0] <= UNUSUAL) and (self.anchor is None or self.anchor.confirmed)
+        proven = _proven(ends, displaced, again)
+        kept = None if explained is None else hypotheses.keep[explained] > 0.0
+        misread = 0.0 if proven else MISREAD_END ** self.confirmations(measurement, ends, kept)
+        prior = hypotheses.prior.copy()
+        prior[hypotheses.ends] = misread * (LOOK_RISK if look_seen else 1.0)
+        if self.anchor is None:
+            # A finger is taken to be straight at first; the ends may have been something else from that on.
+            lasting = ~hypotheses.sudden
+            lasting[hypotheses.ends] = True
+            now = protection_of(fits.doubts(cam_T_grip, prior).among(lasting), risk)
+            return Trust(now, proven, displaced, ends=ends, fits=fits)
+        jumped = self._knocked(now_s - self.anchor.now_s, hidden=True) * prior[hypotheses.ends] > risk
+        if displaced or jumped:
+            all_along = fits.doubts(cam_T_grip, prior)  # what knocks the mount bends a finger, too
+        else:
+            # The ends belong to where it was: what else may have been wrong all along the average knows, too.
+            all_along = self.anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
+        possible = np.where(holds, prior, 0.0)
+        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
+        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
+        since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
+        protection = larger(protection_of(all_along + since, risk), self._as_found())
+        ambiguous = displaced and bool((possible[1:] > 0.0).any())
+        return Trust(protection, proven, displaced, ambiguous, instead, ends, fits)
+
+    def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
+        """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
+        assert trust.fits is not None
+        rows = self._about(trust.fits.edges)[1]
+        if self.anchor is not None:
+            square = np.square(perturbation_between(self.anchor.cam_T_grip, cam_T_grip))
+            # A knock is no vibration, but what rings after it is.
+            noise = self.anchor.covariance.diagonal() + covariance.diagonal() + self.swing
+            self.swing = self.swing + (np.minimum(square, DISPLACED * noise) - self.swing) / SWINGS
+        elif trust.displaced:
+            # Knocked while nobody watched, or marks on the fingers, or a wrong model: a person has to say.
+            self._unexplained = perturbation_between(self._expected[0], cam_T_grip)
+        if self.anchor is None or trust.displaced:
+            self.anchor = Anchor(self._lasting, cam_T_grip, trust.fits, rows, now_s, trust.displaced)
+        else:
+            self.anchor.add(trust.fits, rows, self._creep * max(now_s - self.anchor.now_s, 0.0), now_s)
+
+    def held(self, protection: Protection, growth: Array, unseen_s: float, hidden: bool) -> Protection:
+        """The bounds of a transform that was measured ``unseen_s`` ago, with the covariance (6, 6) of what may have
+        happened since on top; ``hidden``: not the image is bad, but nothing is seen of the gripper in it.
+        """
+        risk = protection.risk
+        if self._knocked(unseen_s, hidden) > risk:
+            return Protection(UNBOUNDED_M, UNBOUNDED_RAD, risk, "knocked while nothing is seen of the gripper")
+        position_m, rotation_rad = bounds(np.stack([growth[:3, :3], growth[3:, 3:]]), np.full(2, risk)).tolist()
+        return Protection(
+            protection.position_m + position_m, protection.rotation_rad + rotation_rad, risk, protection.hypothesis
+        )
+
+    def _knocked(self, unseen_s: float, hidden: bool) -> float:
+        """Probability that the mount was knocked since then; ``hidden``: something is at the gripper."""
+        return max(self._jumps_per_s * unseen_s, KNOCKED_UNSEEN if hidden else 0.0)
+
+    def confirmations(
+        self, measurement: Measurement, ends: FingerEndsSeen | None, kept: NDArray[np.bool_] | None = None
+    ) -> int:
+        """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
+        further corner.  ``kept`` (v,): the measured edges that count.
+        """
+        fingers = len(self._gripper.finger_ids)
+        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
+        edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
+        edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
+        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
+        return int((by_edge * np.maximum(corners, 1)).sum())
+
+    def _as_found(self) -> Protection:
+        """The bound by what the first frames differed from the reference."""
+        away, risk = self._unexplained, self._policy.integrity_risk
+        if away is None:
+            return Protection(0.0, 0.0, risk)
+        covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
+        position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
+        return Protection(
+            position_m + float(np.linalg.norm(away[:3])),
+            rotation_rad + float(np.linalg.norm(away[3:])),
+            risk,
+            "at the start it wasn't where the reference has it: knocked before, or the model is off",
+        )
+
+    def _wander(self, now_s: float) -> Array:
+        """(6,) variance of the way that the gripper may have gone since the anchor: creep and vibration."""
+        if self.anchor is None:
+            return self.swing
+        return self._creep * max(now_s - self.anchor.now_s, 0.0) + self.swing
+
+    def _refitted(self, measurement: Measurement, now_s: float) -> tuple[Refits, Anchored]:
+        """The fits of a measurement, alone and with the anchor.  A frame is weighed anew when its ends were looked at,
+        and for another pose that it allows.
+        """
+        if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
+            fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model)
+            expected_T, covariance = self.expected
+            of_model = 0.0 if self.anchor is None else self.anchor.of_model
+            anchored = fits.anchored(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
+            self._newest = measurement, now_s, fits, anchored
+        return self._newest[2:]
+
+    def _about(self, edges: NDArray[np.intp]) -> tuple[Hypotheses, NDArray[np.intp]]:
+        """What may be wrong with a fit of ``edges`` (v,), and which of it is what may have been wrong all along."""
+        key = edges.tobytes()
+        if key not in self._kept:
+            if len(self._kept) >= MOST_KEPT:
+                self._kept.clear()
+            hypotheses = _about(edges, self._gripper, self._tracker, self._may_open)
+            self._kept[key] = hypotheses, self._lasting.rows(hypotheses, edges)
+        return self._kept[key]
+
+
+def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
+    """Whether the fingers' ends are seen as ends: where the gripper is expected fewer of their corners do, and where it
+    is seen ``again`` as noise has it, one of each finger.
+    """
+    if ends is None:
+        return False
+    expected = not displaced and int(ends.seen.sum()) >= CORNERS_WHERE_EXPECTED
+    return ends.sure or expected or (again and ends.at_each)
+
+
+def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
+    names = tuple(gripper.edge_ids[edge] for edge in edges)
+    return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
+
+
+def _floor(settings: MonitorSettings) -> Array:
+    """(6,) variances of the error that no averaging removes."""
+    return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+
+
+def foresee_protection(
+    tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
+) -> Protection:
+    """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
+    if not len(measurement.normal.edge):
+        return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
+    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
+    model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+    doubts = Refits(measurement, hypotheses, _floor(settings), model).doubts(measurement.cam_T_grip, hypotheses.prior)
+    return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
