@@ -22,8 +22,9 @@ from gripmon.simulator import FrameTruth
 
 
 def test_the_demo_keeps_what_it_promises(tmp_path: Path):
+    """At few frames a second: what a busy machine drops of an event is no reason not to notice it."""
     out = tmp_path / "demo"
-    done = gripmon("demo", "--seconds", "10", "--fps", "12", "--out", out)
+    done = gripmon("demo", "--seconds", "20", "--fps", "6", "--out", out)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     records = [

@@ -286,9 +286,14 @@ def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: P
     router = free_endpoint()
     own_files(tmp_path, router)
     noise = np.random.default_rng(1).integers(0, 256, (1200, 1500, 3), dtype=np.uint8)  # a PNG of it is no smaller
+
+    def paced(i: int) -> Frame:  # a loop that never rests keeps the encoder from its 2 s
+        time.sleep(0.05)
+        return Frame(i, i, noise)
+
     with (
         router_process.running(tmp_path / "router.json5", router),
-        running(PublishSettings(zenoh_config=str(tmp_path / "monitor.json5")), lambda i: Frame(i, i, noise)) as daemon,
+        running(PublishSettings(zenoh_config=str(tmp_path / "monitor.json5")), paced) as daemon,
     ):
         wait_until(lambda: daemon.publisher.connected and daemon.frames, "a frame of a monitor on the network")
         with Client("arm", "wrist", zenoh_config_file=str(tmp_path / "operator.json5")) as operator:

@@ -333,9 +333,9 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             yield recorder
         finally:
             recorder.close(timeout_s=60.0)
-            keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure)
-        if recorder.dropped:
-            print(f"replay: {recorder.dropped} frames are missing in {path}", file=sys.stderr)
+            # A disk that failed for a moment has left a whole file of the frames after it.
+            missing = f"{recorder.dropped} frames are missing" if recorder.dropped else None
+            keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
 
 
 @contextmanager
