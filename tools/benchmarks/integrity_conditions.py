@@ -24,6 +24,9 @@ from gripmon.simulator.scenario import (
     Vibration,
 )
 
+_BUMPED = (0.3, 0.6)
+"""Where in the time in which things happen the mount jumps."""
+
 
 def ordinary(draft: Draft) -> Changes:
     return {}
@@ -165,7 +168,7 @@ def bump(draft: Draft) -> Changes:
     """0.3 to 8 mm in any direction; a third of them along the fingers."""
     size_m = float(np.exp(draft.uniform(np.log(3e-4), np.log(8e-3))))
     ring = draft.one_of(0.0, 0.3)
-    at_s = draft.between_frames_s(draft.uniform(0.3, 0.6))
+    at_s = draft.between_frames_s(draft.uniform(*_BUMPED))
     if draft.chance(0.33):
         x, y, z = (draft.sign() * size_m * draft.cam_T_grip[:3, 2]).tolist()
         return {"mount": (Bump(at_s=at_s, ring_fraction=ring, translation_m=(x, y, z)),)}
@@ -174,11 +177,19 @@ def bump(draft: Draft) -> Changes:
     return {"mount": (Bump(at_s=at_s, ring_fraction=ring, tcp_shift_m=shift),)}
 
 
-def bent(draft: Draft) -> Changes:
-    shift = [draft.sign() * draft.uniform(2e-4, 1.5e-3), draft.sign() * draft.uniform(2e-4, 1.5e-3), 0.0]
+def bent(draft: Draft, share: float = 0.1, times: float = 1.0) -> Changes:
+    shift = [times * draft.sign() * draft.uniform(2e-4, 1.5e-3) for _ in "xy"] + [0.0]
     finger = draft.one_of(*draft.gripper.finger_ids)
-    bend = BentFinger(finger=finger, tip_shift_m=tuple(shift), start_s=draft.between_frames_s(0.1))  # type: ignore[arg-type]
+    bend = BentFinger(finger=finger, tip_shift_m=tuple(shift), start_s=draft.between_frames_s(share))  # type: ignore[arg-type]
     return {"bent_fingers": (bend,)}
+
+
+def crash(draft: Draft) -> Changes:
+    """What knocks the mount bends a finger in the same moment."""
+    share = draft.uniform(*_BUMPED)
+    (knock,) = bump(draft)["mount"]
+    mount = with_(knock, at_s=draft.between_frames_s(share))
+    return bent(draft, share, times=draft.one_of(1.0, 3.0)) | {"mount": (mount,)}
 
 
 def opening_wrong(draft: Draft) -> Changes:
@@ -231,6 +242,7 @@ ORDINARY: tuple[Condition, ...] = (
     Condition("vibration", "the mount vibrates by 0.1 to 0.4 mm", vibration, moves=True),
     Condition("creep", "the mount creeps by 0.2 to 2 mm", creep, moves=True, inside=False),
     Condition("bent finger", "a finger's tip moves by 0.3 to 2 mm", bent, enough=False),
+    Condition("crash", "the mount jumps and bends a finger", crash, enough=False, moves=True, inside=False),
     Condition("opening wrong", "report off by 0.3 to 2 mm", opening_wrong, enough=False),
     Condition("model off", "tips 0.1 to 0.3 mm other than the model", ordinary, enough=False, truth=mismeasured),
     Condition("tips worn", "tips 0.1 to 0.3 mm shorter than the model", worn, enough=False),
