@@ -199,3 +199,23 @@ def test_what_may_have_happened_since_adds_to_the_bound():
     anchor = averaged(frames[:-1])
     levels = [level_m(anchor, frames[-1], wander=np.square(scale * SIGMA)) for scale in (0.0, 0.3, 1.0)]
     assert levels[0] < levels[1] and levels[1] <= levels[2]
+
+
+def test_after_a_long_time_without_proof_the_average_is_the_newest_frame():
+    """What may have crept meanwhile leaves nothing of what was known before."""
+    frames = stream(np.random.default_rng(RNG_SEED), 40, common=0.0)
+    moved = Frame(frames[-1].away + 30.0 * SIGMA, frames[-1].covariance)
+    anchor = averaged(frames[:-1])
+    anchor.add(moved, ROWS, np.square(100.0 * SIGMA), 60.0)
+    off = np.abs(perturbation_between(anchor.cam_T_grip, moved.cam_T_grip))
+    assert (off < SIGMA).all()
+
+
+def test_where_the_average_and_the_frame_differ_beyond_chance_the_average_bounds_nothing():
+    """Under a hypothesis that tells them apart the frame is what is left; else the way between them would be its error."""
+    frames = stream(np.random.default_rng(RNG_SEED), 40, common=0.0)
+    anchor = averaged(frames[:-1])
+    beside = Frame(frames[-1].away + 200.0 * SIGMA, frames[-1].covariance)
+    by_frame = averaged([beside])
+    assert level_m(anchor, beside) == pytest.approx(level_m(by_frame, beside), rel=0.05)
+    assert level_m(anchor, beside) < 30.0 * np.linalg.norm(SIGMA[:3])
