@@ -212,7 +212,7 @@ def test_after_a_long_time_without_proof_the_average_is_the_newest_frame():
 
 
 def test_where_the_average_and_the_frame_differ_beyond_chance_the_average_bounds_nothing():
-    """Under a hypothesis that tells them apart the frame is what is left; else the way between them would be its error."""
+    """Under a hypothesis that tells them apart the frame is left, not the way between them."""
     frames = stream(np.random.default_rng(RNG_SEED), 40, common=0.0)
     anchor = averaged(frames[:-1])
     beside = Frame(frames[-1].away + 200.0 * SIGMA, frames[-1].covariance)
