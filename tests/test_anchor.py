@@ -25,10 +25,14 @@ RNG_SEED = 3
 
 @dataclass
 class Frame:
-    """A frame's fits: ``away`` (g, 6) from :data:`BASE_T` and ``covariance`` (g, 6, 6); the first is published."""
+    """A frame's fits: ``away`` (g, 6) from :data:`BASE_T` and ``covariance`` (g, 6, 6); the first is published.
+
+    ``longer``: by how many standard deviations of its own it is off where a finger is longer than the model says.
+    """
 
     away: np.ndarray
     covariance: np.ndarray
+    longer: float = 0.0
 
     @property
     def cam_T_grip(self) -> np.ndarray:
@@ -42,7 +46,7 @@ class Frame:
 
     @property
     def of_model(self) -> np.ndarray:
-        return np.zeros((len(self.covariance), 2, 6))
+        return np.full((len(self.covariance), 2, 6), self.longer) * SIGMA
 
 
 def shape_of(seed: int = 1) -> np.ndarray:
@@ -219,3 +223,17 @@ def test_where_the_average_and_the_frame_differ_beyond_chance_the_average_bounds
     by_frame = averaged([beside])
     assert level_m(anchor, beside) == pytest.approx(level_m(by_frame, beside), rel=0.05)
     assert level_m(anchor, beside) < 30.0 * np.linalg.norm(SIGMA[:3])
+
+
+def test_what_the_model_is_wrong_by_does_not_average_out():
+    frames = [Frame(f.away, f.covariance, longer=5.0) for f in stream(np.random.default_rng(RNG_SEED), 40, common=0.0)]
+    right = [Frame(f.away, f.covariance) for f in frames]
+    anchor = averaged(frames[:-1])
+    np.testing.assert_allclose(anchor.of_model, frames[0].of_model[0])
+    # Two fingers, each by itself: 5 standard deviations and more, of which none is known to be absent.
+    assert level_m(anchor, frames[-1]) > 3.0 * level_m(averaged(right[:-1]), right[-1])
+    # A model that proves right only now is believed as far as the newest frames count.
+    newer = averaged(frames[:1])
+    for number, frame in enumerate(right):
+        newer.add(frame, ROWS, STILL, 0.1 * number)
+    assert np.abs(newer.of_model).max() < 0.1 * np.abs(frames[0].of_model).max()
