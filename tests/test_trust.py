@@ -5,6 +5,7 @@ Whatever happens, no frame is valid, nor any bound stated, that the truth is bey
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,11 +14,13 @@ import numpy as np
 import pytest
 from meters import box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import Watched, new_monitor, watch
+from watched import Watched, new_monitor, reference_of, watch
 
 from gripmon.camera import make_camera
-from gripmon.corners import FingerEndsSeen
-from gripmon.monitor import MonitorSettings
+from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.geometry import perturb
+from gripmon.monitor import MonitorSettings, Tracker
+from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import Trust
 from gripmon.policy import PolicySettings
 from gripmon.recalibrate import RecalibrationSettings
@@ -249,6 +252,48 @@ def test_one_frame_is_no_knock_nor_are_two_with_the_old_place_between_them():
         assert not trust._knocked(between, 0.0) and not trust._knocked(seen, 10.0)
         assert trust._knocked(seen, 10.0)
     assert not trust._knocked(at_home, 0.0) and trust._knocked(seen, 1.0), "creeps are followed"
+
+
+# --- what a pose elsewhere has to stand against ---
+
+
+def knock_followed(trial: pytest.MonkeyPatch, **instead: Callable[..., object]) -> bool:
+    """Whether a knock in free view is followed at last, with methods of the verdict replaced."""
+    for name, method in instead.items():
+        trial.setattr(Integrity, name, method)
+    seen = watched(scene(28, mount=(along_fingers(3e-3, BEGINS_S),)))
+    return bool(errors_m(seen)[-1] < 1e-3)
+
+
+def test_a_knock_that_the_look_contradicts_is_not_followed(monkeypatch: pytest.MonkeyPatch):
+    assert knock_followed(monkeypatch)
+    assert not knock_followed(monkeypatch, _look_contradicts=lambda *_: True)
+
+
+def test_a_knock_has_to_prove_itself_strictly(monkeypatch: pytest.MonkeyPatch):
+    """Ends that show only while a step on the finger isn't looked for are none."""
+    ends = Tracker.ends
+
+    def but_for_steps(tracker: Tracker, frame: Frame, measurement: Measurement, strict: bool = False) -> FingerEndsSeen:
+        seen = ends(tracker, frame, measurement, strict)
+        return replace(seen, seen=0 * seen.seen) if strict else seen
+
+    monkeypatch.setattr(Tracker, "ends", but_for_steps)
+    assert not knock_followed(monkeypatch)
+
+
+def test_where_the_first_frames_differ_from_the_reference_is_in_the_bound_until_a_person_says_otherwise():
+    """Knocked before it was started, marks taken for the fingers' ends, or a wrong model: an image doesn't tell."""
+    frames, truths = frames_of(scene(20))
+    away = np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0])
+    monitor = new_monitor(cam_T_grip=perturb(nominal_cam_T_grip(), away))
+    seen = watch(frames, truths, monitor)
+    assert errors_m(seen)[-1] < 1e-4 and (bounds_m(seen) > 2e-3).all()
+    assert not valid(seen).any()
+    protection = seen.records[-1].protection
+    assert protection is not None and protection.hypothesis.startswith("at the start it wasn't where")
+    monitor._trust.rebase(reference_of(nominal_cam_T_grip()))
+    assert watch(frames, truths, monitor).records[-1].protection.position_m < 1e-3, "a new reference explains it"
 
 
 # --- again ---

@@ -138,6 +138,8 @@ class Weigher:
             lasting = ~hypotheses.sudden
             lasting[hypotheses.ends] = True
             now = protection_of(fits.doubts(cam_T_grip, prior).among(lasting), risk)
+            if displaced:
+                now = larger(now, self._not_as_expected(perturbation_between(self._expected[0], cam_T_grip)))
             return Trust(now, proven, displaced, ends=ends, fits=fits)
         jumped = self._knocked(now_s - self.anchor.now_s, hidden=True) * prior[hypotheses.ends] > risk
         if displaced or jumped:
@@ -149,7 +151,9 @@ class Weigher:
         number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
         instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
-        protection = larger(protection_of(all_along + since, risk), self._as_found())
+        protection = protection_of(all_along + since, risk)
+        if self._unexplained is not None:
+            protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
         return Trust(protection, proven, displaced, ambiguous, instead, ends, fits)
 
@@ -199,11 +203,9 @@ class Weigher:
         by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
         return int((by_edge * np.maximum(corners, 1)).sum())
 
-    def _as_found(self) -> Protection:
-        """The bound by what the first frames differed from the reference."""
-        away, risk = self._unexplained, self._policy.integrity_risk
-        if away is None:
-            return Protection(0.0, 0.0, risk)
+    def _not_as_expected(self, away: Array) -> Protection:
+        """The bound by what the first frames differ from the reference, ``away`` (6,)."""
+        risk = self._policy.integrity_risk
         covariance = np.stack([self._expected[1][:3, :3], self._expected[1][3:, 3:]])
         position_m, rotation_rad = bounds(covariance, np.full(2, risk)).tolist()
         return Protection(
