@@ -118,7 +118,8 @@ class Snapper:
             return self._rough(placed[0], start_m, why)
         away_px = self._away_px(found, put_px)
         if away_px > FARTHEST_SIGMAS * rough_sigma_px(self.camera):
-            why = f"the edges found lie {away_px:.0f} px from your corners; corners nearer to the fingertips"
+            far = f"{away_px:.0f} px from your corners" if np.isfinite(away_px) else "out of the lens's view"
+            why = f"the edges found lie {far}; corners nearer to the fingertips"
             return self._rough(placed[0], start_m, why)
         return self._measured(found, jaw_opening_m)
 
@@ -182,15 +183,19 @@ class Snapper:
         name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
         if away_px <= sigmas * rough_sigma_px(self.camera):
             return None
-        return f"{name} is {away_px:.0f} px from where the others put it; another corner, or another jaw opening?"
+        beside = f"{away_px:.0f} px from where the others put it"
+        where = beside if np.isfinite(away_px) else "put out of the lens's view by the others"
+        return f"{name} is {where}; another corner, or another jaw opening?"
 
     def _away_px(self, found: Measurement, put_px: Mapping[str, Array]) -> float:
-        """Root mean square distance between the corners put by hand and where the measured gripper has them."""
+        """Root mean square distance between the corners put by hand and where the measured gripper has them; infinite
+        where the lens maps one of them nowhere.
+        """
         if not put_px:
             return 0.0
         model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m)
         apart = [model_px[name] - np.asarray(at) for name, at in put_px.items()]
-        return float(np.sqrt(np.mean(np.square(apart).sum(axis=1))))
+        return float(np.nan_to_num(np.sqrt(np.mean(np.square(apart).sum(axis=1))), nan=np.inf))
 
     def _corners_px(self, cam_T_grip: Array, jaw_opening_m: float | None) -> dict[str, Array]:
         points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]

@@ -167,8 +167,11 @@ class Viewer:
         margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
         sampling = msgspec.structs.replace(sampling, **margins)
         layout = lay_out(self.camera, self.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
-        there = self._predict(layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        # Both have the same samples: those that the lens maps from both poses.
         here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        if there.layout is not here.layout:
+            here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
         profiles = read_profiles(grey, there.map_x, there.map_y)
         noise = estimate_noise(profiles, quantum(grey))
         candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), self._settings.edges, zoom)
