@@ -111,6 +111,11 @@ def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
     assert "the fingers, or near and far, have each other's names" in str(exchanged.snapped.refused)
     empty = np.full_like(rig.image, 120)
     assert "no fingers are seen" in str(bench.look(empty, put(good), (), OPENING_M).snapped.refused)
+    tips = rig.rough("L_in_near", "L_out_near", "R_in_near", "R_out_near")
+    assert "lie on a line" in str(bench.look(empty, put(tips), (), OPENING_M).snapped.refused)
+    assert bench.look(rig.image, put(tips), (), OPENING_M).snapped.refused is None, "the edges say the rest"
+    hidden = rig.rough("L_in_far", "R_in_near", "R_in_far", "L_out_far", off_px=8.0)
+    assert bench.look(rig.image, put(hidden), (), OPENING_M).snapped.refused is None
     away = {name: [u, v - 150.0] for name, (u, v) in good.items()}
     assert bench.look(rig.image, put(away), (), OPENING_M).snapped.refused is not None
 
@@ -320,7 +325,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
         ([image, "--page", "--config", camera, "--jaw-source", "zenoh"], "--jaw-source: --config says where"),
         ([image, *page, "--live-wait", "3"], "--live-wait: goes with --live"),
-        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, or --reference FILE"),
+        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, hidden ones too"),
         ([image, *page, "--corners", rough], "--page and --corners"),
         ([image, *page, "--config", camera], "--config has camera, gripper and reference already"),
         ([image, *page, "--jaw-opening", "0.2"], "jaw opening 0.2 m; the gripper's 0 to 0.06 m"),
