@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gripmon.camera import Camera
@@ -10,6 +12,24 @@ from gripmon.records import Frame, Refusal
 
 _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 """Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
+
+_FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
+
+
+def in_full_scale(frame: Frame, bit_depth: int) -> Frame:
+    """The frame with 16-bit grey levels up to 65535, of an image whose camera fills only the lowest ``bit_depth`` of
+    the 16 bits; without an image, and a fault that says why, where it holds more than these.
+    """
+    image = frame.image
+    if bit_depth == 16 or not isinstance(image, np.ndarray) or image.dtype != np.uint16 or not image.size:
+        return frame
+    brightest, top = int(image.max()), (1 << bit_depth) - 1
+    if brightest > top:
+        fault = f"grey level {brightest}; at most {top} with monitor.bit_depth {bit_depth}"
+        return replace(frame, image=None, refusal=Refusal.WRONG_TYPE, fault=fault)
+    # The high bits again as the low ones: the brightest becomes 65535.
+    scaled = np.bitwise_or(np.left_shift(image, 16 - bit_depth), np.right_shift(image, 2 * bit_depth - 16))
+    return replace(frame, image=scaled)
 
 
 def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, str] | None:
@@ -40,7 +60,8 @@ def _grey_levels(sparse: np.ndarray) -> tuple[Refusal, str] | None:
     if low < 0.0 or high > scale:
         return Refusal.WRONG_TYPE, f"float pixels from {low:g} to {high:g}; float images in 0 to 1"
     if high <= _DARK * scale:
-        return Refusal.BLACK, f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
+        said = f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
+        return Refusal.BLACK, said + (_FEWER_BITS if sparse.dtype == np.uint16 and high > 0.0 else "")
     if low >= _BRIGHT * scale:
         return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
     if high - low <= _FLAT * scale:

@@ -226,7 +226,7 @@ def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
     """An image that fits the camera, with its jaw opening; anything else ends the command with exit code 2."""
     from gripmon.cli.teach_inputs import read_fitting_image
 
-    image = read_fitting_image(path, config.camera, config.gripper)
+    image = read_fitting_image(path, config.camera, config.gripper, config.settings.monitor.bit_depth)
     opening_m = _opening(path, config, jaw_opening_m)
     return _Input(path, image, hashlib.sha256(path.read_bytes()).hexdigest(), opening_m)
 

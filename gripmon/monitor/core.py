@@ -16,7 +16,7 @@ from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, 
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
 from gripmon.gripper import Gripper
-from gripmon.inspection import inspect
+from gripmon.inspection import in_full_scale, inspect
 from gripmon.monitor.answers import (
     after_restart,
     drift_between,
@@ -167,6 +167,7 @@ class Monitor:
     def process(self, frame: Frame) -> FrameRecord:
         """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
         self.ponder()
+        frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
         faults = self._look_at_stream(frame)
         refusal = inspect(frame, self._camera, self._gripper) or frozen(faults)
