@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from gripmon.camera import Camera
@@ -14,22 +12,6 @@ _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 """Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
 
 _FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
-
-
-def in_full_scale(frame: Frame, bit_depth: int) -> Frame:
-    """The frame with 16-bit grey levels up to 65535, of an image whose camera fills only the lowest ``bit_depth`` of
-    the 16 bits; without an image, and a fault that says why, where it holds more than these.
-    """
-    image = frame.image
-    if bit_depth == 16 or not isinstance(image, np.ndarray) or image.dtype != np.uint16 or not image.size:
-        return frame
-    brightest, top = int(image.max()), (1 << bit_depth) - 1
-    if brightest > top:
-        fault = f"grey level {brightest}; at most {top} with monitor.bit_depth {bit_depth}"
-        return replace(frame, image=None, refusal=Refusal.WRONG_TYPE, fault=fault)
-    # The high bits again as the low ones: the brightest becomes 65535.
-    scaled = np.bitwise_or(np.left_shift(image, 16 - bit_depth), np.right_shift(image, 2 * bit_depth - 16))
-    return replace(frame, image=scaled)
 
 
 def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, str] | None:

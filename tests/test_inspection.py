@@ -9,7 +9,8 @@ from simulated import PAPER_LENS, sharp_gripper
 
 from gripmon.camera import make_camera
 from gripmon.gripper import gripper_from_dict
-from gripmon.inspection import in_full_scale, inspect
+from gripmon.inspection import inspect
+from gripmon.pixels import in_full_scale
 from gripmon.records import Frame, Refusal
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), sharp_gripper()
@@ -125,6 +126,10 @@ def test_bits_that_a_camera_leaves_empty(bits: int):
     assert scaled.image.dtype == np.uint16 and scaled.image[0, :2].tolist() == [0, 65535]
     np.testing.assert_allclose(scaled.image / 65535.0, filled / top, atol=1.0 / 65535.0 + 1e-9)
     assert filled.max() == top, "the caller's image stays what it is"
+    again = in_full_scale(scaled, bits)
+    assert again is scaled, "as a recorded one comes back"
+    dark = in_full_scale(frame((filled >> max(bits - 4, 0)).astype(np.uint16)), bits)
+    assert in_full_scale(dark, bits) is dark, "nor does a dark one become bright"
     brighter = filled.copy()
     brighter[5, 5] = top + 1
     refused = inspect(in_full_scale(frame(brighter), bits), CAMERA, GRIPPER)

@@ -180,7 +180,8 @@ class Gripper:
         corners = self._nominal_points_m[loop]
         if np.dot(normal_of(corners), corners.mean(axis=0) - centre) < 0.0:
             raise GripperError(
-                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside"
+                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside, or, "
+                "for a finger that isn't convex, no faces"
             )
         finger = finger_index[face.finger]
         return [FaceLoop(finger, loop[list(flat)]) for flat in self._flat(f"faces[{index}].points", corners)]

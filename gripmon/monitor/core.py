@@ -16,7 +16,7 @@ from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, 
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.geometry import from_record, perturbation_between, to_record
 from gripmon.gripper import Gripper
-from gripmon.inspection import in_full_scale, inspect
+from gripmon.inspection import inspect
 from gripmon.monitor.answers import (
     after_restart,
     drift_between,
@@ -35,6 +35,7 @@ from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity, Standing
+from gripmon.pixels import in_full_scale
 from gripmon.policy import Evidence, Judgement, Policy
 from gripmon.recalibrate import Proposal
 from gripmon.recalibrate import Refusal as Refused
