@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 from box_models import cube_model
-from meters import FISHEYE_LENS, box_gripper, measure, meter, moved
+from meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
-from gripmon.camera import Camera, FisheyeLens, LensSettings, make_camera
+from gripmon.camera import Camera, LensSettings, make_camera
 from gripmon.corners.lines import CornerGeometry, CornerSettings
 from gripmon.corners.prediction import FEWEST_SAMPLES, Prediction, SamplingSettings, lay_out, predict
 from gripmon.corners.profiles import profile_offsets_px
@@ -20,8 +20,6 @@ LENS_NAMES = ["paper", "brown_conrady", "fisheye"]
 OPENING_M = 0.031
 ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")
 OFFSETS_PX = profile_offsets_px(7.0)
-WIDE_LENS = FisheyeLens(width_px=640, height_px=540, fx_px=230.0, fy_px=230.0, cx_px=320.0, cy_px=270.0)
-"""Its image reaches beyond the 89 degrees at which the model ends."""
 
 
 def predicted(

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
+from meters import WIDE_LENS
+from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
 from taught_by_hand import Rig, make_rig
 
 from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
@@ -30,7 +31,7 @@ from gripmon.simulator import Simulator
 from gripmon.simulator.scenario import JawScript, Sensor
 from gripmon.teaching import TeachingImage
 from gripmon.teaching.bench import Bench
-from gripmon.teaching.corner_pose import CameraError, pose_from_corners
+from gripmon.teaching.corner_pose import CameraError, PoseRefused, pose_from_corners
 from gripmon.teaching.placing import place, usual_view
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
@@ -118,6 +119,19 @@ def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
     assert bench.look(rig.image, put(hidden), (), OPENING_M).snapped.refused is None
     away = {name: [u, v - 150.0] for name, (u, v) in good.items()}
     assert bench.look(rig.image, put(away), (), OPENING_M).snapped.refused is not None
+
+
+def test_a_corner_put_by_hand_beyond_the_lens_gives_no_pose():
+    """A fisheye's image reaches farther than its model."""
+    pose = nominal_cam_T_grip(tcp_m=(0.0, 0.002, 0.035))
+    image = simulator(plain_scenario(), lens=WIDE_LENS, cam_T_grip=pose).render(0)
+    camera, gripper = make_camera(WIDE_LENS), sharp_gripper()
+    points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points] @ pose[:3, :3].T + pose[:3, 3]
+    shown = dict(zip(gripper.corner_ids, camera.project(points_m), strict=True))
+    found = Bench(camera, gripper, MonitorSettings(), None).look(image, shown, (), OPENING_M)
+    assert found.reference is not None
+    with pytest.raises(PoseRefused, match="L_in_near was put where the lens shows nothing"):
+        pose_from_corners(camera, gripper, found.snapped, {"L_in_near": np.array([1.0, 1.0])})
 
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="../shared/data/visp_cube is not there")
