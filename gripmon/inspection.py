@@ -11,6 +11,8 @@ from gripmon.records import Frame, Refusal
 _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 """Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""
 
+_FEWER_BITS = " of 16 bits; monitor.bit_depth, if the camera fills only 10 or 12 of them"
+
 
 def inspect(frame: Frame, camera: Camera, gripper: Gripper) -> tuple[Refusal, str] | None:
     """None if the frame may be measured; else the reason, and in words what came and what would be right."""
@@ -40,7 +42,8 @@ def _grey_levels(sparse: np.ndarray) -> tuple[Refusal, str] | None:
     if low < 0.0 or high > scale:
         return Refusal.WRONG_TYPE, f"float pixels from {low:g} to {high:g}; float images in 0 to 1"
     if high <= _DARK * scale:
-        return Refusal.BLACK, f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
+        said = f"no pixel brighter than {100.0 * high / scale:.0f} % of the full scale"
+        return Refusal.BLACK, said + (_FEWER_BITS if sparse.dtype == np.uint16 and high > 0.0 else "")
     if low >= _BRIGHT * scale:
         return Refusal.WHITE, f"no pixel darker than {100.0 * low / scale:.0f} % of the full scale"
     if high - low <= _FLAT * scale:

@@ -1,13 +1,14 @@
-"""Raw pixels as cameras send them, by ROS's names of their formats."""
+"""Raw pixels as cameras send them, by ROS's names of their formats, and 16-bit ones of which they fill a part."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Image
+from gripmon.records import Frame, Image, Refusal
 
 
 class Pixels(NamedTuple):
@@ -69,3 +70,32 @@ def unpacked(rows: NDArray[Any], width: int, pixels: Pixels) -> Image:
 
     converted: Image = cv2.cvtColor(image, getattr(cv2, pixels.conversion))
     return converted
+
+
+def in_full_scale(frame: Frame, bit_depth: int) -> Frame:
+    """The frame with 16-bit grey levels up to 65535, of an image whose camera fills only the lowest ``bit_depth`` of
+    the 16 bits; without an image, and a fault that says why, where it holds more than these.
+
+    An image that this has been done to stays as it is, as a recorded one.
+    """
+    image = frame.image
+    if bit_depth == 16 or not isinstance(image, np.ndarray) or image.dtype != np.uint16 or not image.size:
+        return frame
+    # A look at some of them spares most images the whole comparison.
+    if all(np.array_equal(part, _filled(_levels(part, bit_depth), bit_depth)) for part in (image[::16, ::16], image)):
+        return frame
+    brightest, top = int(image.max()), (1 << bit_depth) - 1
+    if brightest > top:
+        fault = f"grey level {brightest}; at most {top} with monitor.bit_depth {bit_depth}"
+        return replace(frame, image=None, refusal=Refusal.WRONG_TYPE, fault=fault)
+    return replace(frame, image=_filled(image, bit_depth))
+
+
+def _levels(image: NDArray[Any], bit_depth: int) -> NDArray[Any]:
+    """The high bits of grey levels in full scale."""
+    return np.asarray(image >> (16 - bit_depth), dtype=np.uint16)
+
+
+def _filled(levels: NDArray[Any], bit_depth: int) -> NDArray[Any]:
+    """Grey levels of so many bits in 16: the high bits again as the low ones, so that the brightest becomes 65535."""
+    return np.asarray((levels << (16 - bit_depth)) | (levels >> (2 * bit_depth - 16)), dtype=np.uint16)

@@ -9,11 +9,12 @@ import math
 import statistics
 from collections import deque
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from gripmon.records import Cause, Frame, Image
 
@@ -24,6 +25,17 @@ SEEN_BEFORE = 8
 
 USUAL_RUNS = 4
 """A source that repeats frames now and then is frozen after so many times its longest repetition."""
+
+STOOD_SHARE = 0.95
+"""Part of an image's pixels that are the same to the bit as in the one before, while others aren't, from which it is a
+coded stream: of a sensor's own pixels fewer than nine in ten come again, down to a noise of 0.1 grey levels.
+"""
+
+FEWEST_INNER = 200
+"""Pixels neither black nor white, of some 1,700, without which an image doesn't tell."""
+
+CODED_FRAMES = 3
+"""So many such images make sure of it."""
 
 CALM_FRAMES = 30
 """Frames without a fault of their stamps after which the clock is right again."""
@@ -60,6 +72,15 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         float, Meta(gt=0.0, le=3600.0, description="identical images for so long mean a frozen camera (s)")
     ] = 1.0
     frozen_frames: Annotated[int, Meta(ge=2, le=100000, description="and at least so many of them")] = 10
+    frozen_coded_s: Annotated[
+        float,
+        Meta(
+            gt=0.0,
+            le=3600.0,
+            description="the same where images have come that repeat in large parts: H.264 and the like send nothing "
+            "for what stands still until their next whole image (s)",
+        ),
+    ] = 10.0
     rate_s: Annotated[
         float, Meta(gt=0.0, le=3600.0, description="a frame rate that is not the usual one for so long is a fault (s)")
     ] = 2.0
@@ -110,10 +131,14 @@ class StreamWatch:
 
 
 class _Frozen:
-    """Sensors make noise: no two images of a working camera are the same."""
+    """Sensors make noise: no two of their images are the same.  A coder may leave it out: then whole images come again
+    while nothing moves, and before they do, large parts of them.
+    """
 
     def __init__(self, settings: StreamSettings):
         self._settings = settings
+        self._sample: NDArray[Any] | None = None
+        self._coded = 0
         self._before: deque[int] = deque(maxlen=SEEN_BEFORE)
         self._run = 0
         self._since_ns = 0
@@ -132,6 +157,8 @@ class _Frozen:
         number = hash(sample.tobytes())
         again = number in self._before
         self._before.append(number)
+        self._coded += not again and _stands_in_large_parts(sample, self._sample)
+        self._sample = sample.copy()
         # An even image shows no noise, and is another fault.
         if not again or sample.size == 0 or sample.min() == sample.max():
             self._longest = self._longest if self._frozen else max(self._longest, self._run)
@@ -141,11 +168,23 @@ class _Frozen:
         # Stamps may stand still together with the images.
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
         enough = max(self._settings.frozen_frames, USUAL_RUNS * self._longest)
-        self._frozen |= self._run >= enough and lasted_ns >= _NS * self._settings.frozen_s
+        settings = self._settings
+        frozen_s = settings.frozen_s if self._coded < CODED_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
+        self._frozen |= self._run >= enough and lasted_ns >= _NS * frozen_s
         if not self._frozen:
             return None
         text = f"the last {self._run} images repeat earlier ones to the bit: the camera, or its driver, is frozen"
         return StreamFault("frozen", Cause.CAMERA_FROZEN, text)
+
+
+def _stands_in_large_parts(sample: NDArray[Any], before: NDArray[Any] | None) -> bool:
+    """Whether two samples of images differ, but in few of the pixels; those cut off at black or white always stand."""
+    if before is None or before.shape != sample.shape or before.dtype != sample.dtype:
+        return False
+    inner = (sample > sample.min()) & (sample < sample.max())
+    count = int(np.count_nonzero(inner))
+    same = int(np.count_nonzero(inner & (sample == before)))
+    return count >= FEWEST_INNER and STOOD_SHARE * count <= same
 
 
 class _Clock:

@@ -23,6 +23,8 @@ FISHEYE_LENS = FisheyeLens(
     cy_px=290.0,
     coefficients=(0.03, -0.02, 0.004, 0.0),
 )
+WIDE_LENS = FisheyeLens(width_px=640, height_px=540, fx_px=230.0, fy_px=230.0, cx_px=320.0, cy_px=270.0)
+"""Its image reaches beyond the 89 degrees at which the model ends."""
 NARROW = Patience(when_doubtful=False, when_lost=False)
 EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 USUAL_SHARE = 0.9

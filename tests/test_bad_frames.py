@@ -245,3 +245,18 @@ def test_random_frames_of_any_kind_never_raise():
         assert_sound(record)
         if kind < 5:
             assert record.source is Origin.HELD, "noise is no gripper"
+
+
+def test_ten_bits_in_sixteen_are_measured_as_the_same_picture_in_eight():
+    frames = frames_of("static")[0][:4]
+    ten_bits = [replaced(f, image=np.asarray(f.image).astype(np.uint16) << 2) for f in frames]
+    settings = MonitorSettings(bit_depth=10)
+    eight, ten, unknown = new_monitor(), new_monitor(settings=settings), new_monitor()
+    for plain, wide in zip(frames, ten_bits, strict=True):
+        expected, found = eight.process(plain), ten.process(wide)
+        assert expected.cam_T_grip is not None and found.cam_T_grip is not None
+        apart_m = np.subtract(expected.cam_T_grip.translation_m, found.cam_T_grip.translation_m)
+        assert np.abs(apart_m).max() < 1e-5 and found.verdict is expected.verdict
+        assert "black" in unknown.process(wide).reason and "monitor.bit_depth" in unknown.process(wide).reason
+    brighter = replaced(ten_bits[-1], image=ten_bits[-1].image + np.uint16(200))
+    assert "at most 1023 with monitor.bit_depth 10" in ten.process(brighter).reason

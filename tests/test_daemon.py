@@ -187,7 +187,7 @@ def test_a_duration_ends_a_source_that_has_no_end():
 
 
 class Jaw:
-    def opening_m(self) -> float | None:
+    def opening_m(self, stamp_ns: int | None = None) -> float | None:
         return 0.0125
 
     def fault(self) -> str:

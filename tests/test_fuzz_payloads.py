@@ -121,15 +121,15 @@ def test_15000_jaw_messages():
     for payload in jaws(4, 16_500):
         count += 1
         try:
-            opening_m = opening_of_json(payload)
+            opening_m = opening_of_json(payload).opening_m
         except JawError as error:
             assert_one_line(error)
             continue
         # A number, but none of metres of a gripper: refused by whoever knows the travel.
         assert abs(opening_m) > 1.0, f"{payload!r} is no opening, but {opening_m} came out"
     assert count > 15_000
-    assert opening_of_json(b'{"stamp_ns": 1, "opening_m": 0.03}') == opening_of_json(b" 0.03\n") == 0.03
-    assert opening_of_json(b"0") == 0.0
+    assert opening_of_json(b'{"stamp_ns": 1, "opening_m": 0.03}') == (1, 0.03)
+    assert opening_of_json(b" 0.03\n") == (0, 0.03) and opening_of_json(b"0") == (0, 0.0)
 
 
 def test_5000_joint_states():
@@ -137,14 +137,15 @@ def test_5000_joint_states():
     refused = 0
     for payload in ros(5, 5_000, joint_state()):
         try:
-            opening_m = decode(payload)
+            reported = decode(payload)
         except JawError as error:
             assert_one_line(error)
             refused += 1
             continue
-        assert opening_m is None or np.isfinite(opening_m)
+        assert reported is None or np.isfinite(reported.opening_m)
     assert refused > 2_500
-    assert decode(joint_state()) == 0.03
+    reported = decode(joint_state())
+    assert reported is not None and reported.opening_m == 0.03
 
 
 def test_6000_commands():

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 import yaml
 from box_models import Model, cube_model, two_fingers_model
+from scipy.spatial import ConvexHull
 
+from gripmon.cli import main
+from gripmon.config import builtin_config
 from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.simulator.solids import finger_solids
 
 SHIPPED = sorted((Path(__file__).parent.parent / "configs" / "grippers").glob("*.yaml"))
 
@@ -142,6 +146,43 @@ def test_visible_edges_creases_and_corners_are_those_that_rays_find(model: Model
             if np.abs(box - eye).min() >= 1e-3:
                 assert corners[corner] == _seen(eye, points[point], *box)
     assert (counts > 150).all(), "all three kinds occurred"
+
+
+def test_a_skewed_face_is_the_triangles_of_the_convex_solid():
+    """Against the convex hull, whose facets know nothing of the file's faces."""
+    rng = np.random.default_rng(4)
+    for name in ("cube_000", "cube_101", "cube_110"):
+        model = cube_model()
+        point = model["points"][name]
+        # Outwards, across two of its faces: their solid stays convex with the right one of both cuts.
+        point["xyz_m"] = [1.15 * v if axis else v for axis, v in enumerate(point["xyz_m"])]
+        gripper = gripper_from_dict(model)
+        points = gripper.points_grip_m()
+        assert len(gripper.faces) == 8 and len(gripper.notes) == 2
+        assert all(" mm off a plane: taken as 2 triangles" in note for note in gripper.notes)
+        (solid,) = finger_solids(gripper)  # which refuses what isn't closed, flat and convex
+        assert len(solid.loops) == 8
+        hull = ConvexHull(points)
+        for eye in rng.normal(0.0, 0.1, (60, 3)):
+            height = hull.equations[:, :3] @ eye + hull.equations[:, 3]
+            if np.abs(height).min() < 1e-4 or (height < 0.0).all():
+                continue
+            seen = [
+                any(height[k] > 0.0 for k, facet in enumerate(hull.simplices) if {start, end} <= set(facet))
+                for start, end in gripper.edge_points
+            ]
+            np.testing.assert_array_equal(gripper.edge_view(points, eye).visible, seen)
+
+
+def test_check_says_which_faces_are_skewed(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    values = yaml.safe_load(SHIPPED[1].read_text())
+    name = values["faces"][0]["points"][0]
+    values["points"][name]["xyz_m"][0] += 0.003
+    (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
+    demo = yaml.safe_load(builtin_config("demo.yaml").read_text())
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({**demo, "gripper": "gripper.yaml"}, sort_keys=False))
+    assert main(["check", str(tmp_path / "config.yaml")]) == 0
+    assert " mm off a plane: taken as 2 triangles; if it is flat, one of its points is wrong" in capsys.readouterr().out
 
 
 def test_edges_without_faces_are_visible_and_of_the_kind_that_the_file_says():

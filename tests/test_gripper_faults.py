@@ -261,8 +261,18 @@ def test_files_that_cannot_be_read_as_a_gripper_say_so(tmp_path: Path):
     assert load_gripper(file).name == "cube"
 
 
-def test_a_face_that_is_not_flat_is_refused():
+def test_a_face_with_a_point_far_off_is_refused():
     model = cube_model()
-    model["points"]["cube_000"]["xyz_m"] = [-0.028, -0.02, -0.02]
-    with pytest.raises(GripperError, match=r"faces\[\d\]\.points: .*plane"):
+    model["points"]["cube_000"]["xyz_m"] = [-0.02, -0.02, 0.01]
+    with pytest.raises(
+        GripperError, match=r"faces\[\d\]\.points: \d+\.\d mm off a plane, of .* is wrong, or several faces"
+    ):
+        gripper_from_dict(model)
+
+
+def test_a_face_of_points_on_a_line_is_refused():
+    model = cube_model()
+    model["points"]["middle"] = {"finger": "cube", "xyz_m": [-0.02, -0.02, 0.0]}
+    model["faces"].append({"finger": "cube", "points": ["cube_000", "middle", "cube_001"]})
+    with pytest.raises(GripperError, match=r"faces\[6\]\.points: these points lie on a line"):
         gripper_from_dict(model)

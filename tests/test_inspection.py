@@ -10,6 +10,7 @@ from simulated import PAPER_LENS, sharp_gripper
 from gripmon.camera import make_camera
 from gripmon.gripper import gripper_from_dict
 from gripmon.inspection import inspect
+from gripmon.pixels import in_full_scale
 from gripmon.records import Frame, Refusal
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), sharp_gripper()
@@ -112,3 +113,34 @@ def test_openings_far_beyond_the_jaws_range_are_refused(opening_m: float):
 
 def test_a_gripper_without_a_jaw_takes_any_opening():
     assert inspect(frame((RAMP * 255).astype(np.uint8), 34.0), CAMERA, gripper_from_dict(cube_model())) is None
+
+
+@pytest.mark.parametrize("bits", [8, 10, 12, 14])
+def test_bits_that_a_camera_leaves_empty(bits: int):
+    """Mono10 and Mono12 in 16 bits: the lowest ones.  What was black before is the picture that it is."""
+    top = (1 << bits) - 1
+    filled = np.round(RAMP * top).astype(np.uint16)
+    filled[0, :2] = 0, top
+    scaled = in_full_scale(frame(filled), bits)
+    assert inspect(scaled, CAMERA, GRIPPER) is None and scaled.image is not None
+    assert scaled.image.dtype == np.uint16 and scaled.image[0, :2].tolist() == [0, 65535]
+    np.testing.assert_allclose(scaled.image / 65535.0, filled / top, atol=1.0 / 65535.0 + 1e-9)
+    assert filled.max() == top, "the caller's image stays what it is"
+    again = in_full_scale(scaled, bits)
+    assert again is scaled, "as a recorded one comes back"
+    dark = in_full_scale(frame((filled >> max(bits - 4, 0)).astype(np.uint16)), bits)
+    assert in_full_scale(dark, bits) is dark, "nor does a dark one become bright"
+    brighter = filled.copy()
+    brighter[5, 5] = top + 1
+    refused = inspect(in_full_scale(frame(brighter), bits), CAMERA, GRIPPER)
+    assert refused == (Refusal.WRONG_TYPE, f"grey level {top + 1}; at most {top} with monitor.bit_depth {bits}")
+
+
+def test_bit_depth_is_about_16_bits_only():
+    for image in ((RAMP * 255).astype(np.uint8), RAMP.astype(np.float32), None):
+        assert in_full_scale(frame(image), 12).image is image
+    whole = frame((RAMP * 65535).astype(np.uint16))
+    assert in_full_scale(whole, 16) is whole
+    ten = inspect(frame((RAMP * 1023).astype(np.uint16)), CAMERA, GRIPPER)
+    assert ten is not None and ten[0] == Refusal.BLACK and "monitor.bit_depth" in ten[1]
+    assert "bit_depth" not in str(inspect(frame(np.zeros((HEIGHT, WIDTH), np.uint16)), CAMERA, GRIPPER))

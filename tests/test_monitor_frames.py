@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from meters import moved
 from scipy.spatial.transform import Rotation
-from simulated import nominal_cam_T_grip
+from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, replaced
 
+from gripmon.causes import CauseJudge
 from gripmon.records import AlertKind, Cause, Verdict, to_json
 
 
@@ -59,3 +60,32 @@ def test_time_is_the_frames_own_and_never_runs_backwards():
     assert (same.alerts, same.verdict) == ((), Verdict.VALID)
     assert earlier.reason == "the stream of frames is at fault" and same.reason is None
     assert to_json(same) == to_json(msgspec.structs.replace(earlier, alerts=(), verdict=Verdict.VALID, reason=None))
+
+
+def test_a_caller_may_read_every_image_into_the_same_memory():
+    """What moved is worked out later, and must not be of the next image, or of nothing."""
+    buffer = np.zeros((PAPER_LENS.height_px, PAPER_LENS.width_px), np.uint8)
+    apart, reused, explained = new_monitor(), new_monitor(), 0
+    for frame in frames_of("bent_finger")[0]:
+        expected = apart.process(frame)
+        buffer[:] = frame.image
+        found = reused.process(replaced(frame, image=buffer))
+        buffer[:] = 77
+        assert to_json(found) == to_json(expected)
+        explained += any("bent" in alert.text for alert in expected.alerts)
+    assert explained
+
+
+def test_an_explanation_that_fails_costs_no_frame(monkeypatch: pytest.MonkeyPatch):
+    monitor = new_monitor()
+
+    def fail(self: CauseJudge, evidence: object) -> None:
+        raise RuntimeError("singular")
+
+    monkeypatch.setattr(CauseJudge, "add", fail)
+    texts = set()
+    for frame in frames_of("bump")[0]:
+        record = monitor.process(frame)
+        assert record.seq == frame.seq and record.cam_T_grip is not None
+        texts.add(monitor._inquiry.told().text)
+    assert texts == {"", "what moved could not be worked out: RuntimeError: singular"}

@@ -13,7 +13,7 @@ import zenoh
 from loopback import free_endpoint, plain_session, wait_until
 
 from gripmon.publish import ZenohJaw
-from gripmon.publish.jaw import DecodeOpening, opening_of_joints
+from gripmon.publish.jaw import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints
 from gripmon.ros2 import JOINT_STATE, JointOpening, subscription_key
 from gripmon.ros2.types import type_hash, typestore
 from gripmon.wire import Link, PublishSettings, malformed
@@ -91,6 +91,60 @@ def test_rubbish_keeps_no_opening_young():
 
         wait_until(is_old, "the opening to grow old")
         assert arm.jaw.fault().startswith("no jaw opening for 0.2 s or longer, ")
+
+
+def stamped(stamp_ns: int, opening_m: float) -> str:
+    return json.dumps({"stamp_ns": stamp_ns, "opening_m": opening_m})
+
+
+def test_the_opening_is_that_of_the_images_time():
+    """100 mm/s, a report every 10 ms, images between them that come late: the newest would be up to 3 mm off."""
+    base_ns = 1_700_000_000_000_000_000
+    with robot() as arm:
+        for k in range(5):
+            arm.says(stamped(base_ns + 10_000_000 * k, 0.02 + 0.001 * k), 0.02 + 0.001 * k)
+        for late_ms in (0.0, 3.0, 10.0, 24.0, 40.0):
+            at_ns = base_ns + 40_000_000 - round(1e6 * late_ms)
+            assert arm.jaw.opening_m(at_ns) == pytest.approx(0.024 - 1e-4 * late_ms, abs=1e-9)
+        # Nothing is made up before the first report and after the last one.
+        assert arm.jaw.opening_m(base_ns - 20_000_000) == 0.02
+        assert arm.jaw.opening_m(base_ns + 60_000_000) == 0.024
+        assert arm.jaw.fault() == ""
+        # Without stamps it is the newest, as ever.
+        arm.says("0.05", 0.05)
+        assert arm.jaw.opening_m(base_ns) == 0.05
+
+
+def test_stamps_of_another_clock_are_said_and_the_newest_is_taken():
+    image_ns = 1_700_000_000_000_000_000
+    with robot(max_age_s=5.0) as arm:
+        arm.says(stamped(image_ns - 3_600_000_000_000, 0.02), 0.02)
+        arm.says(stamped(image_ns - 3_600_000_000_000 + 10_000_000, 0.03), 0.03)
+        assert arm.jaw.opening_m(image_ns) == 0.03
+        said = "jaw openings have stamps 3.6e+03 s earlier than the images: the newest is taken"
+        assert arm.jaw.fault() == said
+        # The robot's clock is set: what was kept of the other one is forgotten.
+        arm.says(stamped(image_ns, 0.04), 0.04)
+        assert arm.jaw.opening_m(image_ns - 5_000_000) == pytest.approx(0.03 + 0.01 * 0.95) and arm.jaw.fault() == ""
+        arm.says(stamped(image_ns - 7_200_000_000_000, 0.01), 0.01)
+        assert arm.jaw.opening_m(image_ns) == 0.01 and "7.2e+03 s earlier" in arm.jaw.fault()
+
+
+def test_between_rare_reports_the_jaw_moves_at_the_end():
+    """A robot that reports changes says nothing while the jaws stand."""
+    openings = StampedOpenings()
+    openings.add(Reported(1_000_000_000, 0.02), 0.0, 1.0)
+    openings.add(Reported(1_900_000_000, 0.03), 0.9, 1.0)
+    assert openings.at(1_000_000_000) == openings.at(1_500_000_000) == openings.at(1_800_000_000) == 0.02
+    assert openings.at(1_850_000_000) == pytest.approx(0.025)
+    # Those of another order, and too many.
+    openings.add(Reported(1_860_000_000, 0.026), 0.91, 1.0)
+    assert openings.at(1_860_000_000) == 0.026 and openings.at(1_880_000_000) == pytest.approx(0.028)
+    for k in range(2 * MOST_REPORTS):
+        openings.add(Reported(2_000_000_000 + k, 0.03), 1.0, 1.0)
+    assert len(openings) == MOST_REPORTS
+    openings.add(Reported(3_000_000_000, 0.04), 2.5, 1.0)
+    assert len(openings) == 1
 
 
 def joint_state(**positions: float) -> bytes:

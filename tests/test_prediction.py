@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from box_models import cube_model
-from meters import FISHEYE_LENS, box_gripper, moved
+from meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.camera import Camera, LensSettings, make_camera
-from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.corners.lines import CornerGeometry, CornerSettings
+from gripmon.corners.prediction import FEWEST_SAMPLES, Prediction, SamplingSettings, lay_out, predict
 from gripmon.corners.profiles import profile_offsets_px
 from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
 
@@ -207,3 +209,37 @@ def test_a_gripper_without_faces_samples_all_its_edges():
     pose = moved(nominal_cam_T_grip(), np.array([0.0, 0.0, 0.1, 0.3, 0.2, 0.1]))
     prediction = predicted(gripper=gripper_from_dict(model), cam_T_grip=pose, jaw_unknown=False)
     assert len(np.unique(prediction.layout.edge)) == 12
+
+
+def test_what_leaves_the_lens_leaves_the_prediction():
+    """A layout outlives the pose that it was made at; from the next one some of it may be beside or behind the lens."""
+    camera, gripper, rng = make_camera(WIDE_LENS), box_gripper(), np.random.default_rng(0)
+    shorter = 0
+    for _ in range(60):
+        tcp_m = (*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.01, 0.05))
+        pose = nominal_cam_T_grip(rng.uniform(0.0, 80.0), tcp_m)
+        layout = lay_out(camera, gripper, pose, OPENING_M, SamplingSettings())
+        there = moved(pose, np.concatenate([rng.normal(0.0, 0.01, 3), rng.normal(0.0, 0.1, 3)]))
+        prediction = predict(camera, gripper, layout, there, OPENING_M, OFFSETS_PX, True)
+        shorter += len(prediction.layout.edge) < len(layout.edge)
+        for numbers in (prediction.uv_px, prediction.normal, prediction.jacobian, prediction.along, prediction.gain):
+            assert np.isfinite(numbers).all() and len(numbers) == len(prediction.layout.edge)
+        assert np.isfinite(prediction.map_x).all() and np.isfinite(prediction.map_y).all()
+        kept = prediction.layout
+        assert np.isfinite(prediction.line_origin[kept.edges]).all()
+        np.testing.assert_array_equal(kept.edge[kept.first], kept.edges)
+        assert (np.bincount(kept.edge, minlength=1)[kept.edges] >= FEWEST_SAMPLES).all()
+        CornerGeometry.of(gripper, prediction, CornerSettings())
+    assert shorter > 10
+
+
+@pytest.mark.parametrize("seed", [38, 57, 63, 113, 128])
+def test_a_fit_that_leads_out_of_the_lens_is_only_a_bad_fit(seed: int):
+    """Nothing but texture, and fingers that reach past the end of the lens: the fit wanders off."""
+    rng = np.random.default_rng(seed)
+    texture = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (540, 640)).astype(np.uint8), (0, 0), 3.0)
+    image = cv2.normalize(texture, None, 0.0, 255.0, cv2.NORM_MINMAX)
+    tilt_deg = rng.uniform(20.0, 90.0)
+    tcp_m = (*rng.uniform(-0.03, 0.03, 2), rng.uniform(0.005, 0.02))
+    found = measure(image, nominal_cam_T_grip(tilt_deg, tcp_m), using=meter(lens=WIDE_LENS))
+    assert not found.trusted and np.isfinite(found.prediction.uv_px).all()

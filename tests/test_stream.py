@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -102,6 +104,65 @@ def test_frames_that_repeat_for_a_moment_are_not_frozen():
     well = frames(0, 150)
     kinds(watch, well)
     assert not any(kinds(watch, after(well, 20, image=well[-1].image)))
+
+
+def coded(path: Path, codec: str, count: int = 60) -> list[np.ndarray]:
+    """What FFmpeg makes of a standing scene, in which something small moves, with little noise."""
+    rng = np.random.default_rng(0)
+    scene = cv2.GaussianBlur(rng.uniform(0.0, 255.0, (480, 640)).astype(np.float32), (0, 0), 6.0)
+    scene = cv2.normalize(scene, None, 40.0, 210.0, cv2.NORM_MINMAX)
+    out = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), FPS, (640, 480), False)
+    for k in range(count):
+        image = scene + rng.normal(0.0, 0.3, scene.shape)
+        image[100:140, 40 + 3 * k : 80 + 3 * k] = 220.0
+        out.write(np.clip(image, 0.0, 255.0).astype(np.uint8))
+    out.release()
+    reader = cv2.VideoCapture(str(path))
+    read = [reader.read()[1][:, :, 0] for _ in range(count)]
+    reader.release()
+    return read
+
+
+@pytest.mark.parametrize(("codec", "ending", "frozen_s"), [("mp4v", "mp4", 10.0), ("MJPG", "avi", 1.0)])
+def test_a_coder_that_sends_nothing_for_what_stands_is_given_more_time(
+    tmp_path: Path, codec: str, ending: str, frozen_s: float
+):
+    """MPEG-4 leaves out what stands still, as H.264 does; of JPEGs each is an image of its own."""
+    images = coded(tmp_path / f"camera.{ending}", codec)
+    watch = StreamWatch()
+    well = [replace(f, image=image) for f, image in zip(frames(0, len(images)), images, strict=True)]
+    assert not any(kinds(watch, well))
+    found = kinds(watch, after(well, round(12 * FPS), image=well[-1].image))
+    first = found.index({"frozen"})
+    assert frozen_s * FPS - 2 <= first <= frozen_s * FPS + 3
+    assert all(f == {"frozen"} for f in found[first:])
+
+
+def test_whole_images_in_between_tell_how_long_a_coder_may_be_silent():
+    """Eight seconds of the same, and an image anew: so it goes on for a minute without a fault."""
+    watch = StreamWatch()
+    still = picture(0)
+    stream = []
+    for k, frame in enumerate(frames(0, round(60 * FPS))):
+        if k < 30:  # something small moves, the rest stands
+            still = still.copy()
+            still[12, 8 + k] ^= 1
+        elif k % 240 == 0:
+            still = picture(k)
+        stream.append(replace(frame, image=still))
+    assert not any(kinds(watch, stream))
+
+
+def test_a_sensors_little_noise_is_no_coder():
+    """A tenth of a grey level, over- and underexposed in large parts: frozen after a second, as any other."""
+    rng = np.random.default_rng(2)
+    scene = np.clip(rng.uniform(-300.0, 550.0, (48, 64)), 0.0, 255.0)
+    watch, stream = StreamWatch(), []
+    for frame in frames(0, 300):
+        noisy = np.rint(np.clip(scene + rng.normal(0.0, 0.1, scene.shape), 0.0, 255.0))
+        stream.append(replace(frame, image=noisy.astype(np.uint8)))
+    assert not any(kinds(watch, stream))
+    assert 28 <= kinds(watch, after(stream, 60, image=stream[-1].image)).index({"frozen"}) <= 33
 
 
 def test_an_even_image_is_another_fault():

@@ -128,6 +128,19 @@ def test_the_file_says_where_it_comes_from(rig: Path, taught: Path):
     assert [p.name for p in taught.parent.iterdir() if p.name.startswith(".")] == [], "no temporary file is left"
 
 
+def test_an_image_that_is_left_out_is_named_and_not_in_the_file(rig: Path, tmp_path: Path, capsys):
+    texture = np.random.default_rng(5).uniform(0.0, 255.0, (576, 768)).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "hand.png"), cv2.GaussianBlur(texture, (0, 0), 2.0))
+    images = [str(tmp_path / "hand.png"), *map(str, sorted((rig / "first").glob("*.png")))]
+    options = ["--jaw-opening", str(OPENING_M), "--out", str(tmp_path / "taught.yaml"), "--picture"]
+    command = ["teach", *images, "--config", str(rig / "untaught.yaml"), *options, str(tmp_path / "taught.png")]
+    assert main(command) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("left out: ")]
+    assert len(said) == 1 and said[0].startswith(f"left out: {images[0]}: ")
+    model = to_settings(read_yaml(tmp_path / "taught.yaml"), TaughtModel)
+    assert [image.file for image in model.provenance.images] == images[1:]
+
+
 def test_the_picture_shows_every_taught_edge(rig: Path, taught: Path):
     picture = cv2.imread(str(rig / "pictures" / "taught.png"))
     assert picture is not None and picture.shape == (1152, 1536, 3)

@@ -10,7 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper
+from meters import WIDE_LENS
+from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
 from taught_by_hand import Rig, make_rig
 
 from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
@@ -30,7 +31,7 @@ from gripmon.simulator import Simulator
 from gripmon.simulator.scenario import JawScript, Sensor
 from gripmon.teaching import TeachingImage
 from gripmon.teaching.bench import Bench
-from gripmon.teaching.corner_pose import CameraError, pose_from_corners
+from gripmon.teaching.corner_pose import CameraError, PoseRefused, pose_from_corners
 from gripmon.teaching.placing import place, usual_view
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
@@ -111,8 +112,26 @@ def test_refusals_say_what_to_do(rig: Rig, bench: Bench):
     assert "the fingers, or near and far, have each other's names" in str(exchanged.snapped.refused)
     empty = np.full_like(rig.image, 120)
     assert "no fingers are seen" in str(bench.look(empty, put(good), (), OPENING_M).snapped.refused)
+    tips = rig.rough("L_in_near", "L_out_near", "R_in_near", "R_out_near")
+    assert "lie on a line" in str(bench.look(empty, put(tips), (), OPENING_M).snapped.refused)
+    assert bench.look(rig.image, put(tips), (), OPENING_M).snapped.refused is None, "the edges say the rest"
+    hidden = rig.rough("L_in_far", "R_in_near", "R_in_far", "L_out_far", off_px=8.0)
+    assert bench.look(rig.image, put(hidden), (), OPENING_M).snapped.refused is None
     away = {name: [u, v - 150.0] for name, (u, v) in good.items()}
     assert bench.look(rig.image, put(away), (), OPENING_M).snapped.refused is not None
+
+
+def test_a_corner_put_by_hand_beyond_the_lens_gives_no_pose():
+    """A fisheye's image reaches farther than its model."""
+    pose = nominal_cam_T_grip(tcp_m=(0.0, 0.002, 0.035))
+    image = simulator(plain_scenario(), lens=WIDE_LENS, cam_T_grip=pose).render(0)
+    camera, gripper = make_camera(WIDE_LENS), sharp_gripper()
+    points_m = gripper.points_grip_m(OPENING_M)[gripper.corner_points] @ pose[:3, :3].T + pose[:3, 3]
+    shown = dict(zip(gripper.corner_ids, camera.project(points_m), strict=True))
+    found = Bench(camera, gripper, MonitorSettings(), None).look(image, shown, (), OPENING_M)
+    assert found.reference is not None
+    with pytest.raises(PoseRefused, match="L_in_near was put where the lens shows nothing"):
+        pose_from_corners(camera, gripper, found.snapped, {"L_in_near": np.array([1.0, 1.0])})
 
 
 @pytest.mark.skipif(not PHOTOGRAPHS.is_dir(), reason="../shared/data/visp_cube is not there")
@@ -320,7 +339,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *page, "--live", "0"], "--live goes with --page, without images"),
         ([image, "--page", "--config", camera, "--jaw-source", "zenoh"], "--jaw-source: --config says where"),
         ([image, *page, "--live-wait", "3"], "--live-wait: goes with --live"),
-        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, or --reference FILE"),
+        ([image, *given, "--corners", two], "2 of the gripper's corners; at least 4, hidden ones too"),
         ([image, *page, "--corners", rough], "--page and --corners"),
         ([image, *page, "--config", camera], "--config has camera, gripper and reference already"),
         ([image, *page, "--jaw-opening", "0.2"], "jaw opening 0.2 m; the gripper's 0 to 0.06 m"),

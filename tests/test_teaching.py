@@ -240,6 +240,27 @@ def test_images_between_which_the_camera_moved_are_refused():
         taught_from(image_of(0.0), shifted, using=reference(None, 1e-3, 1e-2))
 
 
+def test_an_image_that_contradicts_most_others_is_left_out():
+    """What it would have added to the scatter, and to the mean, isn't there."""
+    shifted = image_of(0.0, None, moved(POSE, np.array([1.2e-4, 0.0, 0.0, 0.0, 0.0, 0.0])))
+    darker, brighter = image_of(0.0, scene(150.0)), image_of(0.0, scene(210.0))
+    empty = np.full_like(darker, 128)
+    using = reference(None, 1e-3, 1e-2)
+    taught = taught_from(image_of(0.0), shifted, darker, empty, brighter, using=using)
+    assert set(taught.left_out) == {1, 3} and taught.used("abcde") == ["a", "c", "e"]
+    assert re.match(r"1\.png: the gripper shows \d\.\d px from where it is in the other images", taught.left_out[1])
+    assert "3.png: measured with what was taught the gripper isn't found" in taught.left_out[3]
+    alone = taught_from(image_of(0.0), darker, brighter, using=using)
+    assert taught.edges == alone.edges and not alone.left_out
+
+
+def test_images_of_which_half_contradict_the_others_are_refused():
+    away = [moved(POSE, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0])) for x in (2e-4, 4e-4)]
+    images = [image_of(0.0), image_of(0.0, scene(150.0)), *(image_of(0.0, None, pose) for pose in away)]
+    with pytest.raises(TeachingRefused, match=r"^\d\.png: the gripper shows .* left out before: \d\.png: the gripper"):
+        taught_from(*images, using=reference(None, 1e-3, 1e-2))
+
+
 def test_a_half_hidden_gripper_is_refused():
     image = image_of(0.0).copy()
     image[:, :430] = 128

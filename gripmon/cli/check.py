@@ -95,6 +95,7 @@ def expectation(config: Config) -> dict[str, Any]:
             "corners": len(gripper.corner_ids),
             "edges": len(gripper.edge_ids),
             "faces": len(gripper.faces),
+            "notes": list(gripper.notes),
             "jaw_m": [gripper.jaw_min_m, gripper.jaw_max_m] if gripper.has_jaw else None,
         },
         "reference": _reference_values(config),
@@ -199,6 +200,7 @@ def _as_text(report: dict[str, Any]) -> str:
     if not report["gripper"]["faces"]:
         # Before the corners, whose list follows.
         lines.insert(-1, " " * 11 + "the gripper file has no faces: what the finger itself hides isn't known")
+    lines[2:2] = [" " * 11 + note for note in report["gripper"]["notes"]]
     lines += [_corner_line(corner) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
     lines.append(f"promise    {report['promise']}")

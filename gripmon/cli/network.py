@@ -176,7 +176,7 @@ class _FixedJaw:
 
     fixed_m: float | None
 
-    def opening_m(self) -> float | None:
+    def opening_m(self, stamp_ns: int | None = None) -> float | None:
         return self.fixed_m
 
     def fault(self) -> str:

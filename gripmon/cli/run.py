@@ -207,13 +207,14 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 
 
 def _open_source(config: Config, link: Link | None) -> Source:
-    from gripmon.sources import SourceError, open_source
+    from gripmon.sources import FullScale, SourceError, open_source
     from gripmon.wire import Keys
 
-    settings = config.settings
+    settings, bit_depth = config.settings, config.settings.monitor.bit_depth
     keys = Keys(settings.robot, settings.camera_name)
     try:
-        return open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
+        source = open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
+        return source if bit_depth == 16 else FullScale(source, bit_depth)
     except SourceError as error:
         raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 

@@ -149,13 +149,13 @@ def run(arguments: argparse.Namespace) -> int:
         taught = teach(config.camera, config.gripper, settings.corners, settings.jaw_sigma_m, config.reference, images)
     except TeachingRefused as refused:
         raise common.CommandFailedError(f"teach: {refused}") from None
-    model = _model(config, taught, inputs, arguments)
+    model = _model(config, taught, taught.used(inputs), arguments)
     _write(model, out)
     if arguments.into_config:
         config = _named_in(config, out)
     print(_summary(config, taught, out))
     if arguments.picture is not None:
-        _draw(config, model, images[0], Path(arguments.picture))
+        _draw(config, model, taught.used(images)[0], Path(arguments.picture))
     return common.EXIT_DONE
 
 
@@ -226,7 +226,7 @@ def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
     """An image that fits the camera, with its jaw opening; anything else ends the command with exit code 2."""
     from gripmon.cli.teach_inputs import read_fitting_image
 
-    image = read_fitting_image(path, config.camera, config.gripper)
+    image = read_fitting_image(path, config.camera, config.gripper, config.settings.monitor.bit_depth)
     opening_m = _opening(path, config, jaw_opening_m)
     return _Input(path, image, hashlib.sha256(path.read_bytes()).hexdigest(), opening_m)
 
@@ -323,6 +323,7 @@ def _summary(config: Config, taught: Taught, out: Path) -> str:
     lines = [f"{'edge':<{width}}          offset                 +-         seen  brighter"]
     lines += [_edge_line(name, edge, px_per_m, width) for name, edge in taught.edges.items()]
     lines += [f"{name:<{width}}  not taught: {reason}" for name, reason in taught.untaught.items()]
+    lines += [f"left out: {why}" for why in taught.left_out.values()]
     lines += [f"note: {note}" for note in taught.notes]
     lines.append(f"measured again with this, the gripper shows at most {taught.closure_px:.2f} px from the reference")
     lines.append(f"written: {out}")

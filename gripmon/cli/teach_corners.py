@@ -135,8 +135,8 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
     if inputs.bench.reference is None and len(rough) < FEWEST_PUT:
         raise common.CommandFailedError(
-            f"{arguments.corners}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, or --reference FILE "
-            "(of gripmon calibrate plane)",
+            f"{arguments.corners}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, hidden ones too, "
+            "about where they would show; or --reference FILE (of gripmon calibrate plane)",
             common.EXIT_USAGE,
         )
     picture = inputs.pictures[0]

@@ -226,9 +226,10 @@ def _faults_of(path: Path) -> Iterator[None]:
         raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
 
 
-def read_fitting_image(path: Path, camera: Camera, gripper: Gripper) -> Image:
-    """An image that fits the camera; anything else ends the command with exit code 2."""
+def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: int) -> Image:
+    """An image that fits the camera, in full scale; anything else ends the command with exit code 2."""
     from gripmon.inspection import inspect
+    from gripmon.pixels import in_full_scale
     from gripmon.records import Frame
     from gripmon.sources.folder import read_image
 
@@ -237,17 +238,19 @@ def read_fitting_image(path: Path, camera: Camera, gripper: Gripper) -> Image:
     image, fault = read_image(path)
     if image is None:
         raise common.CommandFailedError(f"{path}: {fault}; an image file", common.EXIT_USAGE)
-    refused = inspect(Frame(0, 0, image, None, str(path)), camera, gripper)
-    if refused is not None:
-        raise common.CommandFailedError(f"{path}: {refused[0]}: {refused[1]}", common.EXIT_USAGE)
-    return image
+    frame = in_full_scale(Frame(0, 0, image, None, str(path)), bit_depth)
+    refused = inspect(frame, camera, gripper)
+    if refused is not None or frame.image is None:
+        kind, why = refused or (frame.refusal, frame.fault)
+        raise common.CommandFailedError(f"{path}: {kind}: {why}", common.EXIT_USAGE)
+    return frame.image
 
 
 def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
     """An image that fits the camera; else the command ends with exit code 2."""
     from gripmon.teachpage import Picture
 
-    image = read_fitting_image(path, bench.camera, bench.gripper)
+    image = read_fitting_image(path, bench.camera, bench.gripper, bench.settings.bit_depth)
     return Picture(path.name, image, read_opening(path, bench.gripper, config, given_m), str(path))
 
 

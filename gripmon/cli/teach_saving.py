@@ -149,7 +149,8 @@ class FileSaving:
         except TeachingRefused as refused:
             raise SavingRefused(f"no taught model: {refused}; or save without it") from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
-        return self._model(taught, reference, pictures, openings, files), [*taught.notes, *left]
+        model = self._model(taught, reference, pictures, openings, files)
+        return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
     def _model(
         self,
@@ -179,7 +180,7 @@ class FileSaving:
                 gripmon=__version__,
                 time=datetime.now(UTC).isoformat(timespec="seconds"),
                 command=self._inputs.command,
-                images=tuple(images),
+                images=tuple(taught.used(images)),
                 closure_px=taught.closure_px,
             ),
             camera=camera,

@@ -7,7 +7,7 @@ fraction of a pixel: in a standing scene they are computed once.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated
 
@@ -55,6 +55,9 @@ STEP_PX = 0.5
 ROWS = 3
 """Neighbouring rows of pixels along an edge that make one profile."""
 
+FEWEST_SAMPLES = 4
+"""An edge with fewer profiles has no line of its own."""
+
 CORNER_MARGIN_PX = 2.0
 """A corner closer than this to the image's border counts as outside."""
 
@@ -82,6 +85,13 @@ class EdgeLayout:
         starts[self.first[1:]] = 1
         return np.arange(len(self.edge)) // STRETCH + np.cumsum(starts)
 
+    def only(self, kept: NDArray[np.bool_]) -> EdgeLayout:
+        """The samples ``kept`` (n,), without edges of which too few of them are left."""
+        counts = np.bincount(self.edge[kept], minlength=len(self.visible))
+        kept = kept & (counts[self.edge] >= FEWEST_SAMPLES)
+        edges, first = np.unique(self.edge[kept], return_index=True)
+        return replace(self, edge=self.edge[kept], fraction=self.fraction[kept], edges=edges, first=first)
+
 
 @dataclass(frozen=True, slots=True)
 class PredictedCorners:
@@ -107,7 +117,7 @@ class PredictedCorners:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The predicted edges at one pose; n samples, v visible edges, c corners.
+    """The predicted edges at one pose; n samples, v visible edges, c corners.  All numbers of samples are finite.
 
     ``uv_px`` (n, 2) and ``normal`` (n, 2) in the distorted image; the normal points to the right of somebody walking
     along the edge. ``jacobian`` (n, 6 or 7): px of motion along the normal by ``xi = (rho, omega)`` of the transform
@@ -216,7 +226,7 @@ def lay_out(
         # one profile a pixel: closer ones see the same pixels again.
         share = np.sqrt(lengths)
         counts = np.minimum(np.round(settings.samples * share / share.sum()), lengths).astype(int)
-    counts[counts < 4] = 0
+    counts[counts < FEWEST_SAMPLES] = 0
     edges = np.flatnonzero(counts)
     fraction = [np.linspace(r[0], r[1], n) for r, n in zip(ranges, counts, strict=True) if n and r]
     first = np.concatenate([[0], np.cumsum(counts[edges])[:-1]]).astype(np.intp) if len(edges) else np.zeros(0, np.intp)
@@ -267,7 +277,8 @@ def predict(
 ) -> Prediction:
     """Project the sample points of ``layout`` and set up the maps for ``offsets_px`` (s,) along the normals.
 
-    Points behind the camera or outside the lens model are marked in ``ok`` and never measured.
+    Points outside of the image are marked in ``ok`` and never measured.  Points that the lens maps nowhere, as those
+    behind the camera, have neither a place nor a normal: the prediction's own layout leaves them out.
     """
     rotation, translation = cam_T_grip[:3, :3], cam_T_grip[:3, 3]
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
@@ -282,6 +293,10 @@ def predict(
     tangent /= np.sqrt(np.einsum("ni,ni->n", tangent, tangent))[:, None]
     normal = np.column_stack([-tangent[:, 1], tangent[:, 0]])
     gradient = np.einsum("ni,nij->nj", normal, d_uv)
+    mapped = np.isfinite(gradient).all(axis=1)
+    if not mapped.all():
+        kept = layout.only(mapped)
+        return predict(camera, gripper, kept, cam_T_grip, jaw_opening_m, offsets_px, jaw_unknown, taught)
     jacobian = np.empty((len(edge), 7 if jaw_unknown else 6))
     jacobian[:, :3] = gradient
     for i, j, k in ((3, 1, 2), (4, 2, 0), (5, 0, 1)):  # lever x gradient, without np.cross's overhead
@@ -297,7 +312,7 @@ def predict(
         uv = uv + (layout.as_taught[edge] * shift_px)[:, None] * normal
         spread_m = taught.spread_m(gripper, points_grip_m, cam_T_grip)
         edge_spread_m = np.where(layout.as_taught, spread_m, np.hypot(edge_spread_m, taught.usual_m))
-    ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0) & np.isfinite(jacobian).all(axis=1)
+    ok = _inside(camera, uv, float(np.abs(offsets_px[[0, -1]]).max()) + 1.0)
     along, gain, origin, direction = _ideal_lines(points_cam_m, normal, d_uv, layout, len(ends))
     corners = _predict_corners(camera, gripper, cam_T_grip, points_grip_m, rate)
     offsets = offsets_px.astype(np.float32)

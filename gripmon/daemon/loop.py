@@ -109,7 +109,7 @@ class Daemon(Loop):
         """
         try:
             if self._jaw is not None:
-                frame = dataclasses.replace(frame, jaw_opening_m=self._jaw.opening_m())
+                frame = dataclasses.replace(frame, jaw_opening_m=self._jaw.opening_m(frame.stamp_ns))
             record = self._monitor.process(frame)
         except Exception as error:  # noqa: BLE001  said and counted
             failure = f"internal error: {in_short(error)}"

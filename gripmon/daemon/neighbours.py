@@ -56,9 +56,11 @@ class PulseFeed(Protocol):
 
 
 class JawFeed(Protocol):
-    """Where the jaw opening comes from when the frames don't bring it, e.g. :class:`gripmon.publish.ZenohJaw`."""
+    """Where the jaw opening at a frame's time comes from when the frames don't bring it, e.g.
+    :class:`gripmon.publish.ZenohJaw`.
+    """
 
-    def opening_m(self) -> float | None: ...
+    def opening_m(self, stamp_ns: int | None = None) -> float | None: ...
     def fault(self) -> str: ...
 
 

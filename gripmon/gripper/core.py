@@ -8,19 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.gripper.faces import LARGEST_SKEW, LARGEST_WARP_M, FaceLoop, extent_m, normal_of, off_plane_m, triangles
 from gripmon.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
 from gripmon.gripper.motion import motion_table, offset_m
 from gripmon.records import Array
 
 LARGEST_EXTENT_M = 1.0
-LARGEST_WARP_M = 5e-4
 SMALLEST_SPREAD_RATIO = 0.02
-
-
-@dataclass(frozen=True, slots=True)
-class FaceLoop:
-    finger: int
-    points: NDArray[np.intp]
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +33,10 @@ class EdgeView:
 
 
 class Gripper:
-    """A checked gripper model in arrays.  Raises :class:`GripperError` when the model can't work."""
+    """A checked gripper model in arrays.  Raises :class:`GripperError` when the model can't work.
+
+    ``faces`` are flat: one that the file has skewed is several here, and ``notes`` says so in words.
+    """
 
     def __init__(self, model: GripperModel):
         self.model = model
@@ -65,7 +62,8 @@ class Gripper:
         self.edge_bevel_m = np.array([e.bevel_m for e in model.edges.values()])
         self.edge_polarity = np.array([_POLARITY[e.brighter] for e in model.edges.values()], dtype=np.int8)
         self._edge_crease = np.array([e.kind == "crease" for e in model.edges.values()])
-        self.faces = tuple(self._face(i, f, finger_index) for i, f in enumerate(model.faces))
+        self.notes: list[str] = []
+        self.faces = tuple(flat for i, f in enumerate(model.faces) for flat in self._face(i, f, finger_index))
         self._face_span = np.array([self._spanning(f) for f in self.faces], dtype=np.intp).reshape(-1, 3)
         self._edge_faces, self._corner_faces = self._adjacency()
         jaw = model.jaw or JawModel(nominal_m=0.0, min_m=0.0, max_m=0.0)
@@ -162,7 +160,7 @@ class Gripper:
             raise GripperError(f"edges.{name}: its ends are less than 0.1 mm apart; two different points")
         return i, j
 
-    def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> FaceLoop:
+    def _face(self, index: int, face: FaceModel, finger_index: Mapping[str, int]) -> list[FaceLoop]:
         unknown = [p for p in face.points if p not in self._point_index]
         if unknown:
             raise GripperError(
@@ -180,22 +178,38 @@ class Gripper:
             )
         centre = self._nominal_points_m[self.point_finger == finger_index[face.finger]].mean(axis=0)
         corners = self._nominal_points_m[loop]
-        if np.dot(_normal(corners), corners.mean(axis=0) - centre) < 0.0:
+        if np.dot(normal_of(corners), corners.mean(axis=0) - centre) < 0.0:
             raise GripperError(
-                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside"
+                f"faces[{index}].points: it looks into the finger; the points counter-clockwise seen from outside, or, "
+                "for a finger that isn't convex, no faces"
             )
-        off_m = np.abs((corners - corners.mean(axis=0)) @ _normal(corners)).max() / np.linalg.norm(_normal(corners))
-        if not off_m <= LARGEST_WARP_M:
+        finger = finger_index[face.finger]
+        return [FaceLoop(finger, loop[list(flat)]) for flat in self._flat(f"faces[{index}].points", corners)]
+
+    def _flat(self, key: str, corners: Array) -> list[tuple[int, ...]]:
+        """A face's corners (n, 3) by flat parts, each indices into them."""
+        if not np.linalg.norm(normal_of(corners)) > 0.0:
+            raise GripperError(f"{key}: these points lie on a line; the points in turn around the face")
+        off_m = off_plane_m(corners)
+        if off_m <= LARGEST_WARP_M:
+            return [tuple(range(len(corners)))]
+        off = f"{key}: {1e3 * off_m:.1f} mm off a plane"
+        if off_m > LARGEST_SKEW * extent_m(corners):
             raise GripperError(
-                f"faces[{index}].points: {1e3 * off_m:.1f} mm off a plane; points in one plane (or several faces)"
+                f"{off}, of {1e3 * extent_m(corners):.1f} mm from end to end; one of these points is wrong, or several "
+                "faces"
             )
-        return FaceLoop(finger_index[face.finger], loop)
+        parts = triangles(corners)
+        if parts is None:
+            raise GripperError(f"{off}, and it crosses itself; the points in turn around the face")
+        self.notes.append(f"{off}: taken as {len(parts)} triangles; if it is flat, one of its points is wrong")
+        return list(parts)
 
     def _spanning(self, face: FaceLoop) -> NDArray[np.intp]:
         """Three consecutive points (3,) of a face that tell its plane best: others may lie on a straight line."""
         loop = self._nominal_points_m[face.points]
         ahead, behind = np.roll(loop, -1, axis=0) - loop, np.roll(loop, 1, axis=0) - loop
-        best = int(np.argmax(np.cross(ahead, behind) @ _normal(loop)))
+        best = int(np.argmax(np.cross(ahead, behind) @ normal_of(loop)))
         return np.roll(face.points, 1 - best)[:3]
 
     def _adjacency(self) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -252,12 +266,6 @@ class Gripper:
 
 
 _POLARITY = {"any": 0, "right": 1, "left": -1}
-
-
-def _normal(loop: Array) -> Array:
-    """Outward normal (3,) of a planar loop (Newell), not normalised."""
-    following = np.roll(loop, -1, axis=0)
-    return np.cross(loop, following).sum(axis=0)
 
 
 def on_a_line(points_m: Array) -> bool:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from gripmon.causes import CauseJudge
-from gripmon.records import Array, EdgeEvidence, Explanation
+from gripmon.records import Array, EdgeEvidence, Explanation, Frame
 
 CALM_FRAMES, LULL_FRAMES = 30, 3
 """Frames in a row in which nothing looks wrong after which the evidence is forgotten, and up to which an explanation
@@ -29,7 +30,7 @@ class Inquiry:
         self._asked = 0
         self._calm = CALM_FRAMES
         self._explanation = Explanation()
-        self._pending: tuple[bool, Callable[[], EdgeEvidence], Array] | None = None
+        self._pending: tuple[bool, Callable[[], EdgeEvidence] | None, Array] | None = None
 
     def rebase(self, reference_sigma: Array) -> None:
         """There is a new reference, with standard deviations (6,), m and rad."""
@@ -48,15 +49,37 @@ class Inquiry:
         self._judge.interrupted()
         self._calm = min(self._calm, LULL_FRAMES + 1)
 
-    def ask(self, wrong: bool, evidence: Callable[[], EdgeEvidence], ref_cam_T_grip: Array) -> Explanation:
-        """One frame in which something looks ``wrong`` or not; ``evidence`` is gathered only if it is needed.
+    def ask(
+        self, wrong: bool, frame: Frame, gather: Callable[[Frame], EdgeEvidence], ref_cam_T_grip: Array
+    ) -> Explanation:
+        """One frame in which something looks ``wrong`` or not; ``gather`` its evidence only if it is needed.
 
-        What the frames before have shown; this one is thought about in :meth:`ponder`.
+        What the frames before have shown; this one is thought about in :meth:`ponder`, of an image of its own: the
+        caller may read the next one into the same memory before that.
         """
-        self._pending = (wrong, evidence, ref_cam_T_grip)
         if not wrong:
             self._calm += 1
+        evidence = None
+        if self._wants_evidence(wrong):
+            assert frame.image is not None
+            kept = replace(frame, image=frame.image.copy())
+            evidence = lambda: gather(kept)  # noqa: E731
+        self._pending = (wrong, evidence, ref_cam_T_grip)
         return self.told()
+
+    def _wants_evidence(self, wrong: bool) -> bool:
+        """Whether :meth:`ponder` will look at this frame's image."""
+        if wrong:
+            asked = self._asked + 1
+            return asked % EVERY == 0 or asked in GATHERED_AT
+        return self._calm >= CALM_FRAMES and self._judge.wants_baseline
+
+    def catch_up(self) -> None:
+        """Ponder before the next frame, if nobody has: what fails there costs an explanation, not that frame."""
+        try:
+            self.ponder()
+        except Exception as error:  # noqa: BLE001  said in the explanation
+            self._explanation = Explanation(text=f"what moved could not be worked out: {type(error).__name__}: {error}")
 
     def ponder(self) -> None:
         """Think about the last frame that was asked about; nothing if that has been done."""
@@ -66,15 +89,14 @@ class Inquiry:
         if wrong:
             self._calm = 0
             self._asked += 1
-            again = self._asked % EVERY == 0
-            if again or self._asked in GATHERED_AT:
+            if evidence is not None:
                 self._judge.add(evidence())
-            if again or self._asked in CONCLUDED_AT:
+            if self._asked % EVERY == 0 or self._asked in CONCLUDED_AT:
                 self._explanation = self._judge.explanation(ref_cam_T_grip)
             return
         if self._calm == CALM_FRAMES:
             self._forget()
-        if self._calm >= CALM_FRAMES and self._judge.wants_baseline:
+        if evidence is not None:
             self._judge.well(evidence())
 
     def told(self) -> Explanation:

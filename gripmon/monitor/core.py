@@ -35,6 +35,7 @@ from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity, Standing
+from gripmon.pixels import in_full_scale
 from gripmon.policy import Evidence, Judgement, Policy
 from gripmon.recalibrate import Proposal
 from gripmon.recalibrate import Refusal as Refused
@@ -165,8 +166,11 @@ class Monitor:
         )
 
     def process(self, frame: Frame) -> FrameRecord:
-        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason."""
-        self.ponder()
+        """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason.  The image is
+        not looked at after that.
+        """
+        self._inquiry.catch_up()
+        frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
         faults = self._look_at_stream(frame)
         refusal = inspect(frame, self._camera, self._gripper) or frozen(faults)
@@ -324,9 +328,8 @@ class Monitor:
     def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
         if self._stream.repeats:
             return self._inquiry.told()  # the image is an old one, what the robot reports is not
-        return self._inquiry.ask(
-            wrong, lambda: self._tracker.evidence(frame, measurement, self._ref_cam_T_grip), self._ref_cam_T_grip
-        )
+        here = self._ref_cam_T_grip
+        return self._inquiry.ask(wrong, frame, lambda kept: self._tracker.evidence(kept, measurement, here), here)
 
     def _drift(self) -> Drift:
         return drift_between(self._ref_cam_T_grip, self._cam_T_grip)

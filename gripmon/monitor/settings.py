@@ -35,6 +35,15 @@ class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
             description="which corners a recalibration takes: all that are usable, or so many of them next to the TCP"
         ),
     ] = "all"
+    bit_depth: Annotated[
+        int,
+        Meta(
+            ge=8,
+            le=16,
+            description="how many of the 16 bits of an image the camera fills, the lowest ones: 10 for Mono10, 12 for "
+            "Mono12 (bit)",
+        ),
+    ] = 16
     jaw_sigma_m: Annotated[
         float,
         Meta(

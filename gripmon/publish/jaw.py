@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import bisect
 import threading
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import msgspec
 import zenoh
@@ -20,16 +22,73 @@ LARGEST_OPENING_M = 0.5
 BEYOND_TRAVEL_M = 1e-3
 """So far beyond its travel a gripper may report to be; the monitor refuses frames with more."""
 
-DecodeOpening = Callable[[bytes], float | None]
-"""An opening (m) from a payload; None if the message is about something else.  Raises :class:`JawError`."""
+LONGEST_STEP_S = 0.1
+"""Between reports farther apart the jaw stood still, and moved only so long before the later one: a robot may report
+only while the jaws move.
+"""
+
+MOST_REPORTS = 2048
+"""Reports kept for images that are older than the newest one: two seconds at 1 kHz."""
+
+
+class Reported(NamedTuple):
+    """An opening, and when the robot measured it (Unix ns); 0 if that isn't known."""
+
+    stamp_ns: int
+    opening_m: float
+
+
+DecodeOpening = Callable[[bytes], Reported | None]
+"""An opening from a payload; None if the message is about something else.  Raises :class:`JawError`."""
 
 
 class JawError(ValueError):
     """A payload that tells no jaw opening; the text says why, in one line."""
 
 
+class StampedOpenings:
+    """Reports with stamps, by their stamps: what the opening was at a time between them."""
+
+    def __init__(self) -> None:
+        self._reports: list[tuple[Reported, float]] = []
+
+    def __len__(self) -> int:
+        return len(self._reports)
+
+    def add(self, report: Reported, arrival_s: float, max_age_s: float) -> None:
+        """Keep a report; forget those that arrived too long before it (monotonic, s), and all from before the robot's
+        clock was set back.
+        """
+        reports = self._reports
+        if reports and 1e-9 * (reports[-1][0].stamp_ns - report.stamp_ns) > max_age_s:
+            reports.clear()
+        while reports and (len(reports) >= MOST_REPORTS or arrival_s - reports[0][1] > max_age_s):
+            del reports[0]
+        bisect.insort(reports, (report, arrival_s), key=lambda kept: kept[0].stamp_ns)
+
+    def clear(self) -> None:
+        self._reports.clear()
+
+    def apart_s(self, stamp_ns: int) -> float:
+        """How much later the newest report's stamp is, s."""
+        return 1e-9 * (self._reports[-1][0].stamp_ns - stamp_ns)
+
+    def at(self, stamp_ns: int) -> float:
+        """Linear between the reports before and after (m); beyond the first and the last one nothing is made up: as
+        they say.
+        """
+        after = bisect.bisect_left(self._reports, stamp_ns, key=lambda kept: kept[0].stamp_ns)
+        if after in (0, len(self._reports)):
+            return self._reports[min(after, len(self._reports) - 1)][0].opening_m
+        (first, _), (last, _) = self._reports[after - 1 : after + 1]
+        left_ns = last.stamp_ns - stamp_ns
+        share = min(left_ns / min(last.stamp_ns - first.stamp_ns, 1e9 * LONGEST_STEP_S), 1.0)
+        return last.opening_m + share * (first.opening_m - last.opening_m)
+
+
 class ZenohJaw:
-    """The newest jaw opening that the robot sent.
+    """The jaw opening that the robot sent: at an image's stamp where the reports have stamps of the same clock, else
+    the newest.
 
     Age counts from arrival, so that the robot's clock need not agree with ours.  Zenoh's thread stores what arrives;
     any thread may ask.  What is malformed, or no opening that this gripper can have, is counted and said; the one
@@ -57,6 +116,8 @@ class ZenohJaw:
         self._lock = threading.Lock()  # guards what follows against Zenoh's thread
         self._newest_m: float | None = None
         self._arrival_s = 0.0
+        self._stamped = StampedOpenings()
+        self._apart_s: float | None = None  # reports' stamps from the images', where they are of different clocks
         link.attach(self._attach)
 
     @property
@@ -64,10 +125,22 @@ class ZenohJaw:
         """Messages so far that told no opening."""
         return self._malformed.count
 
-    def opening_m(self) -> float | None:
-        """The newest opening, m; None if none came, or none for ``jaw_max_age_s``."""
+    def opening_m(self, stamp_ns: int | None = None) -> float | None:
+        """The opening at an image's stamp, or the newest (m); None if none came, or none for ``jaw_max_age_s``.
+
+        Stamps farther apart than that are of different clocks: then it is the newest, and :meth:`fault` says so.
+        """
         with self._lock:
-            return None if self._newest_m is None or self._is_old() else self._newest_m
+            if self._newest_m is None or self._is_old():
+                return None
+            self._apart_s = None
+            if stamp_ns is None or not len(self._stamped):
+                return self._newest_m
+            apart_s = self._stamped.apart_s(stamp_ns)
+            if abs(apart_s) > self._max_age_s:
+                self._apart_s = apart_s
+                return self._newest_m
+            return self._stamped.at(stamp_ns)
 
     def fault(self) -> str:
         """What is wrong with the readings, in a few words for a person; empty if nothing is."""
@@ -77,6 +150,11 @@ class ZenohJaw:
                 missing = "no jaw opening received"
             elif self._is_old():
                 missing = f"no jaw opening for {self._max_age_s:g} s or longer"
+            elif self._apart_s is not None:
+                when = "later" if self._apart_s > 0.0 else "earlier"
+                missing = (
+                    f"jaw openings have stamps {abs(self._apart_s):.3g} s {when} than the images: the newest is taken"
+                )
         return ", ".join(fault for fault in (missing, self._malformed.fault()) if fault)
 
     def _is_old(self) -> bool:
@@ -91,16 +169,20 @@ class ZenohJaw:
             return
         arrival_s = time.monotonic()
         try:
-            opening_m = self._decode(_bounded(sample.payload))
-            if opening_m is None:
+            reported = self._decode(_bounded(sample.payload))
+            if reported is None:
                 return
-            self._check(opening_m)
+            self._check(reported.opening_m)
         except JawError as error:
             self._malformed.add(str(error))
             return
         self._malformed.good()
         with self._lock:
-            self._newest_m, self._arrival_s = opening_m, arrival_s
+            self._newest_m, self._arrival_s = reported.opening_m, arrival_s
+            if reported.stamp_ns > 0:
+                self._stamped.add(reported, arrival_s, self._max_age_s)
+            else:
+                self._stamped.clear()  # of one robot all reports have stamps, or none
 
     def _check(self, opening_m: float) -> None:
         low_m, high_m = self._travel_m
@@ -119,14 +201,15 @@ def _bounded(payload: zenoh.ZBytes) -> bytes:
     return payload.to_bytes()
 
 
-def opening_of_json(payload: bytes) -> float:
-    """An opening from ``{"stamp_ns": …, "opening_m": …}``, or from a number alone (m).  Raises :class:`JawError`."""
+def opening_of_json(payload: bytes) -> Reported:
+    """A report from ``{"stamp_ns": …, "opening_m": …}``, or from a number alone (m).  Raises :class:`JawError`."""
     try:
         if payload[:64].lstrip()[:1] == b"{":
-            return from_json(payload, JawReading).opening_m
+            reading = from_json(payload, JawReading)
+            return Reported(reading.stamp_ns, reading.opening_m)
         if len(payload) > largest_bytes(JawReading):
             raise JawError(f"{len(payload)} bytes; a number, or at most {largest_bytes(JawReading)} bytes of JSON")
-        return _decode_number(payload)
+        return Reported(0, _decode_number(payload))
     except MessageRefused as error:
         raise JawError(str(error)) from None
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
@@ -136,9 +219,11 @@ def opening_of_json(payload: bytes) -> float:
 def opening_of_joints(joints: JointOpening) -> DecodeOpening:
     """A decoder of ``sensor_msgs/JointState`` (CDR); messages about other joints only are passed over."""
 
-    def decode(payload: bytes) -> float | None:
+    def decode(payload: bytes) -> Reported | None:
         try:
-            return joints.opening_m(decode_joint_state(payload)[1])
+            stamp_ns, positions = decode_joint_state(payload)
+            opening_m = joints.opening_m(positions)
+            return None if opening_m is None else Reported(stamp_ns, opening_m)
         except MessageError as error:
             raise JawError(str(error)) from None
 

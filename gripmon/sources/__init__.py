@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.sources.base import READ_TIMEOUT_S, Source, SourceError, Waiting
+from gripmon.sources.base import READ_TIMEOUT_S, FullScale, Source, SourceError, Waiting
 from gripmon.sources.folder import FolderSettings, FolderSource
 from gripmon.sources.live import LiveCamera, LiveSettings
 from gripmon.sources.network import NetworkCamera, NetworkSettings, network_key
@@ -22,6 +22,7 @@ __all__ = [
     "READ_TIMEOUT_S",
     "FolderSettings",
     "FolderSource",
+    "FullScale",
     "LiveCamera",
     "LiveSettings",
     "NetworkCamera",

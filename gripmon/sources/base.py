@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from gripmon.pixels import in_full_scale
 from gripmon.records import Frame
 
 
@@ -47,3 +48,31 @@ class Source(Protocol):
 
 
 READ_TIMEOUT_S = 0.5
+
+
+class FullScale:
+    """A source of a camera that fills only a part of its 16 bits, in the full scale of the type: so that recordings and
+    previews show what is measured, too.
+    """
+
+    def __init__(self, source: Source, bit_depth: int) -> None:
+        self._source, self._bit_depth = source, bit_depth
+
+    @property
+    def live(self) -> bool:
+        return self._source.live
+
+    @property
+    def connected(self) -> bool:
+        return self._source.connected
+
+    @property
+    def dropped(self) -> int:
+        return self._source.dropped
+
+    def read(self) -> Frame | Waiting | None:
+        answer = self._source.read()
+        return in_full_scale(answer, self._bit_depth) if isinstance(answer, Frame) else answer
+
+    def close(self) -> None:
+        self._source.close()

@@ -98,7 +98,7 @@ class Bench:
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
         """What the images show of every edge.  Raises :class:`gripmon.teaching.TeachingRefused`."""
         found = teach(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m, reference, images)
-        opening_m = float(np.mean([image.jaw_opening_m for image in images]))
+        opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
         arrays = TaughtEdges.of(found.edges, self.gripper, _pose(reference), opening_m)
         return found, arrays
 

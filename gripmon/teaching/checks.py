@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.smoothing import GATE
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, motion_off
 from gripmon.teaching.lines import find_line
-from gripmon.teaching.views import TeachingRefused, View, Viewer, sampled
+from gripmon.teaching.views import ImageRefused, TeachingRefused, View, Viewer, sampled
 
 REFERENCE_SIGMAS = 3.0
 """So many standard deviations of the reference and of the reported opening are allowed on top."""
@@ -50,8 +50,9 @@ def check_enough(viewer: Viewer, views: Sequence[View], lines: Mapping[int, Edge
 
 
 def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
-    """Refuse images between which the gripper has moved: most of its ``edges`` then show elsewhere, each looked for in
-    every image by itself.  A few that differ are clutter, or bevels before another background.
+    """Refuse the image in which the gripper stands farthest from where the others show it: most of its ``edges`` then
+    show elsewhere, each looked for in every image by itself.  A few that differ are clutter, or bevels before another
+    background.
     """
     if len(views) < 2:
         return
@@ -62,15 +63,19 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
             line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
             if line is not None:
                 places_px[number, k] = line.ends_px.mean()
-    shared = np.isfinite(places_px).all(axis=0)
-    if np.count_nonzero(shared) < _FEWEST_SHARED:
+    # By edges that most images show: one that shows nothing says nothing about the others.
+    places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
+    enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
+    if not enough.any():
         return
-    off_px = np.median(np.abs(places_px - np.median(places_px, axis=0))[:, shared], axis=1)
+    off_px = np.zeros(len(views))
+    off_px[enough] = np.nanmedian(np.abs(places_px[enough] - np.nanmedian(places_px, axis=0)), axis=1)
     worst = int(off_px.argmax())
     if off_px[worst] > AGREEING_PX:
-        raise TeachingRefused(
-            f"{views[worst].image.name}: the gripper shows {off_px[worst]:.1f} px from where it is in the other "
-            f"images; at most {AGREEING_PX:g} px: images without motion of the camera, each with its own jaw opening"
+        raise ImageRefused(
+            views[worst].image,
+            f"the gripper shows {off_px[worst]:.1f} px from where it is in the other images; at most {AGREEING_PX:g} "
+            "px: images without motion of the camera, each with its own jaw opening",
         )
 
 

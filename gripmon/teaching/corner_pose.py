@@ -69,6 +69,9 @@ def pose_from_corners(
         raise PoseRefused(f"no pose: {snapped.refused}")
     measured = [i for i, c in enumerate(snapped.corners) if c.uv_px is not None and c.name not in by_hand_px]
     hand = [i for i, c in enumerate(snapped.corners) if c.name in by_hand_px]
+    for name in (snapped.corners[i].name for i in hand):
+        if not np.isfinite(camera.undistort(np.reshape(by_hand_px[name], (1, 2)))).all():
+            raise PoseRefused(f"{name} was put where the lens shows nothing; inside the lens's view, or not by hand")
     every = [*measured, *hand]
     taken = np.isin(np.arange(len(snapped.corners)), measured)
     uv_px = np.array([snapped.corners[i].uv_px for i in measured] + [by_hand_px[snapped.corners[i].name] for i in hand])

@@ -10,14 +10,16 @@ line of sight, which can't be seen, would grow with it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import msgspec
 import numpy as np
 
 from gripmon.camera import Camera
-from gripmon.corners import MeasurementSettings
+from gripmon.corners import Measurement, MeasurementSettings
 from gripmon.corners.taught import TaughtCorner, TaughtEdge, TaughtEdges
 from gripmon.geometry import perturbation_between
 from gripmon.gripper import Gripper
@@ -27,7 +29,9 @@ from gripmon.teaching.checks import check_edges, check_enough, check_reference, 
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, estimate_edges
 from gripmon.teaching.lines import find_line, of_image, settle_line
 from gripmon.teaching.looks import edge_looks
-from gripmon.teaching.views import Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.teaching.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+
+T = TypeVar("T")
 
 SEEN_SHARE = 0.6
 """Part of an edge's profiles that must show its line, in at least half of the images."""
@@ -42,6 +46,7 @@ class Taught:
     """What was learnt.  ``untaught``: for each other edge in view why not; ``notes``: what a person should know.
 
     ``closure_px``: how far the images, measured with what was taught, show the gripper from the reference, at most.
+    ``left_out``: the images that contradict the others, by their numbers, and why.
     """
 
     edges: dict[str, TaughtEdge]
@@ -49,6 +54,11 @@ class Taught:
     untaught: dict[str, str]
     notes: tuple[str, ...]
     closure_px: float
+    left_out: dict[int, str]
+
+    def used(self, images: Sequence[T]) -> list[T]:
+        """Of what belongs to the images given that of those taught from."""
+        return [one for number, one in enumerate(images) if number not in self.left_out]
 
 
 def teach(
@@ -62,16 +72,43 @@ def teach(
     """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
 
     Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
-    image alone a straight line of the background beside an outline can't be told from it.
+    image alone a straight line of the background beside an outline can't be told from it.  An image that contradicts
+    the others is left out while most of them remain.
     """
     assert images, "nothing to teach from"
     viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, images)
-    found = [viewer.fitted(image) for image in images]
-    views = [viewer.view(image, fit) for image, fit in zip(images, found, strict=True)]
+    fits = {number: viewer.fitted(image) for number, image in enumerate(images)}
+    left_out: dict[int, str] = {}
+    while True:
+        used = [images[number] for number in fits]
+        try:
+            viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, used)
+            return replace(_teach_or_say_where(viewer, used, list(fits.values())), left_out=left_out)
+        except ImageRefused as refused:
+            number = next(n for n in fits if images[n] is refused.image)
+            if 2 * (len(fits) - 1) <= len(images):
+                raise _with_those(refused, left_out) from None
+            del fits[number]
+            left_out[number] = str(refused)
+        except TeachingRefused as refused:
+            raise _with_those(refused, left_out) from None
+
+
+def _with_those(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
+    """The refusal, with the images that were left out before, each with its reason."""
+    if not left_out:
+        return refused
+    return TeachingRefused(f"{refused}; and left out before: {'; '.join(left_out.values())}")
+
+
+def _teach_or_say_where(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
+    """What these images teach; where that fails, an image that shows the gripper elsewhere is the likelier reason."""
     try:
-        return _teach(viewer, views)
+        return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
+    except ImageRefused:
+        raise
     except TeachingRefused:
-        for image, fit in zip(images, found, strict=True):
+        for image, fit in zip(images, fits, strict=True):
             if fit is None:
                 viewer.check_elsewhere(image)
         raise
@@ -100,6 +137,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
         {**untaught, **lost},
         notes,
         round(_closure_px(viewer, images, arrays), 4),
+        {},
     )
 
 
@@ -138,19 +176,20 @@ def _lines_of(seen: Sampled, images: int, search: bool) -> EdgeLines | str:
 
 def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtEdges) -> float:
     """How far the gripper shows from the reference in images that are measured with what they taught, px at most."""
-    worst_px = 0.0
+    worst_px, refused_px = 0.0, 0.0
+    refused: ImageRefused | None = None
     for image in images:
         found = viewer.measured(image, arrays)
         xi = perturbation_between(found.cam_T_grip, viewer.ref_cam_T_grip)
-        away_px = found.prediction.moved_px(xi)
+        away_px = found.prediction.moved_px(xi) if found.trusted else math.inf
         explained = xi @ np.linalg.solve(found.covariance[:6, :6], xi) <= GATE
-        if not found.trusted or (away_px > CLOSED_PX and not explained):
-            shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"
-            raise TeachingRefused(
-                f"{image.name}: measured with what was taught the gripper {shows}; at most {CLOSED_PX:g} px: images in "
-                "focus, without motion, the fingers free"
-            )
         worst_px = max(worst_px, away_px)
+        if away_px > max(CLOSED_PX, refused_px) and not (found.trusted and explained):
+            shows = f"shows {away_px:.2f} px from the reference" if found.trusted else "isn't found"
+            why = f"measured with what was taught the gripper {shows}; at most {CLOSED_PX:g} px: images in focus, "
+            refused, refused_px = ImageRefused(image, f"{why}without motion, the fingers free"), away_px
+    if refused is not None:
+        raise refused
     return worst_px
 
 

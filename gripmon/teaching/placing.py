@@ -40,7 +40,8 @@ class Prior:
 @dataclass(frozen=True, slots=True)
 class Placed:
     """A pose that hand-placed corners and the prior allow: ``covariance`` (6, 6), ``cost`` the weighted squares of what
-    is left, ``left_px`` for each placed corner how far the pose leaves it from where it was put.
+    is left, ``left_px`` for each placed corner how far the pose leaves it from where it was put; infinite where the
+    lens maps it nowhere.
     """
 
     cam_T_grip: Array
@@ -94,7 +95,7 @@ def place(
             continue
         cam_T_grip, covariance, cost = settled
         seen_px = camera.project(points_m @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
-        away = np.linalg.norm(seen_px - uv_px[known], axis=1).tolist()
+        away = np.nan_to_num(np.linalg.norm(seen_px - uv_px[known], axis=1), nan=np.inf).tolist()
         found.append(Placed(cam_T_grip, covariance, cost, dict(zip(names, away, strict=True))))
     found.sort(key=lambda pose: pose.cost)
     return found or [Placed(prior.cam_T_grip, prior.covariance, 0.0, {})]

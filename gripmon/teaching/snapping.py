@@ -15,7 +15,7 @@ from gripmon.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.corners.settling import ZOOMS, Expected
 from gripmon.geometry import perturb
-from gripmon.gripper import Gripper
+from gripmon.gripper import Gripper, on_a_line
 from gripmon.records import Array, CornerFault, Image
 from gripmon.teaching.placing import Placed, Prior, place, rough_sigma_px
 
@@ -40,6 +40,14 @@ _USUAL_SHARE = 0.6
 _OPENINGS, _TOLD = 9, 4.0  # jaw openings tried, where nobody reports it; by so much another cost (χ²) tells one
 _ALIKE = 0.25  # of the smallest distance between two corners
 _NARROW = Patience(when_doubtful=False, when_lost=False)
+
+ON_A_LINE = (
+    "the corners lie on a line, which doesn't say how the gripper is turned about it; one more beside it, or "
+    "a calibration of hand and eye (--reference FILE)"
+)
+MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
+NOTHING_SEEN = "no fingers are seen here; corners nearer to the tips"
+"""Why nothing was found, and what would help."""
 
 REASONS = {
     CornerFault.OUTSIDE: "outside of the image",
@@ -109,17 +117,19 @@ class Snapper:
             return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
         if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
             return self._rough(placed[0], start_m, misfit)
+        # Which way the gripper is turned about such a line only the edges can say; where they don't, that is why.
+        line = None if known or not self._on_a_line(put_px) else ON_A_LINE
         found = self._found(image, placed, start_m, jaw_opening_m is not None)
         if not known and self._mirrored_fits(image, put_px, start_m, jaw_opening_m is not None, prior, found):
-            why = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
-            return self._rough(placed[0], start_m, why)
+            return self._rough(placed[0], start_m, line or MIRRORED)
         if found is None or not found.trusted:
-            why = self._misfit(placed[0], MISFIT_SIGMAS[0]) or "no fingers are seen here; corners nearer to the tips"
+            why = self._misfit(placed[0], MISFIT_SIGMAS[0]) or line or NOTHING_SEEN
             return self._rough(placed[0], start_m, why)
         away_px = self._away_px(found, put_px)
         if away_px > FARTHEST_SIGMAS * rough_sigma_px(self.camera):
-            why = f"the edges found lie {away_px:.0f} px from your corners; corners nearer to the fingertips"
-            return self._rough(placed[0], start_m, why)
+            far = f"{away_px:.0f} px from your corners" if np.isfinite(away_px) else "out of the lens's view"
+            why = f"the edges found lie {far}; corners nearer to the fingertips"
+            return self._rough(placed[0], start_m, line or why)
         return self._measured(found, jaw_opening_m)
 
     def _found(
@@ -182,15 +192,24 @@ class Snapper:
         name, away_px = max(placed.left_px.items(), key=lambda item: item[1], default=("", 0.0))
         if away_px <= sigmas * rough_sigma_px(self.camera):
             return None
-        return f"{name} is {away_px:.0f} px from where the others put it; another corner, or another jaw opening?"
+        beside = f"{away_px:.0f} px from where the others put it"
+        where = beside if np.isfinite(away_px) else "put out of the lens's view by the others"
+        return f"{name} is {where}; another corner, or another jaw opening?"
+
+    def _on_a_line(self, put_px: Mapping[str, Array]) -> bool:
+        """Whether the corners put by hand lie on one line of the gripper."""
+        put = [name in put_px for name in self.gripper.corner_ids]
+        return on_a_line(self.gripper.points_grip_m()[self.gripper.corner_points[put]])
 
     def _away_px(self, found: Measurement, put_px: Mapping[str, Array]) -> float:
-        """Root mean square distance between the corners put by hand and where the measured gripper has them."""
+        """Root mean square distance between the corners put by hand and where the measured gripper has them; infinite
+        where the lens maps one of them nowhere.
+        """
         if not put_px:
             return 0.0
         model_px = self._corners_px(found.cam_T_grip, found.jaw_opening_m)
         apart = [model_px[name] - np.asarray(at) for name, at in put_px.items()]
-        return float(np.sqrt(np.mean(np.square(apart).sum(axis=1))))
+        return float(np.nan_to_num(np.sqrt(np.mean(np.square(apart).sum(axis=1))), nan=np.inf))
 
     def _corners_px(self, cam_T_grip: Array, jaw_opening_m: float | None) -> dict[str, Array]:
         points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]

@@ -42,6 +42,14 @@ class TeachingRefused(ValueError):
     """These images can't be taught from; the text is ``what is wrong; what would be right``."""
 
 
+class ImageRefused(TeachingRefused):
+    """This image can't be taught from; others may."""
+
+    def __init__(self, image: TeachingImage, why: str):
+        super().__init__(f"{image.name}: {why}")
+        self.image = image
+
+
 @dataclass(frozen=True, slots=True)
 class TeachingImage:
     """An image at the reference, and the jaw opening that was reported for it (the nominal one without jaw)."""
@@ -127,7 +135,7 @@ class Viewer:
         return found if found.trusted and near else None
 
     def check_elsewhere(self, image: TeachingImage) -> None:
-        """Raise :class:`TeachingRefused` if the gripper clearly stands farther from the reference than the profiles
+        """Raise :class:`ImageRefused` if the gripper clearly stands farther from the reference than the profiles
         reach.
         """
         meter = self._meter(None)
@@ -138,9 +146,10 @@ class Viewer:
         away_px = meter.moved_px(found, self.ref_cam_T_grip)
         if found.trusted and away_px > self._settings.sampling.reach_px:
             motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
-            raise TeachingRefused(
-                f"{image.name}: the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
-                f"{self._settings.sampling.reach_px:g} px: {self.advice(motion)}"
+            raise ImageRefused(
+                image,
+                f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
+                f"{self._settings.sampling.reach_px:g} px: {self.advice(motion)}",
             )
 
     def view(self, image: TeachingImage, found: Measurement | None) -> View:
@@ -167,8 +176,11 @@ class Viewer:
         margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
         sampling = msgspec.structs.replace(sampling, **margins)
         layout = lay_out(self.camera, self.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
-        there = self._predict(layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        # Both have the same samples: those that the lens maps from both poses.
         here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
+        there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
+        if there.layout is not here.layout:
+            here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
         profiles = read_profiles(grey, there.map_x, there.map_y)
         noise = estimate_noise(profiles, quantum(grey))
         candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), self._settings.edges, zoom)

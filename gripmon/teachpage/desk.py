@@ -18,6 +18,7 @@ import numpy as np
 from gripmon import __version__
 from gripmon.geometry import from_record, rotation_angle
 from gripmon.inspection import inspect
+from gripmon.pixels import in_full_scale
 from gripmon.records import Array, Frame, Image
 from gripmon.sources import Source, Waiting
 from gripmon.teaching.bench import Bench, Found, rough_fault
@@ -229,6 +230,7 @@ class Desk:
                 self._arrived.notify_all()
 
     def _usable(self, frame: Frame) -> Picture | None:
+        frame = in_full_scale(frame, self._bench.settings.bit_depth)
         fault = inspect(frame, self._bench.camera, self._bench.gripper)
         if fault is not None:
             self._why_dark = f"{self._labels.live}: {fault[1]}"
