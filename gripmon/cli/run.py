@@ -144,9 +144,11 @@ def run_daemon(
             opened.callback(kept.close)
             config = dataclasses.replace(config, reference=kept.configured)
         state = None if kept is None else kept.state
+        keeper = daemon.StateKeeper(kept)
         monitor = Monitor(
-            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
-        )
+            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state,
+            keeper.references,
+        )  # fmt: skip
         if monitor.look_refused is not None:
             _log.warning("%s", monitor.look_refused)
         network = open_network(config)
@@ -170,7 +172,7 @@ def run_daemon(
             camera=settings.camera_name,
             estimates=estimates,
             jaw=network.jaw,
-            keeper=daemon.StateKeeper(kept),
+            keeper=keeper,
             commands=network.commands,
             reports=dataclasses.replace(
                 with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m

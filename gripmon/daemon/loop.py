@@ -127,8 +127,11 @@ class Daemon(Loop):
         """What has been answered as done must be so after a crash, too."""
         self._make_reference_known()
         self._deliver("state's keeping", self._keep_changes, at_once=True)
-        if answer and answer.done and self._keeper.failure:
-            answer = msgspec.structs.replace(answer, text=f"{answer.text}; but {self._keeper.failure}")
+        if self._keeper.failure:  # also after a refusal for this reason: what is there is tried again
+            self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor_state()))
+            if answer and answer.done:
+                text = f"{answer.text}; but {self._keeper.failure}"
+                answer = msgspec.structs.replace(answer, text=text, durable=False)
         return answer
 
     def _keep_now(self) -> None:
