@@ -84,7 +84,6 @@ class Daemon(Loop):
     def _handle(self, frame: Frame) -> None:
         handed_over_ns = time.monotonic_ns()
         self._seq = frame.seq
-        self._faults.clear()
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
         self._deliver("transform", self._publisher.transform, record)
@@ -99,6 +98,7 @@ class Daemon(Loop):
         self._deliver("estimates", self._estimates.write, record)
         self._deliver("reflection", self._monitor.ponder)
         undelivered = "; ".join(self._faults.values())
+        self._faults.clear()
         for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
             self._alert(alert, record.state, frame.stamp_ns)
 

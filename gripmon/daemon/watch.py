@@ -25,7 +25,7 @@ from gripmon.records import (
 
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
-_SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
+_SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 
 
 class Judged(NamedTuple):
@@ -99,15 +99,21 @@ class Watch:
     def end_of_frame(self, failure: str, undelivered: str, now_s: float, stamp_ns: int) -> list[Alert]:
         """What failed here, not in the camera: the monitor on the frame, or passing on what it had to say.
 
-        Only the first says something about the transform.
+        Only the first says something about the transform, and only it counts as an error: an output that fails must not
+        take the monitor, and the other outputs, with it.
         """
         self.undelivered = undelivered
-        self.errors_in_a_row = self.errors_in_a_row + 1 if failure or undelivered else 0
+        self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
+        if undelivered:
+            silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
+            told = list(self._alerts.present(_OUTPUT, silent, now_s, stamp_ns))
+        else:
+            told = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
         if not failure:
-            return list(self._alerts.absent(_FAILURE, "frames are judged again", now_s))
+            return [*told, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
-        return list(self._alerts.present(_FAILURE, failed, now_s, stamp_ns))
+        return [*told, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or thins, as it says itself; the monitor goes on."""
