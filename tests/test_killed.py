@@ -72,7 +72,7 @@ class Witness:
         for once more, else what was done already would be refused.
         """
         while not stop.is_set():
-            payload = msgspec.json.encode({"argument": references[-2], "id": f"undo-{len(references)}-{references[-1]}"})
+            payload = msgspec.json.encode({"argument": references[-2], "id": f"{len(references)}-{references[-1]}"})
             for reply in self._session.get(f"{PREFIX}/cmd/undo", payload=payload, timeout=timeout_s):
                 if reply.ok is not None:
                     answer = msgspec.json.decode(reply.ok.payload.to_bytes(), type=CommandReply)

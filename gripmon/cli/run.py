@@ -156,11 +156,13 @@ def run_daemon(
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)
         on_network()
-        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live)
+        source = _open_source(config, network.link)
+        opened.callback(source.close)
+        patience_s = 0.0 if source.live else common.RECORDING_PATIENCE_S
+        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live, patience_s)
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
-        source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run(
             monitor,
@@ -228,6 +230,7 @@ def _open_recorder(
     name: str | None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
     live: viewing.LiveView | None,
+    patience_s: float,
 ) -> Recorder:
     from gripmon.config.recorded import to_recorded
     from gripmon.recording import open_recorder
@@ -249,6 +252,7 @@ def _open_recorder(
             directory=out,
             name=name,
             truth_tcp_m=truth_tcp_m,
+            patience_s=patience_s,
             configuration=configuration,
             view=None if live is None else live.settings,
         )

@@ -94,6 +94,7 @@ class FileSeries:
         self.failure: str | None = None
         self.frames_written = 0
         self.frames_lost = 0
+        self.images_lost = 0  # of frames that are written
         self._mend()
         self._begin()
 
@@ -145,7 +146,8 @@ class FileSeries:
             late, self._late = self._late[:_PICTURES_A_CHUNK], self._late[_PICTURES_A_CHUNK:]
             self._writer.write_pictures(late)
             whole = self._flush(self._stream, self._file)
-        if whole:
+            self.images_lost += len(late) * (self._file is None)  # given up, and they with it
+        if whole and self._file is not None:
             self._keep_house(self._file)
         elif self._waiting_for_too_much():
             self._lose()
@@ -298,6 +300,7 @@ class FileSeries:
     def _lose(self) -> None:
         """Frames are gone; alerts wait, so that the recording says in time what it went through."""
         self.frames_lost += len(self._rows)
+        self.images_lost += len(self._late)
         alerts: list[AlertRecord] = self._events.alerts[-_ALERTS_KEPT:]
         self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 

@@ -57,13 +57,22 @@ class Health:
             self._thins = None
 
 
-def _why_silent(pid: int) -> str:
+def is_stopped(pid: int) -> bool:
+    """Whether a process was stopped, by SIGSTOP or a debugger, and won't go on by itself."""
+    return _state(pid) in ("T", "t")
+
+
+def _state(pid: int) -> str:
+    """The letter that Linux has for it; empty if there is no such process."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     except (OSError, IndexError):
-        state = ""
-    if state == "D":
+        return ""
+
+
+def _why_silent(pid: int) -> str:
+    if _state(pid) == "D":
         return "the disk doesn't answer"
-    if state in ("T", "t"):
+    if is_stopped(pid):
         return "its process was stopped from outside"
     return f"its process hasn't answered for {SILENT_AFTER_S:g} s"

@@ -6,6 +6,7 @@ import os
 import select
 import signal
 import time
+from collections import deque
 from dataclasses import replace
 
 import cv2
@@ -25,6 +26,7 @@ from gripmon.records import Alert, AlertRecord, FrameRecord, Limits
 _NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0
 _FRAMES_A_WRITE = 128
+_STAMPS_KEPT = 4096
 _REPORT_PERIOD_S = 1.0  # the daemon must hear something
 
 
@@ -52,6 +54,8 @@ class RecordingLoop:
         self._ring: ImageRing
         self._moments: Moments
         self._before: PictureRing
+        self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images that had no room
+        self._images_lost = 0
         self._decode = msgspec.msgpack.Decoder(Batch).decode
         self._encode = msgspec.json.Encoder().encode
         self._images_done = 0
@@ -133,11 +137,21 @@ class RecordingLoop:
             )
         else:
             row = SpotRow(record, picture)
+        if note.lost and not note.due:
+            self._without.append(record.stamp_ns)
+            self._count_lost()
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
         for receiver in self._receivers():
             receiver.add_frames([row])
+
+    def _count_lost(self) -> None:
+        """Images around an alert that never came here."""
+        missed = [stamp_ns for stamp_ns in self._without if self._is_near(stamp_ns)]
+        self._images_lost += len(missed)
+        for stamp_ns in missed:
+            self._without.remove(stamp_ns)
 
     def _is_near(self, stamp_ns: int) -> bool:
         return self._around_ns > 0 and self._moments.near(stamp_ns)
@@ -149,6 +163,7 @@ class RecordingLoop:
         self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
         if self._around_ns > 0 and near_ns is not None:
             self._moments.add(near_ns)
+            self._count_lost()
             pictures = self._before.take(self._moments)
             for receiver in self._receivers():
                 receiver.add_pictures(pictures)
@@ -167,6 +182,7 @@ class RecordingLoop:
             frames_lost=files.frames_lost,
             images_done=self._images_done,
             view_failure=None if self._live is None else self._live.failure,
+            images_lost=self._images_lost + files.images_lost,
         )
         if self._parent_listens:
             try:
