@@ -65,7 +65,7 @@ def add_parser(commands: Any) -> None:
         "--out",
         metavar="DIR",
         help="put the recording and estimates.jsonl (one JSON line a frame; spots.jsonl, a line a pulse) here; made if "
-        "it is missing, and what is there is kept (estimates-1.jsonl …)",
+        "it is missing, and what is there is kept (estimates-1.jsonl …) within daemon.estimates_budget_bytes",
     )
     parser.add_argument(
         "--fresh-state",
