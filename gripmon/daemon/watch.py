@@ -25,6 +25,8 @@ from gripmon.records import (
 
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
+_UPDATE_S = 10.0
+"""Pause between two reasons of what fails: a disk that is gone and then full is news, figures that change are none."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 
 
@@ -60,7 +62,7 @@ class Watch:
         self.frames_usable = 0
         self.undelivered = ""
         self.errors_in_a_row = 0
-        self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
+        self._alerts = AlertBook(update_s=_UPDATE_S, clear_s=0.0)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._judged: Judged | None = None
@@ -106,7 +108,7 @@ class Watch:
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
         if undelivered:
             silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
-            told = list(self._alerts.present(_OUTPUT, silent, now_s, stamp_ns))
+            told = self._fails(_OUTPUT, silent, now_s, stamp_ns)
         else:
             told = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
         if not failure:
@@ -120,7 +122,13 @@ class Watch:
         if failure is None:
             return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
-        return list(self._alerts.present(_RECORDING, stopped, now_s, stamp_ns))
+        return self._fails(_RECORDING, stopped, now_s, stamp_ns)
+
+    def _fails(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> list[Alert]:
+        """What there is to tell of something that fails, also when it now does for another reason."""
+        before = self._alerts.about(topic)
+        news = before is not None and _kind(before.text) != _kind(alert.text)
+        return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

@@ -259,6 +259,8 @@ class ProcessRecorder:
         worker.read_reports()
         if worker.status.view_failure is not None and worker.status.view_failure != self._status.view_failure:
             _log.warning("%s; the monitor and its recording go on", worker.status.view_failure)
+        if worker.status.notice is not None and self._status.notice is None:
+            _log.info("%s", worker.status.notice)
         self._status = worker.status
         while worker.ready:
             batch = self._next_batch(worker)

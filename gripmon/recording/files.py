@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -14,15 +15,16 @@ from typing import Any
 
 import rerun as rr
 
-from gripmon.recording.budget import DiskBudget, claim, space_missing
+from gripmon.recording.budget import DiskBudget, claim, is_being_written, space_missing
 from gripmon.recording.columns import AnyRow
 from gripmon.recording.layout import layout_file
 from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
-from gripmon.recording.repair import repair
+from gripmon.recording.repair import is_complete, repair
 from gripmon.recording.ring import Moments
 from gripmon.recording.wire import Events, Scene
 from gripmon.recording.writers import Writer, make_writer
 from gripmon.records import AlertRecord
+from gripmon.rerun_private import free_closed_streams
 
 APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0
@@ -95,6 +97,7 @@ class FileSeries:
         self.frames_written = 0
         self.frames_lost = 0
         self.images_lost = 0  # of frames that are written
+        self.notice: str | None = None  # what was found at the start
         self._mend()
         self._begin()
 
@@ -172,7 +175,7 @@ class FileSeries:
                 self._stalled = True
                 self.failure = f"recording pauses: the disk under {self._directory} doesn't answer"
             else:
-                self._abandon(f"can't write {file.path}: {error}")
+                self._abandon(self._why_not(file.path, error))
             return False
         file.frames += self._unflushed
         self.frames_written += self._unflushed
@@ -240,6 +243,8 @@ class FileSeries:
 
     def _begin(self) -> None:
         """Open the next file and write what every file needs: the layout, all that is static, the reference."""
+        with contextlib.suppress(OSError):  # said below
+            self._directory.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
         missing = space_missing(self._directory, self._settings.min_free_bytes, _FREE_AGAIN)
         missing = missing or self._room_missing()
         number = 0 if missing else self._next_number()
@@ -258,7 +263,7 @@ class FileSeries:
             del stream
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
-            self._fail(f"can't write {path}: {error}")
+            self._fail(self._why_not(path, error))
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
         if self._newest_reference not in self._events.references:
@@ -266,8 +271,15 @@ class FileSeries:
         self._stream, self._writer = stream, writer
         self._file = _File(path, claim(path), time.monotonic())
         self.failure = None
-        # The streams of earlier files, which rerun would keep with their threads until the end.
-        rr.bindings.flush_and_cleanup_orphaned_recordings()  # type: ignore[attr-defined]
+        free_closed_streams()  # of earlier files
+
+    def _why_not(self, path: Path, error: Exception) -> str:
+        """rerun only says that its thread has ended: the room there is explains the rest."""
+        try:
+            free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
+        except OSError as missing:
+            free = str(missing.strerror)
+        return f"can't write {path} ({free}): {' '.join(str(error).split())}"
 
     def _room_missing(self) -> str:
         try:
@@ -307,8 +319,16 @@ class FileSeries:
     def _mend(self) -> None:
         """Earlier files of this robot and camera, whose writer may have been killed, and pins without a file."""
         with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
-            for entry in self._budget.recordings():
-                repair(entry.path)
+            paths = [entry.path for entry in self._budget.recordings()]
+            for path in paths:
+                repair(path)
+            lacking = [path for path in paths if not is_complete(path) and not is_being_written(path)]
+            if lacking:
+                self.notice = (
+                    f"{len(lacking)} earlier recordings have no footer, as their recorder was killed, the newest "
+                    f"{lacking[-1]}; gripmon and rerun's viewer read them; for tools that need one: "
+                    "rerun rrd optimize FILE.rrd -o WHOLE.rrd"
+                )
             for pin in self._budget.orphaned_pins():
                 pin.unlink(missing_ok=True)
 

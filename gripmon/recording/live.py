@@ -154,6 +154,7 @@ class NoFiles:
 
     path: str | None = None
     failure: str | None = None
+    notice: str | None = None
     frames_lost = frames_waiting = images_lost = 0
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.recording.health import SILENT_AFTER_S, is_stopped
+from gripmon.recording.health import SILENT_AFTER_S, stands_still
 from gripmon.recording.wire import ImageRing, Scene, Status, framed
 from gripmon.records import Limits
 
@@ -121,7 +121,7 @@ class WorkerProcess:
             _wait_for(self._reports, select.POLLIN, left_s)
             self.read_reports()
         silent_s = time.monotonic() - self.heard_s
-        if not self.gone and has_everything and silent_s < SILENT_AFTER_S and not is_stopped(self.pid):
+        if not self.gone and has_everything and silent_s < SILENT_AFTER_S and not stands_still(self.pid):
             self.still_writes = True
             os.close(self._reports)
             return None

@@ -159,6 +159,7 @@ class Status(msgspec.Struct, frozen=True):
     frames_lost: int
     images_done: int
     view_failure: str | None = None  # of the live view, which is no failure of the recording
+    notice: str | None = None  # what a person may want to do about earlier files
     images_lost: int = 0  # around alerts, or with a disk that failed; those that were due never came here
 
 

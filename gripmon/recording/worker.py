@@ -182,6 +182,7 @@ class RecordingLoop:
             frames_lost=files.frames_lost,
             images_done=self._images_done,
             view_failure=None if self._live is None else self._live.failure,
+            notice=files.notice,
             images_lost=self._images_lost + files.images_lost,
         )
         if self._parent_listens:
