@@ -269,7 +269,8 @@ class ProcessRecorder:
             worker.send(self._encode(batch))
         self._look(worker)
         if worker.gone:
-            self._bury(worker, worker.reap(0.0) or "the recording process ended by itself")
+            ended = worker.reap(0.0) or "the recording process ended by itself"
+            self._bury(worker, (worker.status.failure or ended).removeprefix("recording failed: "))
 
     def _look(self, worker: WorkerProcess) -> None:
         if not worker.gone:

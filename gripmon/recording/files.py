@@ -6,6 +6,7 @@ import contextlib
 import os
 import re
 import shutil
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -30,6 +31,7 @@ APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0
 _LONGEST_RETRY_S = 30.0
 _FLUSH_TIMEOUT_S = 2.0
+_LOOK_S = 0.05
 _STALLED_FLUSH_TIMEOUT_S = 0.1
 _SHORTEST_PIN_S = 5.0  # so much before and after an alert is pinned, even where no images are kept around it
 _SPANS_KEPT = 64
@@ -57,10 +59,23 @@ class _File:
         if stamps_ns:
             self.first_ns, self.last_ns = min(stamps_ns + known_ns), max(stamps_ns + known_ns)
 
+    def is_written(self) -> bool:
+        """Whether rerun still has it open: its thread that writes ends with the first write that fails."""
+        opened = (entry for entry in Path("/proc/self/fd").iterdir() if entry.name != str(self.lock))
+        return any(_link_of(entry) == self.path for entry in opened)
+
     def release(self) -> None:
         if self.lock is not None:
             os.close(self.lock)
             self.lock = None
+
+
+def _link_of(entry: Path) -> Path | None:
+    """What a descriptor is of; None if it was closed meanwhile."""
+    try:
+        return entry.readlink()
+    except OSError:
+        return None
 
 
 class FileSeries:
@@ -98,6 +113,9 @@ class FileSeries:
         self.frames_lost = 0
         self.images_lost = 0  # of frames that are written
         self.notice: str | None = None  # what was found at the start
+        self.hangs = False
+        """rerun waits for ever for a writer that has died: nothing can be cleaned up any more, not even the process."""
+        self._hung: list[rr.RecordingStream] = []
         self._mend()
         self._begin()
 
@@ -157,10 +175,7 @@ class FileSeries:
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
-        if self._stream is not None and self._writer is not None:
-            self._writer.finish()
-            self._stream.disconnect()
-        self._leave()
+        self._complete()
         self._lose()
 
     def _flush(self, stream: rr.RecordingStream, file: _File) -> bool:
@@ -171,11 +186,14 @@ class FileSeries:
             stream.flush(timeout_sec=timeout_s)
             file.whole_bytes = file.path.stat().st_size
         except Exception as error:  # noqa: BLE001 - rerun raises one kind for both; what fails does so at once
-            if time.monotonic() - begun_s >= 0.9 * timeout_s and file.path.exists():
+            timed_out = time.monotonic() - begun_s >= 0.9 * timeout_s
+            if timed_out and file.is_written():
                 self._stalled = True
                 self.failure = f"recording pauses: the disk under {self._directory} doesn't answer"
-            else:
-                self._abandon(self._why_not(file.path, error))
+                return False
+            if timed_out:
+                self._hang(stream)
+            self._abandon(self._why_not(file.path, error))
             return False
         file.frames += self._unflushed
         self.frames_written += self._unflushed
@@ -226,10 +244,31 @@ class FileSeries:
 
     def _end(self) -> None:
         """Complete the file before the next one; what waits stays for that."""
-        if self._stream is not None and self._writer is not None:
+        self._complete()
+
+    def _complete(self) -> None:
+        """Write the footer and end the file; not where its disk has failed, for which rerun would wait for ever."""
+        stream, file = self._stream, self._file
+        if stream is not None and self._writer is not None and file is not None:
             self._writer.finish()
-            self._stream.disconnect()
+            if not self._stalled:
+                self._flush(stream, file)
+            if self._file is None:  # abandoned
+                return
+            ending = threading.Thread(target=stream.disconnect, daemon=True)
+            ending.start()
+            while ending.is_alive() and file.is_written():
+                ending.join(_LOOK_S)
+            ending.join(_FLUSH_TIMEOUT_S)
+            if ending.is_alive():
+                self._hang(stream)
+                self._abandon(self._why_not(file.path, OSError("its end could not be written")))
         self._leave()
+
+    def _hang(self, stream: rr.RecordingStream) -> None:
+        """Keep a stream that would wait for ever when it is forgotten."""
+        self._hung.append(stream)
+        self.hangs = True
 
     def _leave(self) -> None:
         self._stream = self._writer = None
@@ -253,6 +292,7 @@ class FileSeries:
             return
         path = self._directory / f"{self._scene.name}-{number:04d}.rrd"
         stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+        begun_s = time.monotonic()
         try:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
@@ -260,6 +300,8 @@ class FileSeries:
             writer = make_writer(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
+            if time.monotonic() - begun_s >= 0.9 * _FLUSH_TIMEOUT_S and not _File(path, None, begun_s).is_written():
+                self._hang(stream)
             del stream
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)

@@ -156,6 +156,7 @@ class NoFiles:
     failure: str | None = None
     notice: str | None = None
     frames_lost = frames_waiting = images_lost = 0
+    hangs = False
 
     def __init__(self) -> None:
         self.frames_written = 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import signal
+import sys
 import time
 from collections import deque
 from dataclasses import replace
@@ -37,10 +38,13 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
+    code = 0
     try:
         RecordingLoop(status_descriptor, memory_descriptor).run()
     except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
-        raise SystemExit(f"recording process: {type(error).__name__}: {error}") from None
+        sys.stderr.write(f"recording process: {type(error).__name__}: {error}\n")
+        code = 1
+    os._exit(code)  # all is written, or can't be; rerun would wait for a viewer, or for a writer that has died
 
 
 class RecordingLoop:
@@ -69,7 +73,7 @@ class RecordingLoop:
     def run(self) -> None:
         next_flush = next_report = time.monotonic() + self._flush_period_s
         ended = False
-        while not ended:
+        while not ended and not (self._scene is not None and self._files.hangs):
             next_turn = min(next_flush, next_report)
             readable, _, _ = select.select((_STDIN,), (), (), max(next_turn - time.monotonic(), 0.0))
             if readable:
@@ -91,10 +95,9 @@ class RecordingLoop:
                 next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
             self._files.close()
-            released = self._live is None or self._live.close()
+            if self._live is not None:
+                self._live.close()
             self._report()
-            if not released:
-                os._exit(0)  # all is written, and rerun would wait for the viewer
 
     def _take(self, payload: bytes) -> None:
         if self._scene is None:
