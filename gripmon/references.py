@@ -1,6 +1,7 @@
 """The chain of references: which calibration is in force, what it came from, and the way back to an earlier one.
 
-Pure bookkeeping: no clock, no files.  A revision is a number that grows by one with every change, also with an undo,
+Pure bookkeeping: no clock, no files; whoever makes a book may have the chain kept before a reference gets into force
+(:data:`Keep`).  A revision is a number that grows by one with every change, also with an undo,
 and that never names two different references: whoever holds two transforms with the same reference and revision may
 compare them.
 """
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -31,6 +32,10 @@ _SYMMETRY_TOLERANCE = 1e-6
 _ROUNDING = 1e-9
 
 
+Keep = Callable[[tuple["ReferenceRecord", ...]], str]
+"""Keeps a chain of references so that it survives a restart; says why it can't, and nothing where it could."""
+
+
 class CommandRefused(ValueError):
     """What an operator asked for can't be done, and nothing has changed; the text says why."""
 
@@ -43,19 +48,22 @@ class ReferenceBook:
     reference withdraws it.
     """
 
-    def __init__(self, configured: ReferenceRecord):
-        """Begin with the configured reference."""
+    def __init__(self, configured: ReferenceRecord, keep: Keep = lambda _: ""):
+        """Begin with the configured reference.  What ``keep`` can't keep doesn't get into force."""
+        self._keep = keep
         self._references: tuple[ReferenceRecord, ...] = (configured,)
         self._proposal: ReferenceRecord | None = None
         self._changes = 0
 
     @classmethod
-    def restored(cls, references: Sequence[ReferenceRecord], proposal: ReferenceRecord | None = None) -> ReferenceBook:
+    def restored(
+        cls, references: Sequence[ReferenceRecord], proposal: ReferenceRecord | None = None, keep: Keep = lambda _: ""
+    ) -> ReferenceBook:
         """Go on with a chain that was kept.  Raises ValueError with what is wrong if it doesn't hold together."""
         fault = chain_fault(references, proposal)
         if fault:
             raise ValueError(fault)
-        book = cls(references[0])
+        book = cls(references[0], keep)
         book._references, book._proposal = tuple(references), proposal
         return book
 
@@ -115,7 +123,7 @@ class ReferenceBook:
 
     def adopt(self, draft: ReferenceRecord) -> ReferenceRecord:
         """The monitor itself lets a draft in.  Raises ValueError for one that was made for another revision, or whose
-        numbers can't be a pose with a covariance.
+        numbers can't be a pose with a covariance; :class:`CommandRefused` for one that can't be kept.
         """
         self._check(draft)
         return self._append(draft)
@@ -198,10 +206,13 @@ class ReferenceBook:
         )
 
     def _append(self, reference: ReferenceRecord) -> ReferenceRecord:
-        self._references = (*self._references, reference)
-        if len(self._references) > KEPT:
-            self._references = (self._references[0], *self._references[2:])
-        self._proposal = None
+        """Into force, but kept before: a crash must not take back what somebody rests on, nor free its revision."""
+        references = (*self._references, reference)
+        if len(references) > KEPT:
+            references = (references[0], *references[2:])
+        if fault := self._keep(references):
+            raise CommandRefused(f"{reference.reference_id} is not put in force, as a restart would lose it: {fault}")
+        self._references, self._proposal = references, None
         self._changes += 1
         return reference
 

@@ -26,6 +26,9 @@ from gripmon.references import state_fault
 
 _log = logging.getLogger(__name__)
 
+_UNREADABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What decoding raises for a file that is none of ours; the last one where brackets are nested by the thousand."""
+
 FORMAT = 1
 LARGEST_BYTES = 64 << 20
 """A file larger than this is none of ours: a thousand references take less than 3 MB."""
@@ -129,7 +132,7 @@ def unpack(data: bytes) -> Kept:
     """The content of a file.  Raises ValueError, which says what is wrong, for all but a whole and sound one."""
     try:
         envelope = msgspec.json.decode(data, type=_Envelope)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except _UNREADABLE:
         raise ValueError("it is cut off, or no state file at all") from None
     content = bytes(envelope.content)
     if hashlib.sha256(content).hexdigest() != envelope.sha256:
@@ -139,7 +142,7 @@ def unpack(data: bytes) -> Kept:
         if version != FORMAT:
             raise ValueError(f"it has format {version}, and this version of gripmon reads format {FORMAT}")
         read = msgspec.json.decode(content, type=_Read)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except _UNREADABLE as error:
         raise ValueError(f"its content is no state: {error}") from None
     kept = Kept(read.format, read.owner, MonitorState(**msgspec.structs.asdict(read.state)))
     if fault := state_fault(kept.state):
@@ -210,8 +213,9 @@ class StateFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            os.ftruncate(descriptor, 0)
-            os.write(descriptor, b"%d\n" % os.getpid())
+            with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only nobody can say whose
+                os.ftruncate(descriptor, 0)
+                os.write(descriptor, b"%d\n" % os.getpid())
         except BlockingIOError:
             assert descriptor is not None
             holder = os.read(descriptor, 20).decode(errors="replace").strip()
@@ -257,7 +261,7 @@ class StateFile:
             self.state = kept.state
             return
         why = f"of another calibration ({changed} changed since)" if changed else "not wanted"
-        aside = self._set_aside("replaced")
+        aside = self._set_aside("replaced", until_written=True)
         revision = 1 + kept.state.references[-1].revision
         self.configured = msgspec.structs.replace(self.configured, revision=revision)
         self._notice(
@@ -283,15 +287,19 @@ class StateFile:
         )
         return ", ".join(name for name, same in parts if not same)
 
-    def _set_aside(self, why: str) -> str:
-        """Rename the file beside itself; says what became of it."""
+    def _set_aside(self, why: str, *, until_written: bool = False) -> str:
+        """Rename the file beside itself; says what became of it.
+
+        ``until_written``: it stays under its own name, too, until it is written over: it alone knows the revisions.
+        """
         if not self._usable:
             return "not used"
         number = 1
         while (target := self._path.with_name(f"{self._path.name}.{why}-{number}")).exists() or target.is_symlink():
             number += 1
         try:
-            self._path.rename(target)
+            if not (until_written and _linked(self._path, target)):
+                self._path.rename(target)
         except OSError as error:
             self._give_up(f"{self._path} can't be set aside: {error.strerror or error}")
             return "not used"
@@ -309,3 +317,12 @@ class StateFile:
         if failure != self.failure:
             self.failure = failure
             _log.error("%s", failure)
+
+
+def _linked(path: Path, other: Path) -> bool:
+    """Whether the file has the other name besides; not every file system can do that."""
+    try:
+        other.hardlink_to(path)
+    except OSError:
+        return False
+    return True

@@ -127,7 +127,8 @@ class Listener:
         self.offered: list[tuple[Frame, FrameRecord]] = []
         self.commands: list[RecordedCommand] = []
         self.closed = 0
-        self.dropped = 0
+        self.dropped = self.images_dropped = 0
+        self.has_room = True
         self.failure: str | None = None
         self.order: list[tuple[str, int]] = []  # what came, and the revision that it names
         self.fails, self._closing_fails = fails, closing_fails

@@ -30,6 +30,7 @@ from gripmon.records import (
     Severity,
     State,
     Verdict,
+    to_json,
 )
 from gripmon.sources import Waiting
 
@@ -263,6 +264,27 @@ def test_estimates_are_on_disk_after_a_flush(tmp_path: Path):
     estimates.close()
     estimates.write(frame_record(2))
     assert len(path.read_text().splitlines()) == 1
+
+
+def test_estimates_stay_within_their_budget_and_the_newest_are_kept(tmp_path: Path):
+    path = tmp_path / "estimates.jsonl"
+    (tmp_path / "estimates-7.jsonl").write_bytes(b"an earlier run's\n" * 1000)
+    (tmp_path / "estimates-x.jsonl").write_bytes(b"none of ours\n" * 10_000)
+    budget_bytes = 200_000
+    estimates = EstimatesFile(path, budget_bytes)
+    for seq in range(300):
+        estimates.write(frame_record(seq))
+        if seq % 3 == 2:
+            estimates.flush()
+    estimates.close()
+    files = sorted(tmp_path.glob("estimates-[0-9]*.jsonl"), key=lambda kept: int(kept.stem[10:]))
+    assert files[0].name != "estimates-7.jsonl" and (tmp_path / "estimates-x.jsonl").exists()
+    sizes = [kept.stat().st_size for kept in (*files, path)]
+    line_bytes = len(to_json(frame_record(0))) + 3
+    assert budget_bytes - 30_000 < sum(sizes) <= budget_bytes + 3 * line_bytes
+    assert all(20_000 <= size < 20_000 + 4 * line_bytes for size in sizes[:-1])
+    seqs = [json.loads(line)["seq"] for kept in (*files, path) for line in kept.read_text().splitlines()]
+    assert seqs == list(range(seqs[0], 300)), "whole lines, in order, to the newest"
 
 
 def test_the_interpreter_is_left_as_it_was():

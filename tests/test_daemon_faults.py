@@ -11,6 +11,7 @@ from stand_ins import Listener, ScriptedMonitor
 
 from gripmon.records import (
     Alert,
+    AlertEvent,
     AlertKind,
     Cause,
     Origin,
@@ -56,11 +57,16 @@ def test_errors_that_come_and_go_do_not_add_up():
 
 
 @pytest.mark.parametrize("fails", ["transform", "offer", "everything"])
-def test_a_broken_output_is_survived_for_a_while(fails: str):
+def test_a_broken_output_does_not_take_the_monitor_with_it(fails: str, caplog: pytest.LogCaptureFixture):
     bench = Bench(range(100), give_up_after_errors=5)
     bench.network, bench.recording = Listener(fails=fails), Listener(fails=fails)
-    assert bench.run() == 3
-    assert len(bench.monitor.frames) == 5
+    with caplog.at_level(logging.ERROR, "gripmon"):
+        assert bench.run() == 0
+    assert len(bench.monitor.frames) == 100
+    said = [text for text in caplog.messages if text.startswith("output raised: ") and "the line is cut" in text]
+    assert len(said) == 1, "an alert, once, in the log where nobody else hears of it"
+    if fails != "everything":
+        assert bench.alerts == [(AlertKind.OUTPUT, Cause.UNKNOWN)]
 
 
 def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
@@ -70,7 +76,7 @@ def test_a_network_fault_costs_nobody_else_anything(tmp_path: Path):
     assert bench.run(estimates=tmp_path / "estimates.jsonl") == 0
     assert [frame.seq for frame, _ in bench.recording.offered] == [0, 1, 2]
     assert len((tmp_path / "estimates.jsonl").read_bytes().splitlines()) == 3
-    assert [said.kind for said in bench.network.alerts] == [AlertKind.STEP] * 3
+    assert [said.kind for said in bench.network.alerts] == [AlertKind.STEP, AlertKind.OUTPUT, *[AlertKind.STEP] * 2]
     assert bench.network.states[-1].frames == 3
     assert bench.states[1] == (State.TRACKING, "transform not delivered: OSError: the line is cut")
     assert State.LOST not in [state for state, _ in bench.states]
@@ -85,7 +91,11 @@ def test_a_broken_recorder_costs_the_network_nothing_and_its_end_is_said(caplog:
     assert [frame.seq for frame, _ in bench.recording.offered] == [2]
     fault = "recording not delivered: OSError: the line is cut"
     assert bench.states[1:3] == [(State.TRACKING, fault), (State.TRACKING, "")]
-    assert caplog.messages == [fault]
+    assert [text for text in caplog.messages if not text.startswith("output ")] == [fault]
+    assert [(alert.kind, alert.event) for alert in bench.network.alerts] == [
+        (AlertKind.OUTPUT, AlertEvent.RAISED),
+        (AlertKind.OUTPUT, AlertEvent.CLEARED),
+    ]
 
 
 def test_a_monitor_that_fails_is_alerted_though_the_network_failed_before():

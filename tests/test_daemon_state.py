@@ -261,7 +261,22 @@ def test_an_answer_says_when_what_was_done_can_not_be_kept():
     asker = Asker([UNDO])
     bench.run(keeper=StateKeeper(Disk(full=True)), commands=asker)
     (answer,) = asker.answers
-    assert answer.text == "as you like; but state not kept: disk full"
+    assert answer.text == "as you like; but state not kept: disk full" and not answer.durable
+
+
+def test_a_chain_that_can_not_be_kept_is_not_tried_again_and_one_that_is_counts_at_once():
+    disk = Disk(full=True)
+    keeper = StateKeeper(disk)
+    known = MonitorState((reference_record(1),), alerts_raised=7)
+    keeper.now(known)
+    longer = (*known.references, reference_record(2))
+    assert keeper.references(longer) == "state not kept: disk full"
+    disk.full = False
+    wait_until(lambda: disk.states, "what was given to keep")
+    assert disk.states == [known]
+    assert keeper.references(longer) == "" and StateKeeper(None).references(longer) == ""
+    assert disk.states[1:] == [MonitorState(longer, alerts_raised=7)]
+    keeper.close()
 
 
 def test_an_asker_who_is_gone_disturbs_nobody():

@@ -16,6 +16,7 @@ PACKAGE = ROOT / "gripmon"
 
 FLOORS = {
     "records": 0, "provenance": 0, "atomic": 0, "geometry": 0, "lenses": 0, "pixels": 0, "camera": 0, "gripper": 0,
+    "rerun_private": 0,
     "corners": 1, "differential": 1, "inspection": 1, "jaw": 1, "recalibrate": 1, "smoothing": 1, "policy": 1,
     "references": 1, "causes": 1, "stream": 1, "drift": 1, "hindsight": 1,
     "calibration": 1, "simulator": 1, "integrity": 1, "look": 1,
@@ -27,7 +28,7 @@ FLOORS = {
 }  # fmt: skip
 FOREIGN = {
     "zenoh": {"wire", "publish", "client", "sources", "ros2"},
-    "rerun": {"recording", "report", "playback"},
+    "rerun": {"recording", "report", "playback", "rerun_private"},
     "rosbags": {"ros2"},
     "prometheus_client": {"metrics"},
 }

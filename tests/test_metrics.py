@@ -95,6 +95,7 @@ def test_a_daemon_tells_prometheus_what_it_tells_the_network(tmp_path: Path):
             ("gripmon_frames_refused_total", state.frames_refused),
             ("gripmon_frames_dropped_total", state.frames_dropped),
             ("gripmon_recording_dropped_total", state.recording_dropped),
+            ("gripmon_recording_images_dropped_total", state.recording_images_dropped),
             ("gripmon_reference_revision", state.revision),
             ("gripmon_frames_per_second", state.frames_per_s),
             ("gripmon_sigma_meters", state.sigma_m),

@@ -233,6 +233,31 @@ def test_the_alert_about_the_recording() -> None:
     assert watch.standing(()) == ()
 
 
+def test_another_reason_is_told_and_other_figures_are_not() -> None:
+    watch = Watch(DaemonSettings(), 0.0)
+    watch.recording("recording failed: can't write /d/a-0001.rrd (0.0 MB free): its thread ended", 0.0, 10)
+    for at_s, figure in ((11.0, 2), (22.0, 3)):
+        same = f"recording failed: can't write /d/a-000{figure}.rrd ({figure}.1 MB free): its thread ended"
+        assert watch.recording(same, at_s, 20) == []
+    (updated,) = watch.recording("recording pauses: /d: No such file or directory", 33.0, 30)
+    assert (updated.event, updated.text) == (AlertEvent.UPDATED, "recording pauses: /d: No such file or directory")
+    (standing,) = watch.standing(())
+    assert standing.text == updated.text
+
+
+def test_a_directory_that_was_removed_is_made_again(tmp_path: Path) -> None:
+    folder = tmp_path / "deep" / "recordings"
+    writer = recorder(folder)
+    offer_and_wait(writer, 0, 5)
+    shutil.rmtree(folder.parent)
+    wait_until(lambda: offer(writer, 100, 1) or writer.failure is not None, LONG_S)
+    wait_until(lambda: writer.failure is None, LONG_S)
+    offer_and_wait(writer, 200, 5)
+    path = writer.path
+    writer.close(20.0)
+    assert path is not None and path.parent == folder and Recorded(path).seqs()[-5:] == list(range(200, 205))
+
+
 def test_the_daemon_says_so_and_goes_on() -> None:
     def failing(why: str | None):
         return lambda _: setattr(bench.recording, "failure", why)

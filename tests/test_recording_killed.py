@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import random
 import shutil
@@ -16,7 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from recorded import CAMERA, GRIPPER, REFERENCE, Recorded, record, settings, wait_until
+from recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
 
 from gripmon.playback import open_recordings
 from gripmon.recording.columns import Row
@@ -134,3 +135,29 @@ def test_what_is_no_recording_is_left_alone(tmp_path: Path) -> None:
         path.write_bytes(contents)
         repair(path)
         assert path.read_bytes() == contents
+
+
+def test_a_killed_recorders_file_is_told_with_the_command_that_makes_it_whole(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    writer = recorder(tmp_path)
+    writer.offer(frame(0), record(0), lambda: None)
+    wait_until(lambda: writer.frames_written == 1)
+    assert writer.process_id is not None and writer.path is not None
+    killed = writer.path
+    os.kill(writer.process_id, signal.SIGKILL)
+    wait_until(lambda: writer.failure is not None)
+    writer.close(10.0)
+    with caplog.at_level(logging.INFO, "gripmon.recording"):
+        again = recorder(tmp_path)
+        wait_until(lambda: "no footer" in caplog.text)
+        again.close(10.0)
+    (line,) = (text for text in caplog.messages if "no footer" in text)
+    assert line.startswith(f"1 earlier recordings have no footer, as their recorder was killed, the newest {killed};")
+    assert line.endswith("rerun rrd optimize FILE.rrd -o WHOLE.rrd")
+    rerun = str(Path(sys.executable).with_name("rerun"))
+    whole = tmp_path / "whole.rrd"
+    assert subprocess.run([rerun, "rrd", "verify", str(killed)], capture_output=True, check=False).returncode != 0
+    subprocess.run([rerun, "rrd", "optimize", str(killed), "-o", str(whole)], capture_output=True, check=True)
+    subprocess.run([rerun, "rrd", "verify", str(whole)], capture_output=True, check=True)
+    assert Recorded(whole).seqs() == [0]

@@ -297,3 +297,27 @@ def test_a_state_that_does_not_hold_together_is_told(what: str, reason: str):
 
 def test_a_state_that_holds_together_has_no_fault():
     assert state_fault(broken("none")) == ""
+
+
+def test_what_can_not_be_kept_does_not_get_into_force():
+    """Kept first, whoever lets it in; where that fails nothing has changed, and the number names nothing."""
+    kept: list[tuple[ReferenceRecord, ...]] = []
+    full = False
+
+    def keep(references: tuple[ReferenceRecord, ...]) -> str:
+        kept.append(references)
+        return "no space left" if full else ""
+
+    book = ReferenceBook(configured(), keep)
+    for i, step in enumerate(("a", "a", "p"), start=1):
+        take(book, step, i)
+    assert kept == [book.history[:2], book.history]
+    before = (book.history, book.proposal, book.changes)
+    full = True
+    ways = (lambda: adopt(book, 7), book.accept, lambda: book.undo(5), lambda: book.reset(5))
+    for way in ways:
+        with pytest.raises(CommandRefused, match="is not put in force, as a restart would lose it: no space left"):
+            way()
+        assert kept[-1][-1].revision == 3 and (book.history, book.proposal, book.changes) == before
+    full = False
+    assert book.undo(5).revision == 3 and kept[-1] == book.history

@@ -135,7 +135,7 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
 
 
 def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    config = sequence_config(sequence, "{image_format: jpeg, image_rate_hz: 2.0, min_free_bytes: 0}", "thin.yaml")
+    config = sequence_config(sequence, "{image_rate_hz: 2.0, around_alert_s: 0.0, min_free_bytes: 0}", "thin.yaml")
     recording = tmp_path / "thin.rrd"
     replayed(sequence, tmp_path / "then.jsonl", "--config", str(config), "--recording", str(recording))
     capsys.readouterr()

@@ -222,7 +222,7 @@ def test_the_state_of_another_calibration_is_set_aside_and_revisions_go_on(path:
     write(path, DATA)
     calibration = msgspec.structs.replace(OWNER.calibration, **{part: "new"})
     file = read_once(path, Owner("arm", "wrist", calibration))
-    assert file.state is None and beside(path) == ["arm.json.replaced-1"]
+    assert file.state is None and beside(path) == ["arm.json", "arm.json.replaced-1"]
     assert f"of another calibration ({said} changed since); set aside as arm.json.replaced-1" in file.notices[0]
     assert file.configured == configured(4), "no revision names two references"
 
@@ -237,7 +237,26 @@ def test_a_fresh_start_sets_aside_what_could_be_used(path: Path):
         in (file.notices[0])
     )
     assert (path.parent / "arm.json.replaced-1").read_bytes() == DATA
-    assert opened(path, fresh=True).notices == ()  # nothing there
+    again = opened(path, fresh=True)
+    assert again.configured == configured(4), "nothing was written since: what knows the revisions is still there"
+    assert again.write(MonitorState((again.configured,)))
+    again.close()
+    assert opened(path, fresh=True).configured == configured(5)
+    assert [(path.parent / f"arm.json.replaced-{i}").read_bytes() for i in (1, 2)] == [DATA] * 2
+
+
+@pytest.mark.parametrize("nested", [b"[" * 100_000, b'{"format":' * 100_000])
+def test_a_file_nested_by_the_thousand_is_set_aside(path: Path, nested: bytes):
+    for data in (b'{"sha256":"x","content":' + nested, _sealed(b'{"format":1,"owner":' + nested)):
+        write(path, data)
+        file = read_once(path)
+        assert file.state is None and file.configured == configured()
+        assert "is damaged: it is cut off, or no state file at all; set aside" in file.notices[0]
+
+
+def _sealed(content: bytes) -> bytes:
+    """A file whose checksum is right."""
+    return b'{"sha256":"%s","content":%s}' % (hashlib.sha256(content).hexdigest().encode(), content)
 
 
 def test_the_calibration_is_that_of_the_values():

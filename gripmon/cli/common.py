@@ -18,6 +18,7 @@ EXIT_DONE = 0
 EXIT_USAGE = 2
 EXIT_FAILED = 3
 EXIT_INTERRUPTED = 130
+RECORDING_PATIENCE_S = 30.0  # images that can wait outrun any camera: they wait for the recording, none is dropped
 EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 _LARGEST_SEED = 2**32 - 1
 

@@ -52,7 +52,6 @@ FILE.rrd from before stays then); 130 interrupted (what was done until then is i
 
 
 _LATENCY_BIN = 0.02  # natural logarithm
-_RECORDING_PATIENCE_S = 30.0  # replay outruns any camera: it waits for the recording rather than drop a frame
 
 
 def add_parser(commands: Any) -> None:
@@ -325,7 +324,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
             reference=config.reference,
             directory=Path(scratch),
             name=path.stem,
-            patience_s=_RECORDING_PATIENCE_S,
+            patience_s=common.RECORDING_PATIENCE_S,
             configuration=to_recorded(config),
         )
         opened.enter_context(_told_at_the_end())
@@ -334,8 +333,15 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
         finally:
             recorder.close(timeout_s=60.0)
             # A disk that failed for a moment has left a whole file of the frames after it.
-            missing = f"{recorder.dropped} frames are missing" if recorder.dropped else None
+            missing = _missing(recorder)
             keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
+
+
+def _missing(recorder: Recorder) -> str | None:
+    """What is not in a recording that is to hold all; None if nothing is missing."""
+    if recorder.dropped:
+        return f"{recorder.dropped} frames are missing"
+    return f"{recorder.images_dropped} images are missing" if recorder.images_dropped else None
 
 
 @contextmanager

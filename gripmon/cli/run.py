@@ -65,7 +65,7 @@ def add_parser(commands: Any) -> None:
         "--out",
         metavar="DIR",
         help="put the recording and estimates.jsonl (one JSON line a frame; spots.jsonl, a line a pulse) here; made if "
-        "it is missing, and what is there is kept (estimates-1.jsonl …)",
+        "it is missing, and what is there is kept (estimates-1.jsonl …) within daemon.estimates_budget_bytes",
     )
     parser.add_argument(
         "--fresh-state",
@@ -144,9 +144,11 @@ def run_daemon(
             opened.callback(kept.close)
             config = dataclasses.replace(config, reference=kept.configured)
         state = None if kept is None else kept.state
+        keeper = daemon.StateKeeper(kept)
         monitor = Monitor(
-            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state=state
-        )
+            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state,
+            keeper.references,
+        )  # fmt: skip
         if monitor.look_refused is not None:
             _log.warning("%s", monitor.look_refused)
         network = open_network(config)
@@ -154,11 +156,13 @@ def run_daemon(
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)
         on_network()
-        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live)
+        source = _open_source(config, network.link)
+        opened.callback(source.close)
+        patience_s = 0.0 if source.live else common.RECORDING_PATIENCE_S
+        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live, patience_s)
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
-        source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run(
             monitor,
@@ -170,7 +174,7 @@ def run_daemon(
             camera=settings.camera_name,
             estimates=estimates,
             jaw=network.jaw,
-            keeper=daemon.StateKeeper(kept),
+            keeper=keeper,
             commands=network.commands,
             reports=dataclasses.replace(
                 with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m
@@ -227,6 +231,7 @@ def _open_recorder(
     name: str | None,
     truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
     live: viewing.LiveView | None,
+    patience_s: float,
 ) -> Recorder:
     from gripmon.config.recorded import to_recorded
     from gripmon.recording import open_recorder
@@ -248,6 +253,7 @@ def _open_recorder(
             directory=out,
             name=name,
             truth_tcp_m=truth_tcp_m,
+            patience_s=patience_s,
             configuration=configuration,
             view=None if live is None else live.settings,
         )

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from gripmon.sources import Source
     from gripmon.wire import Link
 
-_PATIENCE_S = 30.0  # recorded frames outrun any camera: they wait for the recording rather than be dropped
-
 
 @dataclasses.dataclass(frozen=True)
 class _Network:
@@ -74,11 +72,12 @@ def run_second(
         opened.callback(network.publisher.close)
         publisher = _with_metrics(config, network.publisher)
         opened.callback(publisher.close)
-        recorder = _open_recorder(config, out, live)
+        source = _open_source(config, network.link)
+        opened.callback(source.close)
+        recorder = _open_recorder(config, out, live, 0.0 if source.live else common.RECORDING_PATIENCE_S)
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
-        source = _open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run_second(
             pulsed,
@@ -157,11 +156,10 @@ def _open_source(config: SecondConfig, link: Link | None) -> Source:
         raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 
 
-def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None) -> SpotRecorder:
+def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None, patience_s: float) -> SpotRecorder:
     """The recording that the configuration wants; ends the command with exit code 2 where it can't be made."""
     from gripmon.config.recorded import second_to_recorded
     from gripmon.recording import open_spot_recorder
-    from gripmon.sources import FolderSettings, VideoSettings
 
     settings = config.settings
     try:
@@ -169,7 +167,6 @@ def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None
     except OSError as error:
         text = f"{config.path}: {error.filename}: can't be read any more ({error.strerror})"
         raise common.CommandFailedError(text, common.EXIT_USAGE) from None
-    recorded = isinstance(settings.source, FolderSettings | VideoSettings)
     try:
         return open_spot_recorder(
             settings.recording,
@@ -177,7 +174,7 @@ def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None
             camera_name=settings.camera_name,
             calibration=config.calibration,
             directory=out,
-            patience_s=_PATIENCE_S if recorded else 0.0,
+            patience_s=patience_s,
             configuration=configuration,
             view=None if live is None else live.settings,
         )

@@ -161,7 +161,7 @@ def _closing(
         closing.callback(publisher.close)
         closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
         closing.callback(source.close)
-        file = closing.enter_context(contextlib.closing(EstimatesFile(lines)))
+        file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
         snapshots = closing.enter_context(contextlib.closing(Snapshots()))
         yield _Opened(stop, file, snapshots)
 

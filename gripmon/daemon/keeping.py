@@ -5,7 +5,9 @@ from __future__ import annotations
 import threading
 from typing import Protocol
 
-from gripmon.records import MonitorState
+import msgspec
+
+from gripmon.records import MonitorState, ReferenceRecord
 
 RETRY_S = 1.0
 """Pause before a state that could not be written is tried again."""
@@ -30,6 +32,7 @@ class StateKeeper:
         self._writing = threading.Lock()  # held while a state is written: an older one never replaces a newer one
         self._changed = threading.Condition()  # guards what follows
         self._waiting: MonitorState | None = None
+        self._newest: MonitorState | None = None  # that was given to keep
         self._closing = False
         self._thread: threading.Thread | None = None
 
@@ -46,17 +49,35 @@ class StateKeeper:
             return
         with self._writing:
             with self._changed:
-                self._waiting = None
+                self._waiting, self._newest = None, state
             done = self._sink.write(state)
         if not done:
             self.soon(state)
+
+    def references(self, references: tuple[ReferenceRecord, ...]) -> str:
+        """Keep a chain of references before its newest gets into force; why that can't be, empty if it is done.
+
+        What can't be kept is not tried again: the caller goes without.  The rest of the state is the newest known, but
+        a proposal, which a new reference withdraws, and the look, which belonged to the reference before.
+        """
+        if self._sink is None:
+            return ""
+        with self._changed:
+            known = self._newest or MonitorState(references)
+        state = msgspec.structs.replace(known, references=references, proposal=None, look=None)
+        with self._writing:
+            if not self._sink.write(state):
+                return self._sink.failure
+            with self._changed:
+                self._waiting, self._newest = None, state
+        return ""
 
     def soon(self, state: MonitorState) -> None:
         """Keep a state in another thread."""
         if self._sink is None:
             return
         with self._changed:
-            self._waiting = state
+            self._waiting = self._newest = state
             self._changed.notify()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="gripmon-state", daemon=True)

@@ -84,7 +84,6 @@ class Daemon(Loop):
     def _handle(self, frame: Frame) -> None:
         handed_over_ns = time.monotonic_ns()
         self._seq = frame.seq
-        self._faults.clear()
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
         self._deliver("transform", self._publisher.transform, record)
@@ -99,6 +98,7 @@ class Daemon(Loop):
         self._deliver("estimates", self._estimates.write, record)
         self._deliver("reflection", self._monitor.ponder)
         undelivered = "; ".join(self._faults.values())
+        self._faults.clear()
         for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
             self._alert(alert, record.state, frame.stamp_ns)
 
@@ -127,8 +127,11 @@ class Daemon(Loop):
         """What has been answered as done must be so after a crash, too."""
         self._make_reference_known()
         self._deliver("state's keeping", self._keep_changes, at_once=True)
-        if answer and answer.done and self._keeper.failure:
-            answer = msgspec.structs.replace(answer, text=f"{answer.text}; but {self._keeper.failure}")
+        if self._keeper.failure:  # also after a refusal for this reason: what is there is tried again
+            self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor_state()))
+            if answer and answer.done:
+                text = f"{answer.text}; but {self._keeper.failure}"
+                answer = msgspec.structs.replace(answer, text=text, durable=False)
         return answer
 
     def _keep_now(self) -> None:

@@ -22,6 +22,14 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     give_up_after_errors: Annotated[
         int, msgspec.Meta(ge=1, description="internal errors in so many frames in a row: stop, exit code 3")
     ] = 50
+    estimates_budget_bytes: Annotated[
+        int,
+        msgspec.Meta(
+            ge=0,
+            description="estimates.jsonl (spots.jsonl) of run --out with all that were set aside beside it: a tenth of "
+            "this is a file, and beyond it the oldest are deleted; 0: one file without end (bytes)",
+        ),
+    ] = 10_000_000_000
     stop_within_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="from a signal to the end, the recording completed (s)")
     ] = 1.8

@@ -45,6 +45,9 @@ _T = TypeVar("_T")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
 
+_ROOM_POLL_S = 0.002
+"""Pause of a source that can wait for the recording."""
+
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
 
@@ -99,7 +102,7 @@ class Loop(ABC):
         self._next_state_s = self._start_s
         self._stop = stop
         self._source_broke = False
-        self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
+        self._faults: dict[str, str] = {}  # since the frame before: what could not be delivered, and why
         self._said_faults: dict[str, str] = {}  # in the log
 
     @property
@@ -158,6 +161,10 @@ class Loop(ABC):
         """Wait for the source and handle what it gives; False if there is nothing more to do."""
         self._obey()
         self._between()
+        if not self._source.live and not self._kept.has_room:
+            time.sleep(_ROOM_POLL_S)
+            self._say_state(time.monotonic())
+            return True
         try:
             item = self._source.read()
         except Exception as error:  # noqa: BLE001  said below, and the end of the loop
@@ -208,7 +215,7 @@ class Loop(ABC):
         """Hand something to one receiver, whose failure is no other's; False, said and counted, if it failed."""
         try:
             put(*values, **named)
-        except Exception as error:  # noqa: BLE001  said here, counted at the end of the frame
+        except Exception as error:  # noqa: BLE001  said here, an alert at the end of the frame
             self._faults[what] = f"{what} not delivered: {in_short(error)}"
             self._log_once(what, "", self._faults[what], error)
             return False
@@ -272,6 +279,7 @@ class Loop(ABC):
             uptime_s=now_s - self._start_s,
             camera_connected=self._source.connected,
             recording_dropped=self._kept.dropped,
+            recording_images_dropped=self._kept.images_dropped,
             message=message,
             version=__version__,
             tcp_shift_m=watch.tcp_shift_m,

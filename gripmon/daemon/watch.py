@@ -25,7 +25,9 @@ from gripmon.records import (
 
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
-_SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
+_UPDATE_S = 10.0
+"""Pause between two reasons of what fails: a disk that is gone and then full is news, figures that change are none."""
+_SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 
 
 class Judged(NamedTuple):
@@ -60,7 +62,7 @@ class Watch:
         self.frames_usable = 0
         self.undelivered = ""
         self.errors_in_a_row = 0
-        self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
+        self._alerts = AlertBook(update_s=_UPDATE_S, clear_s=0.0)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._judged: Judged | None = None
@@ -99,22 +101,34 @@ class Watch:
     def end_of_frame(self, failure: str, undelivered: str, now_s: float, stamp_ns: int) -> list[Alert]:
         """What failed here, not in the camera: the monitor on the frame, or passing on what it had to say.
 
-        Only the first says something about the transform.
+        Only the first says something about the transform, and only it counts as an error: an output that fails must not
+        take the monitor, and the other outputs, with it.
         """
         self.undelivered = undelivered
-        self.errors_in_a_row = self.errors_in_a_row + 1 if failure or undelivered else 0
+        self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
+        if undelivered:
+            silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
+            told = self._fails(_OUTPUT, silent, now_s, stamp_ns)
+        else:
+            told = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
         if not failure:
-            return list(self._alerts.absent(_FAILURE, "frames are judged again", now_s))
+            return [*told, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
-        return list(self._alerts.present(_FAILURE, failed, now_s, stamp_ns))
+        return [*told, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or thins, as it says itself; the monitor goes on."""
         if failure is None:
             return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
-        return list(self._alerts.present(_RECORDING, stopped, now_s, stamp_ns))
+        return self._fails(_RECORDING, stopped, now_s, stamp_ns)
+
+    def _fails(self, topic: str, alert: Alert, now_s: float, stamp_ns: int) -> list[Alert]:
+        """What there is to tell of something that fails, also when it now does for another reason."""
+        before = self._alerts.about(topic)
+        news = before is not None and _kind(before.text) != _kind(alert.text)
+        return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

@@ -108,6 +108,7 @@ STATES: list[_Column] = [
     ("frames_refused", _INTEGER, "1", "of these, those that couldn't be measured at all"),
     ("frames_dropped", _INTEGER, "1", "that came while another one was worked on"),
     ("recording_dropped", _INTEGER, "1", "frames that the recording had no time for"),
+    ("recording_images_dropped", _INTEGER, "1", "images that the recording had no time for, of frames that it has"),
     ("transforms_unsent", _INTEGER, "1", "before there was a Zenoh session"),
     ("malformed", _INTEGER, "1", "messages received that were none"),
     ("frames_per_s", _DOUBLE, "1/s", "rate of the last frames"),

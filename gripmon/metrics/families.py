@@ -41,6 +41,7 @@ class Families(Collector):
             ("gripmon_frames_refused", "Frames that could not be measured at all", state.frames_refused),
             ("gripmon_frames_dropped", "Frames that came while another one was worked on", state.frames_dropped),
             ("gripmon_recording_dropped", "Frames that the recording had no time for", state.recording_dropped),
+            ("gripmon_recording_images_dropped", "Images of recorded frames without", state.recording_images_dropped),
             ("gripmon_transforms_unsent", "Transforms from before there was a session", state.transforms_unsent),
             ("gripmon_messages_malformed", "Messages received that were none", state.malformed),
         ):

@@ -61,7 +61,7 @@ from gripmon.records import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.references import CommandRefused
+from gripmon.references import CommandRefused, Keep
 from gripmon.smoothing import PoseAverage
 from gripmon.stream import StreamFault, StreamWatch
 
@@ -82,8 +82,10 @@ class Monitor:
         reference: ReferenceRecord,
         taught: TaughtEdges | None = None,
         state: MonitorState | None = None,
+        keep: Keep = lambda _: "",
     ):
         """``state``, where given, is what :meth:`state` said before a restart: its newest reference counts then.
+        ``keep`` is asked before any other gets into force: what can't be kept is only proposed, or refused.
 
         Raises ValueError for a state that doesn't hold together.
         """
@@ -112,7 +114,7 @@ class Monitor:
         self._jumped = False  # since the last frame that was believed
         self._baseline_weighed = False
         self._restarted = state is not None  # and not yet said whether the picture fits
-        self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state)
+        self._renewal = Renewal(settings, gripper, self._tracker.floor, reference, self._policy, state, keep)
         error = None if state is None or state.reference_error is None else np.array(state.reference_error)
         sigma = np.sqrt(np.reshape(self._renewal.book.configured.covariance, (6, 6)).diagonal())
         self._configured_baseline = Baseline(sigma, settings.policy.settle_frames, error)

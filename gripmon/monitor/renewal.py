@@ -29,7 +29,10 @@ from gripmon.records import (
     Severity,
     State,
 )
-from gripmon.references import CommandRefused, ReferenceBook
+from gripmon.references import CommandRefused, Keep, ReferenceBook
+
+KEEP_AGAIN_S = 10.0
+"""Pause before a reference that could not be kept is measured and tried again: a full disk stays full for a while."""
 
 
 class Renewal:
@@ -43,8 +46,12 @@ class Renewal:
         reference: ReferenceRecord,
         policy: Policy,
         state: MonitorState | None,
+        keep: Keep,
     ):
-        """``floor`` (6, 6): covariance of the systematic error.  ValueError for a state that doesn't hold together."""
+        """``floor`` (6, 6): covariance of the systematic error; ``keep`` comes before any new reference.
+
+        ValueError for a state that doesn't hold together.
+        """
         self._gripper, self._policy, self._settings = gripper, policy, settings.recalibration
         self._settle_frames = settings.policy.settle_frames
         self._recalibrator = Recalibrator(
@@ -55,8 +62,12 @@ class Renewal:
         self.wanted = False
         """Whether an operator wants a new reference."""
         self._rejected: ReferenceRecord | None = None  # by an operator, in place of the reference in force
+        self._unkept: ReferenceRecord | None = None  # the proposal, where it is one for want of a disk alone
+        self._keep_again_s = 0.0
         self.book = (
-            ReferenceBook(reference) if state is None else ReferenceBook.restored(state.references, state.proposal)
+            ReferenceBook(reference, keep)
+            if state is None
+            else ReferenceBook.restored(state.references, state.proposal, keep)
         )
 
     def moved(self) -> None:
@@ -116,7 +127,9 @@ class Renewal:
             self.wanted = False
             text = f"not calibrated anew, as an operator wanted: {explanation.text or cause}"
             return self._policy.refused(text, explanation, now_s, stamp_ns)
-        if not self.wanted and any(self._holds(known, cam_T_grip) for known in (self.book.proposal, self._rejected)):
+        again = self._unkept is not None and self._unkept is self.book.proposal and now_s >= self._keep_again_s
+        known = (None if again else self.book.proposal, self._rejected)
+        if not self.wanted and any(self._holds(each, cam_T_grip) for each in known):
             return ()
         outcome = self.outcome = self._recalibrator.outcome(self.book.current)
         if outcome.wait:
@@ -140,14 +153,29 @@ class Renewal:
             self.book.propose(draft)
             parts = [f"{moved}; the new reference {draft.reference_id} waits to be accepted", *asks, explanation.text]
             return self._policy.proposed("; ".join(p for p in parts if p), explanation, now_s, stamp_ns)
-        self.book.adopt(draft)
-        self._rejected = None
+        try:
+            self.book.adopt(draft)
+        except CommandRefused as refusal:
+            return self._not_kept(draft, str(refusal), asked, explanation, now_s, stamp_ns)
+        self._rejected = self._unkept = None
         text = (
             f"{moved}; it was calibrated anew from {outcome.inputs.frames} frames, corners "
             f"{', '.join(outcome.inputs.corners)}: revision {self.book.current.revision}"
         )
         done = Alert(AlertKind.RECALIBRATED, cause, Severity.WARNING, text)
         return (*self._policy.recalibrated(now_s), done)
+
+    def _not_kept(
+        self, draft: ReferenceRecord, why: str, asked: bool, explanation: Explanation, now_s: float, stamp_ns: int
+    ) -> tuple[Alert, ...]:
+        """A new reference that would be forgotten waits: until it can be kept, or until an operator accepts it."""
+        self._keep_again_s = now_s + KEEP_AGAIN_S
+        if not asked and self._unkept is not None and self._unkept is self.book.proposal:
+            return ()  # said before
+        self.book.propose(draft)
+        self._unkept = draft
+        text = f"{why}; it is tried again every {KEEP_AGAIN_S:g} s"
+        return self._policy.proposed(text, explanation, now_s, stamp_ns)
 
     def _holds(self, proposal: ReferenceRecord | None, cam_T_grip: Array) -> bool:
         """Whether there is a proposal and the gripper is where it has it, by what would be worth a warning at least."""

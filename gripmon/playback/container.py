@@ -23,6 +23,7 @@ import numpy as np
 
 from gripmon.playback import entities, protobuf
 from gripmon.playback.table import IntArray
+from gripmon.rerun_private import RerunChangedError, chunk_index
 
 MAGIC = b"RRF2"
 _FILE_HEADER_BYTES = 12
@@ -115,8 +116,11 @@ class RrdFile:
         try:
             reader = RrdReader(self.path)
             entry = next(e for e in reader.recordings() if e.recording_id == store.recording_id)
-            batch = reader.store(store=entry)._chunk_index().to_arrow()
-            return _manifest(batch, self.size)
+            return _manifest(chunk_index(reader.store(store=entry)), self.size)
+        except RerunChangedError as error:
+            self.has_footer = False
+            self.faults.append(f"its messages were read one by one: {error}")
+            return None
         except Exception as error:  # noqa: BLE001 - whatever rerun raises: the messages themselves may be sound
             self._distrust_footer(error)
             return None

@@ -49,7 +49,8 @@ class ComparedRecorder:
     It writes in the caller's thread: a replay can wait.
     """
 
-    dropped = 0
+    dropped = images_dropped = 0
+    has_room = True
 
     def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
         """``recorded_limits`` are drawn beside the replay's; None where nobody knows them.  OSError as for a file."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
@@ -47,6 +48,7 @@ LONGEST_RESTART_PAUSE_S = 30.0
 _ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
 _FRAMES_A_TURN = 4
+_SAY_LOSSES_EVERY_S = 60.0
 _EVENTS_KEPT = 256
 
 Vector = tuple[float, float, float]
@@ -54,7 +56,9 @@ Truth = Callable[[int], Vector | None]
 
 
 class _Waiting(NamedTuple):
-    """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert."""
+    """A frame in the queue; ``counted`` among the images that wait, ``due`` its image, not only around an alert;
+    ``lost`` its image, for want of room.
+    """
 
     record: FrameRecord | SpotRecord
     counted: bool
@@ -63,6 +67,7 @@ class _Waiting(NamedTuple):
     jaw_reported_m: float | None
     notes: MonitorNotes | None
     due: bool
+    lost: bool = False
 
 
 _T = TypeVar("_T")
@@ -105,8 +110,12 @@ class ProcessRecorder:
         # Written by the hand-over thread only.
         self._images_taken = 0
         self._images_without_slot = 0
+        self._images_lost_earlier = 0
+        self._losses_said = (0, 0)
+        self._losses_said_s = -math.inf
         self._slot_waited_from: float | None = None
         self._lost_earlier = 0
+        self._left_writing = 0  # frames that a process still writes when this object is closed
         self._written_earlier = 0
         self._newest_reference = scene.reference
         self._own_failure: str | None = None
@@ -130,8 +139,16 @@ class ProcessRecorder:
 
     @property
     def images_dropped(self) -> int:
-        """Images that were due but had no room; their frames are recorded without image and overlay."""
-        return self._images_not_queued + self._images_without_slot
+        """Images that were due, or around an alert, but had no room: their frames are recorded without."""
+        earlier = self._images_not_queued + self._images_without_slot + self._images_lost_earlier
+        return earlier + self._status.images_lost
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the next frame and its image would be taken.  Nobody need wait for a recording that fails."""
+        images = self._ring_images if self._ring_wanted else self._queue_images
+        waiting = self._images_offered - self._images_taken
+        return self.failure is not None or (len(self._frames) < self._queue_frames and waiting < images)
 
     @property
     def frames_written(self) -> int:
@@ -178,8 +195,9 @@ class ProcessRecorder:
             self._images_offered += 1
             item = _Waiting(record, True, frame.image, None, frame.jaw_opening_m, noted, False)
         else:
-            self._images_not_queued += bool(due)
-            item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, bool(due))
+            self._images_not_queued += bool(due and frame.image is not None)
+            lost = frame.image is not None and (bool(due) or self._ring_wanted)
+            item = _Waiting(record, False, None, None, frame.jaw_opening_m, noted, bool(due), lost)
         self._frames.append(item)
 
     def alert(self, alert: AlertRecord) -> None:
@@ -206,14 +224,12 @@ class ProcessRecorder:
         self._closing.set()
         self._thread.join()
         self._frames.clear()
-        self._lost_earlier = self._queued - self.frames_written - self._status.frames_lost
+        self._lost_earlier = self._queued - self.frames_written - self._left_writing - self._status.frames_lost
+        self._say_losses()
 
     def _wait_for_room(self) -> None:
         end = time.monotonic() + self._patience_s
-        while time.monotonic() < end and self.failure is None:
-            images_waiting = self._images_offered - self._images_taken
-            if len(self._frames) < self._queue_frames and images_waiting < self._queue_images:
-                return
+        while not self.has_room and time.monotonic() < end:
             time.sleep(_ROOM_POLL_S)
 
     def _image_is_due(self, stamp_ns: int) -> bool:
@@ -243,6 +259,8 @@ class ProcessRecorder:
         worker.read_reports()
         if worker.status.view_failure is not None and worker.status.view_failure != self._status.view_failure:
             _log.warning("%s; the monitor and its recording go on", worker.status.view_failure)
+        if worker.status.notice is not None and self._status.notice is None:
+            _log.info("%s", worker.status.notice)
         self._status = worker.status
         while worker.ready:
             batch = self._next_batch(worker)
@@ -251,7 +269,8 @@ class ProcessRecorder:
             worker.send(self._encode(batch))
         self._look(worker)
         if worker.gone:
-            self._bury(worker, worker.reap(0.0) or "the recording process ended by itself")
+            ended = worker.reap(0.0) or "the recording process ended by itself"
+            self._bury(worker, (worker.status.failure or ended).removeprefix("recording failed: "))
 
     def _look(self, worker: WorkerProcess) -> None:
         if not worker.gone:
@@ -259,6 +278,15 @@ class ProcessRecorder:
             explained = worker.status.failure is not None
             now_s = time.monotonic()
             self._health.look(now_s, worker.heard_s, worker.heard, worker.pid, self.dropped, images, explained)
+            if now_s - self._losses_said_s >= _SAY_LOSSES_EVERY_S:
+                self._say_losses(now_s)
+
+    def _say_losses(self, now_s: float = math.inf) -> None:
+        """One line when something more is missing than was said last."""
+        losses = (self.dropped, self.images_dropped)
+        if losses != self._losses_said:
+            self._losses_said, self._losses_said_s = losses, now_s
+            _log.warning("missing in the recording so far: %d frames; %d images of others", *losses)
 
     def _running_worker(self) -> WorkerProcess | None:
         if self._worker is None and time.monotonic() >= self._restart_at:
@@ -274,7 +302,9 @@ class ProcessRecorder:
         """Count what a dead process took with it and plan the next one."""
         self._lost_earlier += worker.frames_sent - worker.status.frames
         self._written_earlier += worker.status.frames
-        self._status = msgspec.structs.replace(worker.status, path=None, failure=None, frames=0, frames_lost=0)
+        self._images_lost_earlier += worker.status.images_lost
+        none = {"path": None, "failure": None, "frames": 0, "frames_lost": 0, "images_lost": 0}
+        self._status = msgspec.structs.replace(worker.status, **none)
         self._own_failure = failure
         self._worker = None
         self._restart_at = time.monotonic() + self._restart_pause_s
@@ -283,16 +313,19 @@ class ProcessRecorder:
 
     def _next_batch(self, worker: WorkerProcess) -> EncodedBatch:
         frames: list[msgspec.Raw] = []
-        while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0].image):
-            record, counted, image, trace, jaw_reported_m, noted, due = self._frames.popleft()
+        while self._frames and len(frames) < BATCH_FRAMES and not self._wait_for_slot(worker, self._frames[0]):
+            record, counted, image, trace, jaw_reported_m, noted, due, lost = self._frames.popleft()
             self._images_taken += counted
-            note = None if image is None else self._share(worker, image, due)
+            note = None
+            if image is not None and self._ring.takes(image):  # else a refused frame: its record says why
+                note = self._share(worker, image, due)
+                lost = note is None
             packed = None if trace is None else pack_trace(trace)
             truth_tcp_m = None if self._truth_tcp_m is None else self._truth_tcp_m(record.seq)
             limits = None if noted is None or noted.limits is worker.limits_sent else noted.limits
             worker.limits_sent = limits or worker.limits_sent
             share = None if noted is None else noted.statistic_share
-            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due)
+            whole = FrameNote(record, note, packed, truth_tcp_m, jaw_reported_m, share, limits, due, lost)
             frames.append(msgspec.Raw(self._encode(whole)))
             if packed is not None or len(frames) % _FRAMES_A_TURN == 0:
                 time.sleep(0)  # lets the interpreter lock go: the loop waits for tens of microseconds at most
@@ -302,25 +335,23 @@ class ProcessRecorder:
             self._newest_reference = events.references[-1]
         return EncodedBatch(frames, events)
 
-    def _wait_for_slot(self, worker: WorkerProcess, image: Image | None) -> bool:
+    def _wait_for_slot(self, worker: WorkerProcess, head: _Waiting) -> bool:
         """Whether the next frame stays in the queue because its image has no room yet and patience is left."""
-        if self._patience_s == 0.0 or image is None or self._slot_free(worker):
+        if self._patience_s == 0.0 or head.image is None or self._slot_free(worker, head.due):
             self._slot_waited_from = None
             return False
         now = time.monotonic()
         self._slot_waited_from = self._slot_waited_from or now
         return now - self._slot_waited_from < self._patience_s
 
-    def _slot_free(self, worker: WorkerProcess, spared: int = 0) -> bool:
-        slots = self._ring.slots - spared
+    def _slot_free(self, worker: WorkerProcess, due: bool) -> bool:
+        slots = self._ring.slots if due else self._ring_images
         if worker.images_sent - worker.status.images_done >= slots:
             worker.read_reports()
         return worker.images_sent - worker.status.images_done < slots
 
     def _share(self, worker: WorkerProcess, image: Image, due: bool) -> ImageNote | None:
-        if not self._ring.takes(image):
-            return None  # a refused frame: its record says why
-        if not self._slot_free(worker, 0 if due else self._ring.slots - self._ring_images):
+        if not self._slot_free(worker, due):
             self._images_without_slot += due
             return None
         note = self._ring.put(worker.images_sent % self._ring.slots, image)
@@ -335,10 +366,15 @@ class ProcessRecorder:
 
     def _finish(self) -> None:
         worker, self._worker = self._worker, None
-        if worker is not None:
+        if worker is not None and self._queued == 0 and not worker.heard:
+            worker.discard()  # it hasn't even begun, and there is nothing that it could record
+        elif worker is not None:
             failure = worker.finish(self._close_before)
             self._status = worker.status
             self._own_failure = failure
+            if worker.still_writes:
+                self._left_writing = worker.frames_sent - worker.status.frames - worker.status.frames_lost
+                _log.info("the recording process still writes the end of the last file, and ends by itself")
             if failure is not None:
                 _log.error("recording incomplete: %s", failure)
         self._own_failure = self._stopped or self._own_failure

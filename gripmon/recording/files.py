@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -14,20 +16,22 @@ from typing import Any
 
 import rerun as rr
 
-from gripmon.recording.budget import DiskBudget, claim, space_missing
+from gripmon.recording.budget import DiskBudget, claim, is_being_written, space_missing
 from gripmon.recording.columns import AnyRow
 from gripmon.recording.layout import layout_file
 from gripmon.recording.pins import SUFFIX, PinBoard, PinnedBy, pin_path
-from gripmon.recording.repair import repair
+from gripmon.recording.repair import is_complete, repair
 from gripmon.recording.ring import Moments
 from gripmon.recording.wire import Events, Scene
 from gripmon.recording.writers import Writer, make_writer
 from gripmon.records import AlertRecord
+from gripmon.rerun_private import free_closed_streams
 
 APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0
 _LONGEST_RETRY_S = 30.0
 _FLUSH_TIMEOUT_S = 2.0
+_LOOK_S = 0.05
 _STALLED_FLUSH_TIMEOUT_S = 0.1
 _SHORTEST_PIN_S = 5.0  # so much before and after an alert is pinned, even where no images are kept around it
 _SPANS_KEPT = 64
@@ -55,10 +59,23 @@ class _File:
         if stamps_ns:
             self.first_ns, self.last_ns = min(stamps_ns + known_ns), max(stamps_ns + known_ns)
 
+    def is_written(self) -> bool:
+        """Whether rerun still has it open: its thread that writes ends with the first write that fails."""
+        opened = (entry for entry in Path("/proc/self/fd").iterdir() if entry.name != str(self.lock))
+        return any(_link_of(entry) == self.path for entry in opened)
+
     def release(self) -> None:
         if self.lock is not None:
             os.close(self.lock)
             self.lock = None
+
+
+def _link_of(entry: Path) -> Path | None:
+    """What a descriptor is of; None if it was closed meanwhile."""
+    try:
+        return entry.readlink()
+    except OSError:
+        return None
 
 
 class FileSeries:
@@ -94,6 +111,11 @@ class FileSeries:
         self.failure: str | None = None
         self.frames_written = 0
         self.frames_lost = 0
+        self.images_lost = 0  # of frames that are written
+        self.notice: str | None = None  # what was found at the start
+        self.hangs = False
+        """rerun waits for ever for a writer that has died: nothing can be cleaned up any more, not even the process."""
+        self._hung: list[rr.RecordingStream] = []
         self._mend()
         self._begin()
 
@@ -145,17 +167,15 @@ class FileSeries:
             late, self._late = self._late[:_PICTURES_A_CHUNK], self._late[_PICTURES_A_CHUNK:]
             self._writer.write_pictures(late)
             whole = self._flush(self._stream, self._file)
-        if whole:
+            self.images_lost += len(late) * (self._file is None)  # given up, and they with it
+        if whole and self._file is not None:
             self._keep_house(self._file)
         elif self._waiting_for_too_much():
             self._lose()
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
-        if self._stream is not None and self._writer is not None:
-            self._writer.finish()
-            self._stream.disconnect()
-        self._leave()
+        self._complete()
         self._lose()
 
     def _flush(self, stream: rr.RecordingStream, file: _File) -> bool:
@@ -166,11 +186,14 @@ class FileSeries:
             stream.flush(timeout_sec=timeout_s)
             file.whole_bytes = file.path.stat().st_size
         except Exception as error:  # noqa: BLE001 - rerun raises one kind for both; what fails does so at once
-            if time.monotonic() - begun_s >= 0.9 * timeout_s and file.path.exists():
+            timed_out = time.monotonic() - begun_s >= 0.9 * timeout_s
+            if timed_out and file.is_written():
                 self._stalled = True
                 self.failure = f"recording pauses: the disk under {self._directory} doesn't answer"
-            else:
-                self._abandon(f"can't write {file.path}: {error}")
+                return False
+            if timed_out:
+                self._hang(stream)
+            self._abandon(self._why_not(file.path, error))
             return False
         file.frames += self._unflushed
         self.frames_written += self._unflushed
@@ -221,10 +244,31 @@ class FileSeries:
 
     def _end(self) -> None:
         """Complete the file before the next one; what waits stays for that."""
-        if self._stream is not None and self._writer is not None:
+        self._complete()
+
+    def _complete(self) -> None:
+        """Write the footer and end the file; not where its disk has failed, for which rerun would wait for ever."""
+        stream, file = self._stream, self._file
+        if stream is not None and self._writer is not None and file is not None:
             self._writer.finish()
-            self._stream.disconnect()
+            if not self._stalled:
+                self._flush(stream, file)
+            if self._file is None:  # abandoned
+                return
+            ending = threading.Thread(target=stream.disconnect, daemon=True)
+            ending.start()
+            while ending.is_alive() and file.is_written():
+                ending.join(_LOOK_S)
+            ending.join(_FLUSH_TIMEOUT_S)
+            if ending.is_alive():
+                self._hang(stream)
+                self._abandon(self._why_not(file.path, OSError("its end could not be written")))
         self._leave()
+
+    def _hang(self, stream: rr.RecordingStream) -> None:
+        """Keep a stream that would wait for ever when it is forgotten."""
+        self._hung.append(stream)
+        self.hangs = True
 
     def _leave(self) -> None:
         self._stream = self._writer = None
@@ -238,6 +282,8 @@ class FileSeries:
 
     def _begin(self) -> None:
         """Open the next file and write what every file needs: the layout, all that is static, the reference."""
+        with contextlib.suppress(OSError):  # said below
+            self._directory.mkdir(parents=True, exist_ok=True)  # somebody may have removed it
         missing = space_missing(self._directory, self._settings.min_free_bytes, _FREE_AGAIN)
         missing = missing or self._room_missing()
         number = 0 if missing else self._next_number()
@@ -246,6 +292,7 @@ class FileSeries:
             return
         path = self._directory / f"{self._scene.name}-{number:04d}.rrd"
         stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
+        begun_s = time.monotonic()
         try:
             stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
             stream.send_recording_name(self._scene.name)
@@ -253,10 +300,12 @@ class FileSeries:
             writer = make_writer(stream, self._scene, number)
             stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
         except Exception as error:  # noqa: BLE001 - as above
+            if time.monotonic() - begun_s >= 0.9 * _FLUSH_TIMEOUT_S and not _File(path, None, begun_s).is_written():
+                self._hang(stream)
             del stream
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
-            self._fail(f"can't write {path}: {error}")
+            self._fail(self._why_not(path, error))
             self._retry_s = min(2.0 * self._retry_s, _LONGEST_RETRY_S)
             return
         if self._newest_reference not in self._events.references:
@@ -264,8 +313,15 @@ class FileSeries:
         self._stream, self._writer = stream, writer
         self._file = _File(path, claim(path), time.monotonic())
         self.failure = None
-        # The streams of earlier files, which rerun would keep with their threads until the end.
-        rr.bindings.flush_and_cleanup_orphaned_recordings()  # type: ignore[attr-defined]
+        free_closed_streams()  # of earlier files
+
+    def _why_not(self, path: Path, error: Exception) -> str:
+        """rerun only says that its thread has ended: the room there is explains the rest."""
+        try:
+            free = f"{1e-6 * shutil.disk_usage(self._directory).free:.1f} MB free"
+        except OSError as missing:
+            free = str(missing.strerror)
+        return f"can't write {path} ({free}): {' '.join(str(error).split())}"
 
     def _room_missing(self) -> str:
         try:
@@ -298,14 +354,23 @@ class FileSeries:
     def _lose(self) -> None:
         """Frames are gone; alerts wait, so that the recording says in time what it went through."""
         self.frames_lost += len(self._rows)
+        self.images_lost += len(self._late)
         alerts: list[AlertRecord] = self._events.alerts[-_ALERTS_KEPT:]
         self._rows, self._late, self._events = [], [], Events(alerts=alerts)
 
     def _mend(self) -> None:
         """Earlier files of this robot and camera, whose writer may have been killed, and pins without a file."""
         with contextlib.suppress(OSError):  # what is wrong with the directory is said when the first file begins
-            for entry in self._budget.recordings():
-                repair(entry.path)
+            paths = [entry.path for entry in self._budget.recordings()]
+            for path in paths:
+                repair(path)
+            lacking = [path for path in paths if not is_complete(path) and not is_being_written(path)]
+            if lacking:
+                self.notice = (
+                    f"{len(lacking)} earlier recordings have no footer, as their recorder was killed, the newest "
+                    f"{lacking[-1]}; gripmon and rerun's viewer read them; for tools that need one: "
+                    "rerun rrd optimize FILE.rrd -o WHOLE.rrd"
+                )
             for pin in self._budget.orphaned_pins():
                 pin.unlink(missing_ok=True)
 

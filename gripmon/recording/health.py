@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 SILENT_AFTER_S = 5.0
@@ -9,6 +10,8 @@ _START_TAKES_S = 30.0  # its imports, on a machine that is busy
 _LOOK_EVERY_S = 1.0
 _LOOKS_TO_RAISE = 3
 _LOOKS_TO_CLEAR = 5
+_LOOKS_AT_A_PROCESS = 5
+_STOPPED = ("T", "t")  # by SIGSTOP, by a debugger
 
 
 class Health:
@@ -57,13 +60,30 @@ class Health:
             self._thins = None
 
 
-def _why_silent(pid: int) -> str:
+def stands_still(pid: int) -> bool:
+    """Whether a process was stopped from outside, or one of its threads waits for a disk at every look in a tenth of a
+    second.
+    """
+    for _ in range(_LOOKS_AT_A_PROCESS):
+        states = [_state(thread) for thread in Path(f"/proc/{pid}/task").glob("*")]
+        if not any(state in ("D", *_STOPPED) for state in states):
+            return False
+        time.sleep(0.1 / _LOOKS_AT_A_PROCESS)
+    return True
+
+
+def _state(process: Path) -> str:
+    """The letter that Linux has for a process or thread; empty if there is none."""
     try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        return (process / "stat").read_text().rpartition(")")[2].split()[0]
     except (OSError, IndexError):
-        state = ""
+        return ""
+
+
+def _why_silent(pid: int) -> str:
+    state = _state(Path(f"/proc/{pid}"))
     if state == "D":
         return "the disk doesn't answer"
-    if state in ("T", "t"):
+    if state in _STOPPED:
         return "its process was stopped from outside"
     return f"its process hasn't answered for {SILENT_AFTER_S:g} s"

@@ -154,7 +154,9 @@ class NoFiles:
 
     path: str | None = None
     failure: str | None = None
-    frames_lost = frames_waiting = 0
+    notice: str | None = None
+    frames_lost = frames_waiting = images_lost = 0
+    hangs = False
 
     def __init__(self) -> None:
         self.frames_written = 0

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgspec
 
+from gripmon.recording.health import SILENT_AFTER_S, stands_still
 from gripmon.recording.wire import ImageRing, Scene, Status, framed
 from gripmon.records import Limits
 
@@ -60,6 +61,7 @@ class WorkerProcess:
         self.frames_sent = 0
         self.limits_sent: Limits | None = None
         self.gone = False
+        self.still_writes = False
 
     @property
     def pid(self) -> int:
@@ -103,19 +105,32 @@ class WorkerProcess:
                 self.status = self._decode(lines[-1])
 
     def finish(self, deadline: float) -> str | None:
-        """Let it write everything and end; past the ``deadline`` (monotonic seconds) it is ended by force.
+        """Let it write everything and end.
 
-        Returns why the recording is incomplete, None if all went well.
+        One that has everything and is only slow past the ``deadline`` (monotonic seconds) is left to it, and
+        :attr:`still_writes`: it needs nobody, and ends by itself.  Others are ended by force.  Returns why the
+        recording is incomplete, None if all went well.
         """
         while self._unsent and not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
             _wait_for(self._commands, select.POLLOUT, left_s)
             self.pump()
+        has_everything = not self._unsent
         self._close_commands()
         # Reading on until the pipe ends keeps the process from waiting for room in it.
         while not self.gone and (left_s := deadline - time.monotonic()) > 0.0:
             _wait_for(self._reports, select.POLLIN, left_s)
             self.read_reports()
+        silent_s = time.monotonic() - self.heard_s
+        if not self.gone and has_everything and silent_s < SILENT_AFTER_S and not stands_still(self.pid):
+            self.still_writes = True
+            os.close(self._reports)
+            return None
         return self.reap(deadline - time.monotonic())
+
+    def discard(self) -> None:
+        """End it, whatever it is at."""
+        self._process.kill()
+        self.reap(_KILL_GRACE_S)
 
     def reap(self, timeout_s: float) -> str | None:
         """Wait for the end, or bring it about; then release all descriptors."""

@@ -25,12 +25,17 @@ Notes = Callable[[], MonitorNotes]
 class EventRecorder(Protocol):
     """What every loop sees of a recording: it takes without ever blocking; what it could not take is counted.
 
-    ``dropped`` are frames that are not in the recording, ``failure`` says why nothing is being written, None when all
-    is well.
+    ``dropped`` are frames that are not in the recording, ``images_dropped`` images that others lack; ``failure`` says
+    why nothing is being written, None when all is well.  ``has_room``: nothing would be dropped now, or waiting would
+    not help; whoever can wait does until then.
     """
 
     @property
     def dropped(self) -> int: ...
+    @property
+    def images_dropped(self) -> int: ...
+    @property
+    def has_room(self) -> bool: ...
     @property
     def failure(self) -> str | None: ...
 
@@ -59,7 +64,8 @@ class SpotRecorder(EventRecorder, Protocol):
 class NullRecorder:
     """Records nothing."""
 
-    dropped = 0
+    dropped = images_dropped = 0
+    has_room = True
     failure: str | None = None
 
     def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:

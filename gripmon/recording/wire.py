@@ -105,6 +105,7 @@ class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     statistic_share: float | None
     limits: Limits | None
     due: bool  # its image is written in any case, not only around an alert
+    lost: bool  # its image had no room
 
 
 class Events(msgspec.Struct, frozen=True, array_like=True):
@@ -158,6 +159,8 @@ class Status(msgspec.Struct, frozen=True):
     frames_lost: int
     images_done: int
     view_failure: str | None = None  # of the live view, which is no failure of the recording
+    notice: str | None = None  # what a person may want to do about earlier files
+    images_lost: int = 0  # around alerts, or with a disk that failed; those that were due never came here
 
 
 def make_scene(

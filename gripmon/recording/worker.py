@@ -5,7 +5,9 @@ from __future__ import annotations
 import os
 import select
 import signal
+import sys
 import time
+from collections import deque
 from dataclasses import replace
 
 import cv2
@@ -25,6 +27,7 @@ from gripmon.records import Alert, AlertRecord, FrameRecord, Limits
 _NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0
 _FRAMES_A_WRITE = 128
+_STAMPS_KEPT = 4096
 _REPORT_PERIOD_S = 1.0  # the daemon must hear something
 
 
@@ -35,10 +38,13 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
+    code = 0
     try:
         RecordingLoop(status_descriptor, memory_descriptor).run()
     except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
-        raise SystemExit(f"recording process: {type(error).__name__}: {error}") from None
+        sys.stderr.write(f"recording process: {type(error).__name__}: {error}\n")
+        code = 1
+    os._exit(code)  # all is written, or can't be; rerun would wait for a viewer, or for a writer that has died
 
 
 class RecordingLoop:
@@ -52,6 +58,8 @@ class RecordingLoop:
         self._ring: ImageRing
         self._moments: Moments
         self._before: PictureRing
+        self._without: deque[int] = deque(maxlen=_STAMPS_KEPT)  # capture times of images that had no room
+        self._images_lost = 0
         self._decode = msgspec.msgpack.Decoder(Batch).decode
         self._encode = msgspec.json.Encoder().encode
         self._images_done = 0
@@ -65,7 +73,7 @@ class RecordingLoop:
     def run(self) -> None:
         next_flush = next_report = time.monotonic() + self._flush_period_s
         ended = False
-        while not ended:
+        while not ended and not (self._scene is not None and self._files.hangs):
             next_turn = min(next_flush, next_report)
             readable, _, _ = select.select((_STDIN,), (), (), max(next_turn - time.monotonic(), 0.0))
             if readable:
@@ -87,10 +95,9 @@ class RecordingLoop:
                 next_report = time.monotonic() + _REPORT_PERIOD_S
         if self._scene is not None:
             self._files.close()
-            released = self._live is None or self._live.close()
+            if self._live is not None:
+                self._live.close()
             self._report()
-            if not released:
-                os._exit(0)  # all is written, and rerun would wait for the viewer
 
     def _take(self, payload: bytes) -> None:
         if self._scene is None:
@@ -133,11 +140,21 @@ class RecordingLoop:
             )
         else:
             row = SpotRow(record, picture)
+        if note.lost and not note.due:
+            self._without.append(record.stamp_ns)
+            self._count_lost()
         if picture is not None and not note.due and not self._is_near(record.stamp_ns):
             self._before.push(row)
             row = replace(row, picture=None)
         for receiver in self._receivers():
             receiver.add_frames([row])
+
+    def _count_lost(self) -> None:
+        """Images around an alert that never came here."""
+        missed = [stamp_ns for stamp_ns in self._without if self._is_near(stamp_ns)]
+        self._images_lost += len(missed)
+        for stamp_ns in missed:
+            self._without.remove(stamp_ns)
 
     def _is_near(self, stamp_ns: int) -> bool:
         return self._around_ns > 0 and self._moments.near(stamp_ns)
@@ -149,6 +166,7 @@ class RecordingLoop:
         self._files.pin(pinned_by(alert, stamp_ns, seq), near_ns)
         if self._around_ns > 0 and near_ns is not None:
             self._moments.add(near_ns)
+            self._count_lost()
             pictures = self._before.take(self._moments)
             for receiver in self._receivers():
                 receiver.add_pictures(pictures)
@@ -167,6 +185,8 @@ class RecordingLoop:
             frames_lost=files.frames_lost,
             images_done=self._images_done,
             view_failure=None if self._live is None else self._live.failure,
+            notice=files.notice,
+            images_lost=self._images_lost + files.images_lost,
         )
         if self._parent_listens:
             try:

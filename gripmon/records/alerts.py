@@ -57,6 +57,7 @@ class AlertKind(OpenEnum):
     STREAM = "stream"
     SOURCE = "source"
     RECORDING = "recording"
+    OUTPUT = "output"
 
 
 class AlertEvent(enum.StrEnum):

@@ -102,6 +102,14 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
         ),
     ] = None
     snapshot: Annotated[Snapshot | None, Meta(description="answers snapshot; else null")] = None
+    durable: Annotated[
+        bool,
+        Meta(
+            description="false: what was done isn't on the disk yet, and a crash would forget it; text says why. A new "
+            "reference is on the disk or not in force. Without a state file nothing outlives the process, true all the "
+            "same"
+        ),
+    ] = True
 
 
 class CommandFault(OpenEnum):

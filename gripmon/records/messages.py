@@ -71,6 +71,9 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     malformed: Annotated[
         int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")
     ] = 0
+    recording_images_dropped: Annotated[
+        int, Meta(description="images that should be in the recording and aren't, of frames that are")
+    ] = 0
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):

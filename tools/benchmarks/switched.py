@@ -39,6 +39,10 @@ class SwitchedRecorder:
         return self._inner.images_dropped
 
     @property
+    def has_room(self) -> bool:
+        return self._inner.has_room
+
+    @property
     def waiting(self) -> int:
         """Frames that were taken and are not yet written."""
         return self._offered - self._inner.frames_written - self._inner.dropped

@@ -1,0 +1,147 @@
+"""What is missing in a recording is counted and said; whoever can wait loses nothing; no false alarm at an end."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
+import psutil
+import pytest
+import yaml
+from gripmon_process import gripmon
+from recorded import Recorded, frame, image, record, recorder, trace, wait_until
+
+from gripmon.config import builtin_config
+from gripmon.playback import open_recordings
+from gripmon.recording import ProcessRecorder
+from gripmon.records import Alert, AlertKind, Cause, Severity
+
+DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
+PICTURE = image(0)
+
+
+@pytest.fixture
+def slow_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recording process that needs two seconds before it does anything, as on a busy machine."""
+    from gripmon.recording import process
+
+    monkeypatch.setattr(process, "_BOOTSTRAP", f"import time; time.sleep(2.0); {process._BOOTSTRAP}")
+
+
+def stopped(writer: ProcessRecorder) -> int:
+    """The recording process, stopped: nothing gets room any more."""
+    wait_until(lambda: writer.path is not None)
+    assert writer.process_id is not None
+    os.kill(writer.process_id, signal.SIGSTOP)
+    return writer.process_id
+
+
+def pictures(directory: Path) -> set[int]:
+    """Numbers of the frames whose image is in the recordings."""
+    return {seq for path in directory.glob("*.rrd") for seq in Recorded(path).by_seq("rig/camera/image", "blob")}
+
+
+def test_a_source_that_can_wait_loses_no_image(tmp_path: Path) -> None:
+    """The monitor outruns an encoder of PNG; with a simulated camera that isn't in real time it waits."""
+    demo = builtin_config("demo.yaml")
+    settings = yaml.safe_load(demo.read_text())
+    settings |= {
+        "gripper": str(demo.parent / settings["gripper"]),
+        "source": {"kind": "simulator", "scenario": "bump", "duration_s": 1.5, "fps": 20.0, "realtime": False},
+        "publish": {"enabled": False},
+        "recording": {"image_format": "png", "image_every": 1, "min_free_bytes": 0},
+    }
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    done = gripmon("run", tmp_path / "config.yaml", "--out", tmp_path / "out", timeout_s=400.0)
+    assert done.returncode == 0 and "missing" not in done.stderr and "incomplete" not in done.stderr, done.stderr
+    (run,) = open_recordings(sorted((tmp_path / "out").glob("*.rrd"))).recordings
+    assert len(run.frames) == 30
+    again = gripmon("replay", *(tmp_path / "out").glob("*.rrd"), "--out", tmp_path / "again.jsonl", timeout_s=400.0)
+    assert "replay: all 30 as they were recorded, every number the same" in again.stderr
+
+
+def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    writer = recorder(tmp_path, image_every=1, queue_images=4)
+    process = stopped(writer)
+    with caplog.at_level(logging.WARNING, "gripmon.recording"):
+        for i in range(30):
+            writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+        wait_until(lambda: "missing in the recording so far: 0 frames" in caplog.text)
+        os.kill(process, signal.SIGCONT)
+        writer.close(20.0)
+    assert (writer.dropped, writer.frames_written) == (0, 30)
+    assert 0 < writer.images_dropped == 30 - len(pictures(tmp_path))
+    assert f"missing in the recording so far: 0 frames; {writer.images_dropped} images of others" in caplog.text
+
+
+def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_path: Path) -> None:
+    """Before the alert nobody misses them."""
+    writer = recorder(tmp_path, image_rate_hz=0.0, queue_images=4)
+    process = stopped(writer)
+    for i in range(30):
+        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+    os.kill(process, signal.SIGCONT)
+    wait_until(lambda: writer.frames_written == 30)
+    assert writer.images_dropped == 0
+    writer.offer(frame(30, PICTURE), record(30, alerts=(DRIFT,)), partial(trace, 30))
+    wait_until(lambda: writer.frames_written == 31)
+    writer.close(20.0)
+    assert 0 < writer.images_dropped == 31 - len(pictures(tmp_path))
+
+
+def test_whoever_can_wait_gets_all_images_around_an_alert(tmp_path: Path) -> None:
+    writer = recorder(tmp_path, patience_s=30.0, image_rate_hz=0.0, queue_images=4)
+    for i in range(60):
+        writer.offer(frame(i, PICTURE), record(i, alerts=(DRIFT,) * (i == 40)), partial(trace, i))
+    writer.close(30.0)
+    assert (writer.dropped, writer.images_dropped, pictures(tmp_path)) == (0, 0, set(range(60)))
+
+
+def test_a_configuration_error_is_told_alone_and_at_once(tmp_path: Path) -> None:
+    demo = builtin_config("demo.yaml")
+    settings = yaml.safe_load(demo.read_text())
+    settings |= {
+        "gripper": str(demo.parent / settings["gripper"]),
+        "source": {"kind": "folder", "path": "nowhere"},
+        "publish": {"enabled": False},
+    }
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
+    done = gripmon("run", tmp_path / "config.yaml", "--out", tmp_path / "out", timeout_s=400.0)
+    assert done.returncode == 2
+    (line,) = (line for line in done.stderr.splitlines() if "WARNING" not in line)
+    assert line.startswith(f"{tmp_path / 'config.yaml'}: source.path")
+
+
+@pytest.mark.usefixtures("slow_start")
+def test_a_recorder_that_was_given_nothing_ends_at_once_and_says_nothing(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    writer = recorder(tmp_path)
+    process = writer.process_id
+    begun_s = time.monotonic()
+    writer.close(2.0)
+    assert time.monotonic() - begun_s < 1.0 and (writer.failure, caplog.text) == (None, "")
+    assert process is not None and not psutil.pid_exists(process)
+
+
+@pytest.mark.usefixtures("slow_start")
+def test_a_process_that_has_everything_and_is_only_slow_is_left_to_finish(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ctrl-C while it still starts: the file is complete all the same, some time after the monitor's end."""
+    writer = recorder(tmp_path)
+    process = writer.process_id
+    assert process is not None
+    for i in range(20):
+        writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
+    with caplog.at_level(logging.WARNING, "gripmon.recording"):
+        writer.close(0.5)
+    assert (writer.failure, writer.dropped) == (None, 0) and "incomplete" not in caplog.text
+    wait_until(lambda: psutil.Process(process).status() == psutil.STATUS_ZOMBIE)
+    (path,) = tmp_path.glob("*.rrd")
+    assert Recorded(path).seqs() == list(range(20))
+    os.waitpid(process, 0)

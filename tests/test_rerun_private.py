@@ -1,0 +1,51 @@
+"""The parts of rerun that it doesn't call public: used in one place, and missed in words."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import rerun as rr
+from recorded import frame, record, recorder
+from rerun.chunk import LazyStore
+
+from gripmon.playback import open_recordings
+from gripmon.recording import wire
+from gripmon.recording.files import FileSeries
+from gripmon.rerun_private import RerunChangedError
+
+GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
+
+
+def test_they_are_used_in_one_file_alone():
+    private = re.compile(r"\brr\.bindings|rerun_bindings|\._chunk_index|rerun\.\w*\._|rerun\._")
+    using = {path.name for path in GRIPMON.rglob("*.py") if private.search(path.read_text())}
+    assert using <= {"rerun_private.py"}
+
+
+def test_without_its_chunk_index_files_are_read_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    writer = recorder(tmp_path)
+    for i in range(10):
+        writer.offer(frame(i), record(i), lambda: None)
+    writer.close(30.0)
+    (path,) = tmp_path.glob("*.rrd")
+    (whole,) = open_recordings([path]).recordings
+    assert whole.faults == ()
+    monkeypatch.delattr(LazyStore, "_chunk_index")
+    (read,) = open_recordings([path]).recordings
+    assert list(read.frames.seq) == list(whole.frames.seq) == list(range(10))
+    (fault,) = read.faults
+    assert "its messages were read one by one: rerun-sdk" in fault
+    assert fault.endswith("gripmon needs rerun-sdk>=0.41,<0.42 (pip install 'rerun-sdk>=0.41,<0.42')")
+
+
+def test_a_recorder_that_could_not_free_its_files_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from recorded import CAMERA, GRIPPER, REFERENCE, settings
+
+    monkeypatch.delattr(rr.bindings, "flush_and_cleanup_orphaned_recordings")
+    scene = wire.make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)
+    with pytest.raises(
+        RerunChangedError, match=r"has no rerun\.bindings\.flush_and_cleanup_orphaned_recordings; gripmon"
+    ):
+        FileSeries(scene)
