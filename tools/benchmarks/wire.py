@@ -137,7 +137,7 @@ def as_text(results: dict[str, Any]) -> str:
 def _slow_rows(rows: dict[str, Any]) -> list[str]:
     """True age against claimed age, s, of what a client calls usable."""
     lines = [
-        f"a client's usable readings over slow links, max_age_s {MAX_AGE_S:g}, 30 transforms/s of 2.7 kB; s",
+        f"a client's usable readings over slow links, max_age_s {MAX_AGE_S:g}, 30 transforms/s of 2.6 kB; s",
         f"  {'':28s}  usable true 99.9 % claimed 99.9 % true max  bound claimed too young by oldest newest",
     ]
     for title, row in rows.items():
