@@ -17,6 +17,7 @@ from gripmon.records import (
     CameraShift,
     Cause,
     CauseWeight,
+    ClockReading,
     CommandError,
     CommandFault,
     CommandName,
@@ -275,6 +276,7 @@ SAMPLES: dict[str, msgspec.Struct] = {
     "reference": RECALIBRATED,
     "reference_configured": CONFIGURED,
     "reference_undone": UNDONE,
+    "clock": ClockReading("0e8f6f0c5cbb4c0f9f0a4b6b9f1f2a3b", 86_400_123_456_789),
     "jaw": JawReading(STAMP_NS, 0.034),
     "frame": FrameNote(stamp_ns=STAMP_NS, jaw_opening_m=0.034, width=768, height=576, encoding="mono8"),
     "pulse": LaserPulse(

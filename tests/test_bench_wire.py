@@ -15,7 +15,7 @@ def test_the_whole_run_in_small():
 
     plan = wire_runs.Plan(
         size=(384, 288), ring=8, block=20, settle=5, rounds=2, more_subscribers=1, restarts=1,
-        before_s=0.5, down_s=0.25, after_s=6.0,
+        before_s=0.5, down_s=0.25, after_s=6.0, slow_s=1.5, slow_after_s=1.0, stopped_s=1.0,
     )  # fmt: skip
     results = wire.measure(plan)
     measured = results["conditions"]
@@ -32,12 +32,17 @@ def test_the_whole_run_in_small():
     assert turn["lost"] >= turn["lost_while_away"] > 0
     assert turn["recovery_s"] is None or turn["recovery_s"] > -turn["router_away_s"]
     assert results["restarts"]["exceptions"] == measured["exceptions"] == 0
+    slow = results["slow"]
+    assert len(slow) == 6 and all(row["polls"] > 0 for row in slow.values())
+    assert slow["no limit"]["usable"] > 0.5 * slow["no limit"]["polls"]
+    assert slow["router stopped for 1 s"]["newest_max_s"] > 0.8
+    assert max(row["true_max_s"] for row in slow.values()) <= wire.AGE_BOUND_S  # of whatever is usable, on any machine
     text = wire.as_text(results)
-    assert text.count("  met") + text.count("NOT MET") == len(wire.verdicts(results)) == 7
+    assert text.count("  met") + text.count("NOT MET") == len(wire.verdicts(results)) == 8
 
 
 def figures(
-    median_us: float, tails_us: tuple[float, float], recovery_s: float | None, exceptions: int
+    median_us: float, tails_us: tuple[float, float], recovery_s: float | None, exceptions: int, oldest_s: float = 0.2
 ) -> dict[str, Any]:
     def row(median: float, tails: tuple[float, float]) -> dict[str, Any]:
         # Two quiet rounds and one in which the machine did something else: the middle one counts.
@@ -49,7 +54,8 @@ def figures(
 
     measured: dict[str, Any] = {condition: row(median_us, (2000.0, 2000.0)) for condition in ("alone", "blocked")}
     measured |= {"stopped": row(median_us, tails_us), "exceptions": exceptions}
-    return {"conditions": measured, "restarts": {"runs": [{"recovery_s": recovery_s}], "exceptions": 0}}
+    slow = {"30 kB/s": {"true_max_s": oldest_s}}
+    return {"slow": slow, "conditions": measured, "restarts": {"runs": [{"recovery_s": recovery_s}], "exceptions": 0}}
 
 
 @pytest.mark.parametrize(
@@ -61,7 +67,8 @@ def figures(
         ((1499.0, (2199.0, 2201.0), 1.9, 0), 2),
         ((1499.0, (2199.0, 2199.0), 2.1, 0), 5),
         ((1499.0, (2199.0, 2199.0), None, 0), 5),
-        ((1499.0, (2199.0, 2199.0), 1.9, 1), 6),
+        ((1499.0, (2199.0, 2199.0), 1.9, 0, 0.26), 6),
+        ((1499.0, (2199.0, 2199.0), 1.9, 1), 7),
         ((math.nan, (2199.0, 2199.0), 1.9, 0), 0),
     ],
 )

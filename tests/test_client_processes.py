@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from loopback import frame_record, free_endpoint, wait_until
+from loopback import ask, frame_record, free_endpoint, plain_session, wait_until
 from remote_monitor import remote_monitor, router
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
@@ -131,9 +132,10 @@ config.insert_json5("mode", '"client"')
 config.insert_json5("scouting/multicast/enabled", "false")
 config.insert_json5("connect/endpoints", f'["{sys.argv[1]}"]')
 payload = sys.stdin.read()
+clock = sys.argv[2]
 with zenoh.open(config) as session:
     while True:
-        session.put("gripmon/arm/wrist/transform", payload)
+        session.put("gripmon/arm/wrist/transform", payload, attachment=clock)
         session.put("gripmon/arm/wrist/transform", "{")
 """
 
@@ -143,8 +145,12 @@ def test_while_messages_pour_in_every_thread_gets_the_newest_at_once(endpoint: s
     with (
         remote_monitor(listen=[endpoint], fps=2.0),
         TransformClient("arm", connect=[endpoint], policy=PATIENT) as client,
-        subprocess.Popen([sys.executable, "-c", _FLOOD, endpoint], stdin=subprocess.PIPE) as flood,
+        plain_session(connect=endpoint) as session,
     ):
+        usable(client)
+        (clock,) = ask(session, "gripmon/arm/wrist/transform?clock")  # sent then, the flood says of all that is in it
+        command = [sys.executable, "-c", _FLOOD, endpoint, json.dumps(clock)]
+        flood = subprocess.Popen(command, stdin=subprocess.PIPE)
         try:
             assert flood.stdin is not None
             flood.stdin.write(to_json(frame_record(10**6)))
@@ -166,6 +172,7 @@ def test_while_messages_pour_in_every_thread_gets_the_newest_at_once(endpoint: s
             assert next(iter(client)).usable
         finally:
             flood.kill()
+            flood.wait()
 
 
 def test_asyncio_gets_readings_and_the_end_and_a_cancelled_wait_loses_nothing(endpoint: str):

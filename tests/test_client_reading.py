@@ -13,9 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from loopback import frame_record
 from scipy.spatial.transform import Rotation
+from timely import TimelyInbox as Inbox
 
 from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
-from gripmon.client.inbox import MOST_PRESENT, Inbox
+from gripmon.client.inbox import MOST_PRESENT
 from gripmon.client.judging import judge
 from gripmon.records import FrameRecord, Transform, Verdict, to_json
 
@@ -108,6 +109,20 @@ def test_with_clocks_that_agree_what_was_held_up_on_the_way_is_old():
     for wall_ns, age_s in ((stamp_ns + 3_000_000_000, 3.0), (stamp_ns + 10_000_000, 0.05), (0, 0.05)):
         assert reading(inbox, Policy(clocks_agree=True), 100.05, wall_ns).age_s == pytest.approx(age_s)
         assert reading(inbox, Policy(), 100.05, wall_ns).age_s == pytest.approx(0.05)
+
+
+def test_with_clocks_that_agree_a_stamp_of_the_future_is_refused():
+    inbox, stamp_ns = heard(), frame_record().stamp_ns
+    for ahead_s, usable in ((0.09, True), (0.11, False), (3600.0, False)):
+        wall_ns = stamp_ns - round(1e9 * ahead_s)
+        got = reading(inbox, Policy(clocks_agree=True), 100.05, wall_ns)
+        assert got.usable is usable and (got.transform is not None) is usable
+        assert reading(inbox, Policy(), 100.05, wall_ns).usable  # nobody says that they agree
+        if not usable:
+            assert got.why is Unusable.CLOCKS
+            assert got.reason == (
+                f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
+            )
 
 
 def test_a_vanished_monitor_is_gone_until_it_sends_again():

@@ -49,6 +49,14 @@ def test_every_frame_is_published_recorded_and_written_in_order(tmp_path: Path):
     assert (bench.source.closed, bench.network.closed, bench.recording.closed) == (1, 1, 1)
 
 
+def test_what_waited_before_the_hand_over_counts_as_latency():
+    waited = Frame(0, 5, None, arrived_ns=time.monotonic_ns() - 3 * 10**9)
+    bench = Bench([waited, 1], ScriptedMonitor())
+    bench.run()
+    first, second = (record.latency_ns for record in bench.network.transforms)
+    assert first > 3e9 and second < 3e9
+
+
 def test_latency_counts_from_the_hand_over():
     def answers(seq: int) -> dict[str, object]:
         time.sleep(0.05)

@@ -144,6 +144,8 @@ def test_smoothed_inverse_on_another_domain_under_other_names(make_bench: Callab
         (("valid",), {}, True, "yes"),
         (("valid",), {"verdict": Verdict.SUSPECT}, False, "no: verdict suspect"),
         (("valid", "suspect"), {"verdict": Verdict.SUSPECT}, True, "yes"),
+        (("valid",), {"latency_ns": 490_000_000}, True, "yes"),
+        (("valid",), {"latency_ns": 5_200_000_000}, False, "no: judged 5.2 s after its frame came, at most 0.5 s"),
         (("valid", "suspect"), {"verdict": Verdict.UNKNOWN}, False, "no: verdict unknown"),
         (("valid", "suspect"), {"verdict": Verdict.SUSPECT, "cam_T_grip": None, "covariance": None}, False,
          "no: no transform"),

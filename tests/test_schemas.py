@@ -12,6 +12,7 @@ from sample_messages import SAMPLES
 from gripmon.records import (
     MESSAGES,
     AlertKind,
+    ClockReading,
     CommandError,
     CommandFault,
     CommandName,
@@ -35,6 +36,7 @@ ONE_OF_EACH = {
     "state": state_record(),
     "alert": alert_record(),
     "reference": reference_record(),
+    "clock": ClockReading("5f2ac301", 5),
     "jaw": JawReading(5, 0.02),
     "frame": FrameNote(stamp_ns=5, jaw_opening_m=0.02, width=768, height=576, encoding="mono8", step=1024),
     "pulse": SAMPLES["pulse"],

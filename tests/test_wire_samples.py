@@ -164,12 +164,15 @@ def test_the_page_says_how_each_key_is_sent(heard: dict[str, zenoh.Sample], leaf
     assert str(sample.priority).rpartition(".")[2] == name.upper().replace(" ", "_")
     assert (congestion, sample.congestion_control) == ("drop", zenoh.CongestionControl.DROP)
     assert {"yes": True, "no": False}[express] is sample.express
-    assert str(sample.encoding) == "application/json" and sample.attachment is None
+    assert str(sample.encoding) == "application/json"
+    attached = None if sample.attachment is None else json.loads(sample.attachment.to_bytes())
+    assert (None if attached is None else attached["schema"]) == ("gripmon.clock/1" if leaf == "transform" else None)
     assert json.loads(sample.payload.to_bytes())["schema"] == schema_name(MESSAGES[leaf])
 
 
 def test_the_sizes_on_the_page_are_those_of_the_code():
     from gripmon.records import (
+        ClockReading,
         CommandReply,
         CommandRequest,
         FrameNote,
@@ -179,6 +182,8 @@ def test_the_sizes_on_the_page_are_those_of_the_code():
         largest_bytes,
     )
 
-    assert "larger than 1 MiB, a `jaw`, `pulse`, `frame` or `command` 4 KiB, a `reply` 64 MiB" in PAGE
+    assert "larger than 1 MiB, a `clock`, `jaw`, `pulse`, `frame` or `command` 4 KiB, a `reply` 64 MiB" in PAGE
     assert largest_bytes(FrameRecord) == 1 << 20 and largest_bytes(CommandReply) == 64 << 20
-    assert {largest_bytes(message) for message in (JawReading, LaserPulse, FrameNote, CommandRequest)} == {4 << 10}
+    assert {
+        largest_bytes(message) for message in (ClockReading, JawReading, LaserPulse, FrameNote, CommandRequest)
+    } == {4 << 10}

@@ -8,7 +8,9 @@ from typing import Any
 
 from gripmon.cli import common
 
-_NAMES = ("transform", "state", "alert", "reference", "jaw", "frame", "pulse", "spot", "command", "reply", "error")
+_NAMES = (
+    "transform", "state", "alert", "reference", "clock", "jaw", "frame", "pulse", "spot", "command", "reply", "error",
+)  # fmt: skip
 
 _DESCRIPTION = """\
 Print the JSON Schema (draft 2020-12) of one message, or of any message: its fields with units, frames

@@ -7,9 +7,10 @@ import threading
 import weakref
 from typing import NamedTuple, Protocol
 
+from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
 from gripmon.client.message import transform_message
 from gripmon.client.names import MonitorName
-from gripmon.records import FrameRecord, MessageRefused
+from gripmon.records import ClockReading, FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
 
@@ -17,19 +18,26 @@ MOST_PRESENT = 16
 """Names of more monitors are not kept: two are too many already, and a stranger may make up any number."""
 
 
+HELD_BACK_S = 1.0
+"""So long a transform of which it isn't known how old it is waits for that, before those who wait for one are told.
+The monitor is asked meanwhile; an answer takes milliseconds."""
+
+
 class Entry(NamedTuple):
-    """A record, who sent it, and when it arrived by the monotonic clock."""
+    """A record, who sent it, and when it arrived by the monotonic clock; ``sent`` None: the monitor doesn't say."""
 
     record: FrameRecord
     monitor: MonitorName
     arrival_s: float
+    sent: Sent | None = None
 
 
 class Heard(NamedTuple):
     """What readings are made from; replaced as a whole, so that who reads it needs no lock.
 
     ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
-    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read.
+    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read; ``leads``: what is
+    known of the monitors' clocks.
     """
 
     entry: Entry | None = None
@@ -37,6 +45,7 @@ class Heard(NamedTuple):
     cut: bool = False
     unreadable: str = ""
     closed: bool = False
+    leads: Leads = NO_LEADS
 
 
 class Waiter(Protocol):
@@ -53,19 +62,35 @@ class Inbox:
         self.heard = Heard()
         self.unreadable = 0
         self._lock = threading.Lock()  # for those who write
+        self._held: Entry | None = None
+        self._held_since_s: float | None = None
         self._waiters: weakref.WeakSet[Waiter] = weakref.WeakSet()  # an iterator that is let go is told no more
 
-    def take(self, monitor: MonitorName, payload: bytes, arrival_s: float) -> None:
+    def take(self, monitor: MonitorName, payload: bytes, arrival_s: float, sent: Sent | None = None) -> None:
         """A message arrived."""
         try:
-            entry = Entry(transform_message(payload), monitor, arrival_s)
+            entry = Entry(transform_message(payload), monitor, arrival_s, sent)
         except MessageRefused as error:
             self._refuse(monitor, str(error))
             return
         with self._lock:
-            self._set(entry=entry, present=self._present_with(monitor), cut=False, unreadable="")
-            for waiter in self._waiters:
-                waiter.put(entry)
+            leads = self.heard.leads if sent is None else without_contradicted(self.heard.leads, sent)
+            self._set(entry=entry, present=self._present_with(monitor), cut=False, unreadable="", leads=leads)
+            self._hand_over(entry)
+
+    def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
+        """A monitor said what its clock shows; both times by our steady clock."""
+        with self._lock:
+            self._set(leads=with_answer(self.heard.leads, answer, asked_ns, answered_ns))
+            held, self._held = self._held, None
+            if held is not None:
+                self._hand_over(held)
+
+    @property
+    def age_known(self) -> bool:
+        """Is it known how old the newest transform is?"""
+        heard = self.heard
+        return heard.entry is not None and waited_s(heard.leads, heard.entry.sent) is not None
 
     def appeared(self, monitor: MonitorName) -> None:
         """Its liveliness token is there."""
@@ -91,6 +116,20 @@ class Inbox:
         """Tell it from now on, as long as somebody else refers to it."""
         with self._lock:
             self._waiters.add(waiter)
+
+    def _hand_over(self, entry: Entry) -> None:
+        """Give it to those who wait; one of which it isn't known how old it is only when that takes too long."""
+        if entry.sent is not None and waited_s(self.heard.leads, entry.sent) is None:
+            if self._held_since_s is None:
+                self._held_since_s = entry.arrival_s
+            if entry.arrival_s - self._held_since_s < HELD_BACK_S:
+                self._held = entry
+                return
+        else:
+            self._held_since_s = None
+        self._held = None
+        for waiter in self._waiters:
+            waiter.put(entry)
 
     def _refuse(self, monitor: MonitorName, text: str) -> None:
         with self._lock:

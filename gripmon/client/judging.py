@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from gripmon.client.age import waited_s
 from gripmon.client.inbox import Entry, Heard, several
 from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
 from gripmon.records import FrameRecord, Verdict
 
 _Refusal = tuple[Unusable, str]
+
+MOST_AHEAD_S = 0.1
+"""A stamp further ahead than this is of a clock that doesn't agree: those that NTP keeps, on whatever network, are
+within some tens of milliseconds."""
 
 
 def judge(
@@ -23,8 +28,14 @@ def judge(
         why, reason = _cut_off(heard, None) or _silence(heard, fault)
         return Reading(monitor=None, verdict=Verdict.UNKNOWN, usable=False, why=why, reason=reason, age_s=math.inf)
     record = entry.record
-    age_s = _age_s(entry, policy, now_s, wall_ns)
-    lost = _cut_off(heard, entry) or _unknown(record) or _too_old(heard, age_s, policy)
+    age_s = _age_s(heard, entry, policy, now_s, wall_ns)
+    lost = (
+        _cut_off(heard, entry)
+        or _unknown(record)
+        or _from_the_future(record, policy, wall_ns)
+        or _of_unknown_age(entry, age_s)
+        or _too_old(heard, age_s, policy)
+    )
     refusal = lost or _against_policy(record, policy)
     return Reading(
         monitor=entry.monitor,
@@ -46,9 +57,13 @@ def judge(
     )
 
 
-def _age_s(entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
+def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: int) -> float:
+    """It is not older, s; infinite if nothing tells how long it was on its way."""
     age_s = max(0.0, now_s - entry.arrival_s) + 1e-9 * entry.record.latency_ns
-    return max(age_s, 1e-9 * (wall_ns - entry.record.stamp_ns)) if policy.clocks_agree else age_s
+    on_its_way_s = waited_s(heard.leads, entry.sent)
+    if policy.clocks_agree:
+        return max(age_s + (on_its_way_s or 0.0), 1e-9 * (wall_ns - entry.record.stamp_ns))
+    return math.inf if on_its_way_s is None else age_s + on_its_way_s
 
 
 def _cut_off(heard: Heard, entry: Entry | None) -> _Refusal | None:
@@ -76,6 +91,26 @@ def _unknown(record: FrameRecord) -> _Refusal | None:
     if record.verdict is not Verdict.UNKNOWN:
         return None
     return Unusable.UNKNOWN, f"the monitor has no transform: {record.reason or record.state}"
+
+
+def _from_the_future(record: FrameRecord, policy: Policy, wall_ns: int) -> _Refusal | None:
+    """With clocks that agree there is no such thing: one of them is wrong, and no age can be told by them."""
+    ahead_s = 1e-9 * (record.stamp_ns - wall_ns)
+    if not policy.clocks_agree or ahead_s <= MOST_AHEAD_S:
+        return None
+    text = f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
+    return Unusable.CLOCKS, text
+
+
+def _of_unknown_age(entry: Entry, age_s: float) -> _Refusal | None:
+    if age_s < math.inf:
+        return None
+    why = (
+        "a monitor of an older version doesn't tell; update it, or let the clocks agree and set clocks_agree"
+        if entry.sent is None
+        else "the monitor has not answered yet what its clock shows"
+    )
+    return Unusable.AGE_UNKNOWN, f"how long the transform was on its way is not known: {why}"
 
 
 def _too_old(heard: Heard, age_s: float, policy: Policy) -> _Refusal | None:

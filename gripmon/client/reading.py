@@ -26,6 +26,8 @@ class Unusable(enum.StrEnum):
     GONE = "gone"
     RESTARTED = "restarted"
     UNKNOWN = "unknown"
+    AGE_UNKNOWN = "age_unknown"
+    CLOCKS = "clocks_disagree"
     STALE = "stale"
     SUSPECT = "suspect"
     UNCERTAIN = "uncertain"
@@ -50,7 +52,7 @@ class Policy(msgspec.Struct, frozen=True, kw_only=True):
     protection level, the bound on the TCP's position error, is known and at most that (None: the verdict decides by the
     monitor's own alert limit).  ``clocks_agree``: the clocks of
     monitor and controller show the same time (the same machine, PTP): the age then counts from the capture by their
-    stamps, so that what was held up on the way is known to be old.
+    stamps if that is more, and a stamp of the future is refused.
     """
 
     max_age_s: float = 0.2
@@ -74,11 +76,11 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     None whenever ``verdict`` is ``unknown``.  The verdict is the monitor's, but ``unknown`` where the monitor can't
     be asked any more: it is gone, its last transform too old, or there is none.
 
-    ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` is the
-    time since the message arrived, by this machine's monotonic clock, and what the monitor needed for the frame; the
-    way of the image into the monitor and of the message through the network are not in it (microseconds to
-    milliseconds, unless something is stuck; see :class:`Policy` ``clocks_agree``).  Infinite if no transform came yet.
-    ``stamp_ns`` is the capture time by the monitor's clock.
+    ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` bounds
+    the time since the monitor was handed the frame: what it needed for it, how long the message was on its way at most
+    (:mod:`gripmon.client.age`), and the time since it arrived; the way of the image into the monitor is not in it.
+    Infinite if no transform came yet, or nothing tells how long it was on its way.  ``stamp_ns`` is the capture time by
+    the monitor's clock.
     """
 
     monitor: MonitorName | None

@@ -36,7 +36,8 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     ``state`` is its last state message, None before the first; ``state_age_s`` the time since that arrived, or since
     the monitor was first seen.  ``gone_since_ns``: when its liveliness token vanished, by our clock; None while it is
-    there.  ``transforms_per_s`` and ``transform_age_s`` are None unless transforms are listened to and came.
+    there.  ``transforms_per_s`` and ``transform_age_s`` (since the last one arrived, however long it was on
+    its way: to move by it ask a TransformClient) are None unless transforms are listened to and came.
     """
 
     name: MonitorName

@@ -9,13 +9,16 @@ from typing import Self
 
 import zenoh
 
+from gripmon.client.age import Sent
+from gripmon.client.asking import ClockAsker
 from gripmon.client.inbox import Entry, Inbox
 from gripmon.client.iterators import AsyncReadings, Readings
 from gripmon.client.judging import judge
 from gripmon.client.names import monitor_name
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
-from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
+from gripmon.records import ClockReading, MessageRefused, from_json
+from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
 
 
 class TransformClient:
@@ -48,6 +51,7 @@ class TransformClient:
         self.keys = Keys(robot, camera if camera is not None else "*")
         self._depth = depth
         self._inbox = Inbox()
+        self._asker = ClockAsker(self.keys["transform"], self._inbox.answered)
         self._threads: list[threading.Thread] = []
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
         with named_as_arguments():
@@ -140,6 +144,7 @@ class TransformClient:
         # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
         transforms = zenoh.handlers.Callback(self._receive, indirect=False)
         tokens = zenoh.handlers.Callback(self._see, indirect=False)
+        self._asker.use(session)
         self._declared = (
             session.declare_subscriber(self.keys["transform"], transforms),
             session.liveliness().declare_subscriber(self.keys["alive"], tokens, history=True),
@@ -147,9 +152,26 @@ class TransformClient:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT:
-            arrival_s = time.monotonic()
-            self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s)
+            arrival_s, arrived_ns = time.monotonic(), steady_ns()
+            sent = _sent(sample, arrived_ns)
+            self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s, sent)
+            if sent is not None:
+                self._asker.ask(known=self._inbox.age_known)
 
     def _see(self, token: zenoh.Sample) -> None:
-        seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
-        seen(monitor_name(token.key_expr))
+        if token.kind == zenoh.SampleKind.PUT:
+            self._inbox.appeared(monitor_name(token.key_expr))
+            self._asker.ask(known=False)  # so that its first transform is usable
+        else:
+            self._inbox.vanished(monitor_name(token.key_expr))
+
+
+def _sent(sample: zenoh.Sample, arrived_ns: int) -> Sent | None:
+    """When it was sent and when it arrived; None if the message doesn't say."""
+    attached = sample.attachment
+    if attached is None:
+        return None
+    try:
+        return Sent(from_json(attached.to_bytes(), ClockReading), arrived_ns)
+    except MessageRefused:
+        return None

@@ -82,10 +82,10 @@ class Daemon(Loop):
         self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
 
     def _handle(self, frame: Frame) -> None:
-        handed_over_ns = time.monotonic_ns()
+        arrived_ns = frame.arrived_ns if frame.arrived_ns is not None else time.monotonic_ns()
         self._seq = frame.seq
         frame, record, failure = self._judge(frame)
-        record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
+        record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
         self._deliver("transform", self._publisher.transform, record)
         self._newest = Newest(frame, record, time.monotonic())
         # The rest is less urgent.

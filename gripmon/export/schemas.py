@@ -70,7 +70,7 @@ FRAMES: list[_Column] = [
     *_REFERENCE,
     ("rms_px", _DOUBLE, "px", "root mean square of the corners' residuals"),
     ("jaw_opening_m", _DOUBLE, "m", "as the image shows it"),
-    ("latency_ns", _INTEGER, "ns", "from handed over to judged"),
+    ("latency_ns", _INTEGER, "ns", "from when the frame came to the monitor's machine to judged"),
     ("corners_used", pa.int32(), "1", "corners that the transform rests on"),
     ("corners_total", pa.int32(), "1", "corners of the gripper file"),
     ("refused", _TRUTH, "", "nothing was measured in this frame"),

@@ -81,7 +81,7 @@ class Families(Collector):
             verdicts.add_metric((*self._who, verdict.value), count)
         yield verdicts
         latency = HistogramMetricFamily(
-            "gripmon_latency_seconds", "From a frame handed over until it is judged", labels=_WHO
+            "gripmon_latency_seconds", "From when a frame came to the machine until it is judged", labels=_WHO
         )
         latency.add_metric(self._who, _cumulative(tally.latencies[:]), 1e-9 * tally.latency_sum_ns)
         yield latency

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import uuid
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
@@ -10,8 +11,8 @@ from typing import Protocol
 import zenoh
 
 from gripmon.publish.answers import Answers
-from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
-from gripmon.wire import Keys, Link, check_name
+from gripmon.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
+from gripmon.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
 
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
@@ -200,6 +201,29 @@ class _LastValue:
             query.reply(self._key, last, encoding=_JSON)
 
 
+class _TimedStream(_LastValue):
+    """A key whose messages say when they were sent, and which tells the time to whoever asks.
+
+    With both a reader without a clock of the same time can bound how long a message was on its way.
+    """
+
+    _clock = uuid.uuid4().hex  # of this process: after a restart, perhaps on another machine, it is another one
+
+    def put(self, payload: bytes) -> None:
+        self._last = payload
+        self._publisher.put(payload, attachment=self._now())
+
+    def _answer(self, query: zenoh.Query) -> None:
+        if query.parameters.get(CLOCK_PARAMETER) is None:
+            super()._answer(query)
+            return
+        now = self._now()  # before the reply has to wait for anything
+        self._answers.send(query, lambda asked: asked.reply(self._key, now, encoding=_JSON))
+
+    def _now(self) -> bytes:
+        return to_json(ClockReading(self._clock, steady_ns()))
+
+
 class _Wire:
     """Everything declared on one open session; ``puts`` by the last part of the key."""
 
@@ -221,7 +245,7 @@ class _Wire:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self._add(leaf, publisher)
+        self._add(leaf, publisher, _TimedStream)
 
     def declare_kept(self, leaf: str, kept: int = 1) -> None:
         """A key whose last ``kept`` messages are there for who comes late."""
@@ -232,8 +256,13 @@ class _Wire:
         """Show the liveliness token, when all is declared."""
         self._alive = self._session.liveliness().declare_token(self._keys["alive"])
 
-    def _add(self, leaf: str, publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher) -> None:
-        self.values[leaf] = _LastValue(self._session, self._keys[leaf], publisher, self._answers)
+    def _add(
+        self,
+        leaf: str,
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        kind: type[_LastValue] = _LastValue,
+    ) -> None:
+        self.values[leaf] = kind(self._session, self._keys[leaf], publisher, self._answers)
         self.puts[leaf] = self.values[leaf].put
 
     def close(self) -> None:

@@ -39,7 +39,7 @@ from gripmon.records.frames import (
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
 from gripmon.records.looks import LookRecord
-from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StandingAlert, StateRecord
+from gripmon.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
 from gripmon.records.motion import Creep, Explanation, Motion, Vibration
 from gripmon.records.notes import Limits, MonitorNotes
 from gripmon.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
@@ -59,6 +59,7 @@ __all__ = [
     "CameraShift",
     "Cause",
     "CauseWeight",
+    "ClockReading",
     "Command",
     "CommandError",
     "CommandFault",

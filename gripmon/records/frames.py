@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
@@ -81,6 +81,7 @@ class Frame:
     ``image`` is H x W or H x W x 3 (BGR), uint8, uint16 or float32 in 0..1, or None where the source could not make one
     (truncated file, failed read); ``fault`` then says why in a few words, ``refusal`` in one.  ``jaw_opening_m`` is
     what the robot reported for this frame, None if nobody did.  ``name`` is the file or stream that it came from.
+    ``arrived_ns``: when the capture was over or the frame came to this machine, by the monotonic clock (ns); None: now.
     """
 
     seq: int
@@ -90,6 +91,7 @@ class Frame:
     name: str = ""
     fault: str | None = None
     refusal: Refusal = Refusal.NOT_AN_IMAGE
+    arrived_ns: int | None = field(default=None, compare=False)
 
 
 class CornerRecord(msgspec.Struct, frozen=True):
@@ -131,7 +133,7 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     ]
     corners: Annotated[tuple[CornerRecord, ...], Meta(description="all of the gripper file, in its order")]
     alerts: Annotated[tuple[Alert, ...], Meta(description="what this frame raised, updated or cleared")]
-    latency_ns: Annotated[int, Meta(description="from handed over to judged, ns")] = 0
+    latency_ns: Annotated[int, Meta(description="from when the frame came to the monitor's machine to judged, ns")] = 0
     reason: Annotated[str | None, Meta(description="why the verdict isn't valid; null when it is")] = None
     name: Annotated[str, Meta(description="file or stream that the frame came from")] = ""
     protection: Annotated[

@@ -88,6 +88,15 @@ class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gri
     revision: Annotated[int, Meta(description="of the reference in force")]
 
 
+class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.clock/1"):
+    """What the monitor's steady clock shows: as a transform is sent, attached to it, or as it is asked for."""
+
+    clock: Annotated[str, Meta(max_length=64, description="which clock; another one after every start of the monitor")]
+    now_ns: Annotated[
+        int, Meta(ge=0, le=2**63 - 1, description="ns since no moment in particular; nobody sets it, it never jumps")
+    ]
+
+
 class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
     """The opening of the jaws, which the robot writes."""
 

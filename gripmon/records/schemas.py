@@ -14,7 +14,7 @@ import msgspec
 from gripmon.records.commands import CommandError, CommandReply, CommandRequest
 from gripmon.records.frames import FrameRecord
 from gripmon.records.laser import LaserPulse, SpotRecord
-from gripmon.records.messages import AlertRecord, FrameNote, JawReading, StateRecord
+from gripmon.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
 from gripmon.records.references import ReferenceRecord
 
 _T = TypeVar("_T", bound=msgspec.Struct)
@@ -24,6 +24,7 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
     "state": StateRecord,
     "alert": AlertRecord,
     "reference": ReferenceRecord,
+    "clock": ClockReading,
     "jaw": JawReading,
     "frame": FrameNote,
     "pulse": LaserPulse,
@@ -35,6 +36,7 @@ MESSAGES: dict[str, type[msgspec.Struct]] = {
 """Everything that goes over the wire."""
 
 LARGEST_BYTES: dict[type[msgspec.Struct], int] = {
+    ClockReading: 4096,
     JawReading: 4096,
     FrameNote: 4096,
     LaserPulse: 4096,

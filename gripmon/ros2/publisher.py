@@ -21,6 +21,12 @@ _log = logging.getLogger(__name__)
 _TF_QOS = Qos(depth=100)
 """That of ``tf2_ros``' broadcasters: reliable, volatile, keep last 100."""
 
+MOST_WAITED_S = 0.5
+"""What was judged later than this after its frame came is not broadcast: tf takes the newest that comes for what is
+true now.  Twice what the client for controllers lets a transform be old by default, so that a busy machine still says
+something.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class _Topics:
@@ -34,8 +40,9 @@ class Ros2Publisher:
     """Publishes one monitor's records as a node on a link that somebody else closes.
 
     Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
-    capture time.  Diagnostics go out with every state record (once a second and on every change) and every alert.
-    While the link isn't open, nothing is kept: what comes late to tf is old, and diagnostics are said again.
+    capture time; one that waited in the monitor does not.  Diagnostics go out with every state record (once a second
+    and on every change) and every alert.  While the link isn't open, nothing is kept: what comes late to tf is old, and
+    diagnostics are said again.
     """
 
     def __init__(self, link: Link, settings: Ros2Settings, layout: Layout) -> None:
@@ -57,7 +64,7 @@ class Ros2Publisher:
         self._frame = record
         topics = self._ready()
         chosen = self._chosen(record)
-        if topics is None or chosen is None or record.verdict not in self._verdicts:
+        if topics is None or chosen is None or self._held_back():
             return
         transform, covariance = inverse(*chosen) if self._inverse else chosen
         header = self._messages.header(record.stamp_ns)
@@ -105,6 +112,8 @@ class Ros2Publisher:
             return "no frame yet"
         if self._frame.verdict not in self._verdicts:
             return f"verdict {self._frame.verdict}"
+        if (waited_s := 1e-9 * self._frame.latency_ns) > MOST_WAITED_S:
+            return f"judged {waited_s:.2g} s after its frame came, at most {MOST_WAITED_S:g} s"
         return "no transform" if self._chosen(self._frame) is None else ""
 
     def _chosen(self, record: FrameRecord) -> tuple[Transform, Iterable[float]] | None:

@@ -118,7 +118,7 @@ class _CaptureReader:
                 return self._lost("can't be opened")
         if not self._capture.grab():
             return self._lost("delivers no frames" if self._delivers else "opens, but delivers no frame")
-        stamp_ns = time.time_ns()
+        stamp_ns, arrived_ns = time.time_ns(), time.monotonic_ns()
         decoded, image = self._capture.retrieve()
         if not self._delivers:
             self._delivers = True
@@ -126,8 +126,8 @@ class _CaptureReader:
         self._backoff.reset()
         seq, self._seq = self._seq, self._seq + 1
         if not decoded:
-            return Frame(seq, stamp_ns, None, None, self._name, "the frame can't be decoded")
-        return Frame(seq, stamp_ns, image, None, self._name)
+            return Frame(seq, stamp_ns, None, None, self._name, "the frame can't be decoded", arrived_ns=arrived_ns)
+        return Frame(seq, stamp_ns, image, None, self._name, arrived_ns=arrived_ns)
 
     def _connect(self) -> bool:
         import cv2

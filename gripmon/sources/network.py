@@ -12,6 +12,7 @@ import zenoh
 
 from gripmon.records import Frame, FrameNote, Image, Refusal, largest_bytes
 from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.sources.lateness import MOST_LATE_S, Lateness
 from gripmon.sources.payload import (
     JPEG,
     PNG,
@@ -32,7 +33,6 @@ FILES = {"jpeg": JPEG, "png": PNG}
 ROS_FORMATS = ("ros2_image", "ros2_compressed")
 _PADDING_BYTES = 1 << 20
 _MOST_PIXEL_BYTES = 8  # no encoding has more
-_MOST_LATE_S = 3.0
 LARGEST_ATTACHMENT_BYTES = largest_bytes(FrameNote)
 
 Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
@@ -169,6 +169,7 @@ class NetworkCamera:
         self._newest: tuple[float, int] | None = None  # of the good ones: monotonic time of arrival, stamp
         self._last_arrival_s: float | None = None
         self._clock_fault = ""
+        self._lateness = Lateness()
         self._subscriber: zenoh.Subscriber[None] | None = None
         link.attach(self._attach)
 
@@ -269,7 +270,12 @@ class NetworkCamera:
             stamp_ns = arrival.unix_ns if stamped is None else stamped.get_time_as_ntp64().as_nanos()
         self._newest = arrival.monotonic_s, stamp_ns
         self._clock_fault = clock_fault(self.key, stamp_ns, arrival.unix_ns)
-        return Frame(self._next_seq(), stamp_ns, content.image, content.jaw_opening_m, self.key)
+        arrived_ns = round(1e9 * arrival.monotonic_s)
+        waited_ns = self._lateness.waited_ns(stamp_ns, arrived_ns, arrival.unix_ns)
+        return Frame(
+            self._next_seq(), stamp_ns, content.image, content.jaw_opening_m, self.key,
+            arrived_ns=arrived_ns - waited_ns,
+        )  # fmt: skip
 
     def _next_seq(self) -> int:
         seq = self._handed_over + self._dropped_before
@@ -299,7 +305,7 @@ def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:
         (86_400.0, "a day"),
         (3_600.0, "an hour"),
         (60.0, "a minute"),
-        (_MOST_LATE_S, "some seconds"),
+        (MOST_LATE_S, "some seconds"),
     ):
         if abs(late_s) >= limit_s:
             return (

@@ -81,6 +81,7 @@ class SimulatedCamera:
                 renderer.await_ready()
                 self._poll.register(renderer.announcements, select.POLLIN)
             start = time.monotonic(), time.time_ns()
+            self._stamps_ahead_ns = start[1] - round(_NS * start[0])  # of the monotonic clock
             for renderer in self._all:
                 renderer.commands.send(start)
         except BaseException:
@@ -150,7 +151,8 @@ class SimulatedCamera:
             return None
         self._dropped += announced.seq - self._last_seq - 1
         self._last_seq = announced.seq
-        return Frame(announced.seq, announced.stamp_ns, image, announced.jaw_opening_m, self._name)
+        due_ns = announced.stamp_ns - self._stamps_ahead_ns
+        return Frame(announced.seq, announced.stamp_ns, image, announced.jaw_opening_m, self._name, arrived_ns=due_ns)
 
 
 class _Announcement(NamedTuple):

@@ -9,9 +9,12 @@ from gripmon.wire.link import Link
 from gripmon.wire.router import Router
 from gripmon.wire.session import Joining, joining, open_session, zenoh_config
 from gripmon.wire.settings import DEFAULT_ENDPOINT, Keys, PublishError, PublishSettings, check_name
+from gripmon.wire.steady import CLOCK_PARAMETER, MOST_DRIFT, steady_ns
 
 __all__ = [
+    "CLOCK_PARAMETER",
     "DEFAULT_ENDPOINT",
+    "MOST_DRIFT",
     "Joining",
     "Keys",
     "Link",
@@ -22,5 +25,6 @@ __all__ = [
     "check_name",
     "joining",
     "open_session",
+    "steady_ns",
     "zenoh_config",
 ]

@@ -15,6 +15,11 @@ from gripmon.wire.files import ZenohFileError, load_file, said
 from gripmon.wire.settings import PublishError, PublishSettings, form_fault
 from gripmon.wire.zenoh_errors import in_short
 
+_SEND_BUFFER_BYTES = 8192
+"""Linux takes twice this, with its own overhead: three or four transforms of 2.7 kB.  Half of it would be less than
+two, so that each waits for the far end's word that it has the one before.
+"""
+
 
 def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh.Config:
     """Zenoh's own configuration for these settings; a path in them counts from ``relative_to``.
@@ -58,9 +63,10 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
         "transport/link/rx/max_message_size": 64 << 20,
         # Images gain by shared memory; transforms, 3 KiB, don't, and each sender costs its reader a pool of 16 MiB.
         "transport/shared_memory/transport_optimization/message_size_threshold": 64 << 10,
-        # An express message takes a whole place in the queue, of which there are two: 33 ms without a slice of the
-        # processor would lose a frame.
-        "transport/link/tx/queue/size/real_time": 8,
+        # Where a link can't carry the rate, what waits here makes every transform old: a few messages and not
+        # megabytes, the rest is dropped.  On loopback it costs no latency; a snapshot of 10 MB still takes 0.1 s.
+        "transport/link/tcp/so_sndbuf": _SEND_BUFFER_BYTES,
+        "transport/link/tls/so_sndbuf": _SEND_BUFFER_BYTES,
         # An endpoint that takes the connection and says nothing: closing waits for the attempt under way.
         "transport/unicast/open_timeout": 3000,
     }
@@ -98,7 +104,7 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
         keys = [key for key in ("listen", "connect") if getattr(settings, key)]
         if settings.zenoh_config is not None:
             keys = ["zenoh_config"]
-        if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
+        if taken := re.search(r"bound to ([^\s#]+)\S*: .*Address already in use", str(error)):
             remedy = "stop the program that has it, or choose another port"
             raise PublishError(keys[0], f"{taken[1]} is already in use; {remedy}") from error
         text = f"can't open a Zenoh session: {in_short(error)}"

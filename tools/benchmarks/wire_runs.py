@@ -36,9 +36,12 @@ class Plan:
     before_s: float = 2.0
     down_s: float = 1.0
     after_s: float = 5.0
+    slow_s: float = 20.0
+    slow_after_s: float = 4.0
+    stopped_s: float = 5.0
 
 
-QUICK = Plan(ring=30, block=210, rounds=3, restarts=2)
+QUICK = Plan(ring=30, block=210, rounds=3, restarts=2, slow_s=8.0)
 
 
 class _Switched:
