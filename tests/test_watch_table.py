@@ -23,10 +23,16 @@ def state(**changes: object) -> StateRecord:
     return msgspec.structs.replace(state_record(), **({"tcp_shift_m": (0.001, 0.0, 0.0), "sigma_m": 2e-5} | changes))
 
 
-def status(robot: str, *, age_s: float = 0.5, gone: bool = False, **changes: object) -> MonitorStatus:
+def status(
+    robot: str, *, age_s: float = 0.5, gone: bool = False, several: bool = False, **changes: object
+) -> MonitorStatus:
     said = None if changes.get("state") == "none" else state(**changes)
     return MonitorStatus(
-        name=MonitorName(robot, "wrist"), state=said, state_age_s=age_s, gone_since_ns=GONE_NS if gone else None
+        name=MonitorName(robot, "wrist"),
+        state=said,
+        state_age_s=age_s,
+        gone_since_ns=GONE_NS if gone else None,
+        several=several,
     )
 
 
@@ -40,6 +46,7 @@ THE_WORST_FIRST = [
     status("gone", gone=True),
     status("stopped", gone=True, message="stopped", state=State.STALE, **UNKNOWN),
     status("hangs", age_s=9.0),
+    status("twice", several=True),
     status("lost-with-error", state=State.LOST, open_alerts=(standing(Severity.ERROR),), **UNKNOWN),
     status("lost", state=State.LOST, **UNKNOWN),
     status("new", state="none", age_s=0.1),

@@ -17,8 +17,8 @@ COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "f
 _SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
 _FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
 _STYLES = {
-    "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
-    "stopped": "dim", "valid": "green"
+    "gone": "bold red", "silent": "bold red", "several": "bold red", "unknown": "red", "starting": "yellow",
+    "suspect": "yellow", "stopped": "dim", "valid": "green"
 }  # fmt: skip
 _MARKS = {"error": "!!", "warning": "!", "info": "i"}
 
@@ -36,7 +36,7 @@ def row(status: MonitorStatus) -> Row:
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
     cells = (
-        printable(str(status.name)),
+        printable(f"{status.name} {status.monitor_id}" if status.several else str(status.name)),
         _what(status),
         state.verdict.value if state is not None and there else "unknown",
         _number(1e3, status.drift_m, ".3f"),
@@ -106,6 +106,7 @@ def as_data(status: MonitorStatus) -> dict[str, Any]:
     return {
         "robot": status.name.robot,
         "camera": status.name.camera,
+        "monitor_id": status.monitor_id,
         "condition": status.condition.value,
         "gone_since_ns": status.gone_since_ns,
         "state_age_s": round(status.state_age_s, 3),
@@ -141,7 +142,8 @@ def _what(status: MonitorStatus) -> str:
     if status.gone_since_ns is not None:
         return f"{status.condition} since {clock(status.gone_since_ns)}"
     state = "starting" if status.state is None else printable(status.state.state)
-    return f"silent, was {state}" if status.condition == "silent" else state
+    before = {"silent": "silent, was ", "several": "several, "}
+    return f"{before.get(status.condition, '')}{state}"
 
 
 def _age_s(status: MonitorStatus) -> float:

@@ -204,6 +204,7 @@ class _Changes:
                 state and (state.state, state.verdict, state.revision, state.message),
                 tuple((alert.alert_id, alert.severity, alert.acknowledged) for alert in status.alerts),
             )
-            if self._said.get(status.name) != what:
-                self._said[status.name] = what
+            who = (status.name, status.monitor_id if status.several else "")
+            if self._said.get(who) != what:
+                self._said[who] = what
                 print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.line(status)}", flush=True)

@@ -8,13 +8,17 @@ import weakref
 from typing import NamedTuple, Protocol
 
 from gripmon.client.message import transform_message
-from gripmon.client.names import MonitorName
+from gripmon.client.names import MonitorName, Start
 from gripmon.records import FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
 
 MOST_PRESENT = 16
 """Names of more monitors are not kept: two are too many already, and a stranger may make up any number."""
+
+
+SENDS_S = 1.0
+"""Who sent a transform within that time is there, also where a router's rules let no token of its start through."""
 
 
 class Entry(NamedTuple):
@@ -24,12 +28,17 @@ class Entry(NamedTuple):
     monitor: MonitorName
     arrival_s: float
 
+    @property
+    def start(self) -> Start:
+        return Start(self.monitor, self.record.monitor_id)
+
 
 class Heard(NamedTuple):
     """What readings are made from; replaced as a whole, so that who reads it needs no lock.
 
     ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
-    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read.
+    vanished since; ``unreadable``: what was wrong with the last message, if it could not be read.  ``starts``: by their
+    tokens, which processes these monitors are; ``senders``: when each that sends was heard last.
     """
 
     entry: Entry | None = None
@@ -37,6 +46,8 @@ class Heard(NamedTuple):
     cut: bool = False
     unreadable: str = ""
     closed: bool = False
+    starts: frozenset[Start] = frozenset()
+    senders: tuple[tuple[Start, float], ...] = ()
 
 
 class Waiter(Protocol):
@@ -63,7 +74,13 @@ class Inbox:
             self._refuse(monitor, str(error))
             return
         with self._lock:
-            self._set(entry=entry, present=self._present_with(monitor), cut=False, unreadable="")
+            self._set(
+                entry=entry,
+                present=self._present_with(monitor),
+                cut=False,
+                unreadable="",
+                senders=_with_sender(self.heard.senders, entry),
+            )
             for waiter in self._waiters:
                 waiter.put(entry)
 
@@ -78,7 +95,24 @@ class Inbox:
         with self._lock:
             entry = self.heard.entry
             cut = self.heard.cut or (entry is not None and entry.monitor == monitor)
-            self._set(present=self.heard.present - {monitor}, cut=cut)
+            senders = tuple(sender for sender in self.heard.senders if sender[0].monitor != monitor)
+            self._set(present=self.heard.present - {monitor}, cut=cut, senders=senders)
+            self._wake()
+
+    def started(self, start: Start) -> None:
+        """The token of this start is there."""
+        with self._lock:
+            if len(self.heard.starts) < MOST_PRESENT:
+                self._set(starts=self.heard.starts | {start})
+            self._wake()
+
+    def ended(self, start: Start) -> None:
+        """It is gone; another process may speak under the same name."""
+        with self._lock:
+            entry = self.heard.entry
+            cut = self.heard.cut or (entry is not None and entry.start == start)
+            senders = tuple(sender for sender in self.heard.senders if sender[0] != start)
+            self._set(starts=self.heard.starts - {start}, cut=cut, senders=senders)
             self._wake()
 
     def close(self) -> None:
@@ -106,15 +140,27 @@ class Inbox:
     def _set(self, **changes: object) -> None:
         before = self.heard
         self.heard = before._replace(**changes)  # type: ignore[arg-type]
-        if len(self.heard.present) > 1 >= len(before.present):
-            _log.error("%s", several(self.heard.present))
+        if len(self.heard.present) > 1 >= len(before.present) or len(self.heard.starts) > 1 >= len(before.starts):
+            _log.error("%s", several(self.heard, 0.0))
 
     def _wake(self) -> None:
         for waiter in self._waiters:
             waiter.wake()
 
 
-def several(present: frozenset[MonitorName]) -> str:
-    """What to tell somebody who has not named the camera."""
-    names = ", ".join(map(str, sorted(present)))
-    return f"more than one monitor is there: {names}; name the camera"
+def several(heard: Heard, now_s: float) -> str:
+    """What to say where more than one monitor is there at ``now_s``; empty if there is one at most."""
+    if len(heard.present) > 1:  # the camera isn't named
+        names = ", ".join(map(str, sorted(heard.present)))
+        return f"more than one monitor is there: {names}; name the camera"
+    starts = heard.starts.union(start for start, sent_s in heard.senders if now_s - sent_s < SENDS_S)
+    if len(starts) < 2:
+        return ""
+    return f"more than one monitor has the same name: {', '.join(map(str, sorted(starts)))}; stop all but one"
+
+
+def _with_sender(senders: tuple[tuple[Start, float], ...], entry: Entry) -> tuple[tuple[Start, float], ...]:
+    """With who sent just now, and without those that are silent."""
+    start, now_s = entry.start, entry.arrival_s
+    others = tuple(sender for sender in senders if sender[0] != start and now_s - sender[1] < SENDS_S)
+    return (*others[1 - MOST_PRESENT :], (start, now_s))

@@ -12,7 +12,7 @@ import zenoh
 from gripmon.client.inbox import Entry, Inbox
 from gripmon.client.iterators import AsyncReadings, Readings
 from gripmon.client.judging import judge
-from gripmon.client.names import monitor_name
+from gripmon.client.names import monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
@@ -140,9 +140,11 @@ class TransformClient:
         # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
         transforms = zenoh.handlers.Callback(self._receive, indirect=False)
         tokens = zenoh.handlers.Callback(self._see, indirect=False)
+        starts = zenoh.handlers.Callback(self._see_start, indirect=False)
         self._declared = (
             session.declare_subscriber(self.keys["transform"], transforms),
             session.liveliness().declare_subscriber(self.keys["alive"], tokens, history=True),
+            session.liveliness().declare_subscriber(self.keys["alive/*"], starts, history=True),
         )
 
     def _receive(self, sample: zenoh.Sample) -> None:
@@ -153,3 +155,7 @@ class TransformClient:
     def _see(self, token: zenoh.Sample) -> None:
         seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
         seen(monitor_name(token.key_expr))
+
+    def _see_start(self, token: zenoh.Sample) -> None:
+        seen = self._inbox.started if token.kind == zenoh.SampleKind.PUT else self._inbox.ended
+        seen(start_of(token.key_expr))

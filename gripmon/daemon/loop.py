@@ -24,6 +24,7 @@ from gripmon.records import (
     FrameRecord,
     MonitorState,
     unmeasured_record,
+    withheld,
 )
 from gripmon.sources import Source
 
@@ -87,7 +88,8 @@ class Daemon(Loop):
         self._faults.clear()
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - handed_over_ns)
-        self._deliver("transform", self._publisher.transform, record)
+        several = self._not_alone()
+        self._deliver("transform", self._publisher.transform, withheld(record, several) if several else record)
         self._newest = Newest(frame, record, time.monotonic())
         # The rest is less urgent.
         self._deliver("state's keeping", self._keep_changes)

@@ -18,6 +18,7 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.publish import StatePublisher
+from gripmon.publish.presence import in_words
 from gripmon.recording import EventRecorder
 from gripmon.records import (
     Alert,
@@ -36,6 +37,7 @@ from gripmon.records import (
     Severity,
     State,
     StateRecord,
+    Verdict,
 )
 from gripmon.sources import Source, Waiting
 
@@ -177,6 +179,8 @@ class Loop(ABC):
             self._handle(item)
         for alert in self._watch.recording(self._kept.failure, time.monotonic(), time.time_ns()):
             self._alert(alert, self._watch.state)
+        for alert in self._watch.others(self._not_alone(), time.monotonic(), time.time_ns()):
+            self._alert(alert, self._watch.state)
         self._say_state(time.monotonic())
         return not self._watch.gives_up
 
@@ -244,23 +248,33 @@ class Loop(ABC):
         if not recorded:
             self._deliver("alert's recording", self._kept.alert, message)
 
+    def _not_alone(self) -> str:
+        """What to say while other monitors have this name, else empty: nobody can tell then whose transform is right,
+        so that none is published.
+        """
+        nobody: tuple[str, ...] = ()
+        others = self._ask(self._reports.others, nobody)
+        return f"{in_words(others)}; nothing is usable until it or this one is stopped" if others else ""
+
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
         watch, said, reports = self._watch, self._said, self._reports
-        faults = (watch.message, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
+        alone = not (several := self._not_alone())
+        verdict = watch.verdict if alone else Verdict.UNKNOWN
+        faults = (watch.message, several, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
         message = "; ".join(fault for fault in faults if fault)
-        now = (watch.state, watch.verdict, self._source.connected, message, self._in_force[1])
+        now = (watch.state, verdict, self._source.connected, message, self._in_force[1])
         due = now_s >= self._next_state_s
         if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
             return
-        if said is None or (watch.state, watch.verdict) != (said.state, said.verdict):
+        if said is None or (watch.state, verdict) != (said.state, said.verdict):
             said_more = f" ({message})" if message else ""
-            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, watch.verdict, said_more)
+            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, verdict, said_more)
         self._said = StateRecord(
             robot=self._robot,
             camera=self._camera,
             state=watch.state,
-            verdict=watch.verdict,
+            verdict=verdict,
             stamp_ns=time.time_ns(),
             seq=self._seq,
             reference_id=self._in_force[0],
@@ -274,9 +288,9 @@ class Loop(ABC):
             recording_dropped=self._kept.dropped,
             message=message,
             version=__version__,
-            tcp_shift_m=watch.tcp_shift_m,
-            sigma_m=watch.sigma_m,
-            protection_m=watch.protection_m,
+            tcp_shift_m=watch.tcp_shift_m if alone else None,
+            sigma_m=watch.sigma_m if alone else None,
+            protection_m=watch.protection_m if alone else None,
             alert_limit_m=reports.alert_limit_m,
             open_alerts=watch.standing(self._open_alerts),
             transforms_unsent=self._ask(reports.unsent, 0),

@@ -25,7 +25,7 @@ from gripmon.records import (
 
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
-_SILENCE, _FAILURE, _RECORDING = "silence", "failure", "recording"
+_SILENCE, _FAILURE, _RECORDING, _OTHERS = "silence", "failure", "recording", "others"
 
 
 class Judged(NamedTuple):
@@ -115,6 +115,13 @@ class Watch:
             return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
         return list(self._alerts.present(_RECORDING, stopped, now_s, stamp_ns))
+
+    def others(self, said: str, now_s: float, stamp_ns: int) -> list[Alert]:
+        """Other monitors of this name: ``said`` of them, empty while there are none."""
+        if not said:
+            return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
+        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, said)
+        return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

@@ -35,6 +35,7 @@ from gripmon.records.frames import (
     State,
     Verdict,
     unmeasured_record,
+    withheld,
 )
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
@@ -115,4 +116,5 @@ __all__ = [
     "summary",
     "to_json",
     "unmeasured_record",
+    "withheld",
 ]

@@ -57,6 +57,7 @@ class AlertKind(OpenEnum):
     STREAM = "stream"
     SOURCE = "source"
     RECORDING = "recording"
+    SEVERAL = "several_monitors"
 
 
 class AlertEvent(enum.StrEnum):

@@ -63,6 +63,14 @@ class CommandRequest(
             description="of this request: sent again, it gets the same answer and isn't carried out again; empty: none",
         ),
     ] = ""
+    monitor_id: Annotated[
+        str,
+        Meta(
+            max_length=64,
+            pattern=_PRINTED,
+            description="the start of the monitor that is meant, any other refuses; empty: the only one of its name",
+        ),
+    ] = ""
 
 
 class SnapshotImage(msgspec.Struct, frozen=True):
@@ -102,6 +110,7 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
         ),
     ] = None
     snapshot: Annotated[Snapshot | None, Meta(description="answers snapshot; else null")] = None
+    monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""
 
 
 class CommandFault(OpenEnum):
@@ -110,6 +119,7 @@ class CommandFault(OpenEnum):
     UNKNOWN = "unknown_command"
     MALFORMED = "malformed"
     SEVERAL = "several_monitors"
+    ANOTHER = "another_monitor"
     BUSY = "busy"
     TIMEOUT = "timeout"
     STOPPING = "stopping"
@@ -122,3 +132,4 @@ class CommandError(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
 
     error: CommandFault
     text: Annotated[str, Meta(description="what went wrong, in one line for a person")]
+    monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""

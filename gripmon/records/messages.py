@@ -71,6 +71,7 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     malformed: Annotated[
         int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")
     ] = 0
+    monitor_id: Annotated[str, Meta(description="of this start of the monitor; empty from one before ids")] = ""
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
@@ -83,6 +84,7 @@ class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gri
     state: State
     reference_id: Annotated[str, Meta(description="the reference in force")]
     revision: Annotated[int, Meta(description="of the reference in force")]
+    monitor_id: Annotated[str, Meta(description="of this start of the monitor; empty from one before ids")] = ""
 
 
 class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
