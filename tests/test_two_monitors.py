@@ -149,7 +149,7 @@ def test_the_client_uses_neither_until_one_is_gone(two: tuple[Published, Publish
 
 
 def test_a_command_reaches_the_one_that_is_named_and_no_other(two: tuple[Published, Published], router: str):
-    first, second = two
+    first = two[0]
     camera = first.keys.camera
     with Client("arm", camera, connect=[router]) as client, plain_session(connect=router) as plain:
         with pytest.raises(Ambiguous, match=f"^2 monitors are arm/{camera}: .*; stop all but one, or name one$"):

@@ -135,10 +135,10 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
     assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 7
     below = " ".join(line.strip() for line in lines[-2:])
     assert (
-        "15 monitors: 1 gone, 1 stopped, 1 silent, 2 unknown, 1 starting, 2 suspect, 7 valid; no connection to tcp/x;"
-        in below
+        "16 monitors: 1 gone, 1 stopped, 1 silent, 1 several, 2 unknown, 1 starting, 2 suspect, 7 valid; "
+        "no connection to tcp/x;" in below
     )
-    assert "8 more than fit here, none in more trouble" in below
+    assert "9 more than fit here, none in more trouble" in below
 
 
 @pytest.mark.parametrize(("width", "has_sigma"), [(80, False), (120, True)])
@@ -180,8 +180,8 @@ def test_json_has_what_the_table_is_made_from():
     data = msgspec.json.encode([fleet_table.as_data(s) for s in THE_WORST_FIRST])
     told = json.loads(data)
     assert [each["condition"] for each in told] == [s.condition.value for s in THE_WORST_FIRST]
-    assert told[0]["gone_since_ns"] == GONE_NS and told[6]["drift_m"] == pytest.approx(0.005)
-    assert told[6]["state"]["schema"] == "gripmon.state/1" and told[5]["state"] is None
+    assert told[0]["gone_since_ns"] == GONE_NS and told[7]["drift_m"] == pytest.approx(0.005)
+    assert told[7]["state"]["schema"] == "gripmon.state/1" and told[6]["state"] is None
 
 
 ARM = MonitorName("arm", "wrist")

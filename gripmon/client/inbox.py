@@ -38,7 +38,8 @@ class Heard(NamedTuple):
 
     ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
     vanished since; ``unreadable``: what was wrong with the last message, if it could not be read.  ``starts``: by their
-    tokens, which processes these monitors are; ``senders``: when each that sends was heard last.
+    tokens, which processes these monitors are; ``senders``: when each that sends was heard last; ``elsewhere``: other
+    monitors on the network, where somebody has looked for them.
     """
 
     entry: Entry | None = None
@@ -48,6 +49,7 @@ class Heard(NamedTuple):
     closed: bool = False
     starts: frozenset[Start] = frozenset()
     senders: tuple[tuple[Start, float], ...] = ()
+    elsewhere: frozenset[MonitorName] = frozenset()
 
 
 class Waiter(Protocol):
@@ -114,6 +116,12 @@ class Inbox:
             senders = tuple(sender for sender in self.heard.senders if sender[0] != start)
             self._set(starts=self.heard.starts - {start}, cut=cut, senders=senders)
             self._wake()
+
+    def found(self, monitor: MonitorName) -> None:
+        """It is on the network, whether it is the one that is meant or not."""
+        with self._lock:
+            if len(self.heard.elsewhere) < MOST_PRESENT:
+                self._set(elsewhere=self.heard.elsewhere | {monitor})
 
     def close(self) -> None:
         """No more will come."""

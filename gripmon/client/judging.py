@@ -77,7 +77,10 @@ def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
         return Unusable.UNREADABLE, f"no transform came that can be read: {heard.unreadable}"
     if text := fault():
         return Unusable.NOT_CONNECTED, text
-    return Unusable.NOTHING_YET, f"no transform came yet{'' if heard.present else ', and no monitor is seen'}"
+    if heard.present:
+        return Unusable.NOTHING_YET, "no transform came yet"
+    others = f"; there are {', '.join(map(str, sorted(heard.elsewhere)))}" if heard.elsewhere else ""
+    return Unusable.NOTHING_YET, f"no transform came yet, and no monitor of this name is seen{others}"
 
 
 def _unknown(record: FrameRecord) -> _Refusal | None:

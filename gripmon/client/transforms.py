@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +17,8 @@ from gripmon.client.names import monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
+
+_LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds
 
 
 class TransformClient:
@@ -52,6 +55,7 @@ class TransformClient:
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
+        self._session: zenoh.Session | None = None
         self._link.attach(self._declare)
 
     def __enter__(self) -> Self:
@@ -130,6 +134,17 @@ class TransformClient:
         """The reading of a message, as of now."""
         return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
 
+    def look_around(self) -> None:
+        """Ask, without waiting, which monitors are on the network; what was heard then stands in the ``reason``."""
+        found = zenoh.handlers.Callback(self._find, indirect=False)
+        if self._session is not None:
+            with contextlib.suppress(zenoh.ZError):  # another thread closes it just now
+                self._session.liveliness().get(Keys("*", "*")["alive"], found, timeout=_LOOK_WITHIN_S)
+
+    def _find(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._inbox.found(monitor_name(reply.ok.key_expr))
+
     def _fault(self) -> str:
         try:
             return self._link.fault()
@@ -137,6 +152,7 @@ class TransformClient:
             return "the client is being closed"
 
     def _declare(self, session: zenoh.Session) -> None:
+        self._session = session
         # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
         transforms = zenoh.handlers.Callback(self._receive, indirect=False)
         tokens = zenoh.handlers.Callback(self._see, indirect=False)
