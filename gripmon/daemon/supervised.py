@@ -177,10 +177,12 @@ class Loop(ABC):
                 self._alert(alert, self._watch.state)
         else:
             self._handle(item)
-        for alert in self._watch.recording(self._kept.failure, time.monotonic(), time.time_ns()):
-            self._alert(alert, self._watch.state)
-        for alert in self._watch.others(self._not_alone(), time.monotonic(), time.time_ns()):
-            self._alert(alert, self._watch.state)
+        watch, now_s, stamp_ns = self._watch, time.monotonic(), time.time_ns()
+        alerts = watch.recording(self._kept.failure, now_s, stamp_ns)
+        alerts += watch.dropped(self._source.dropped, now_s, stamp_ns)
+        alerts += watch.others(self._not_alone(), now_s, stamp_ns)
+        for alert in alerts:
+            self._alert(alert, watch.state)
         self._say_state(time.monotonic())
         return not self._watch.gives_up
 

@@ -7,6 +7,7 @@ import re
 from collections import deque
 from typing import NamedTuple
 
+from gripmon.daemon.drops import Drops
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.policy import AlertBook
 from gripmon.records import (
@@ -26,6 +27,7 @@ from gripmon.records import (
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _SILENCE, _FAILURE, _RECORDING, _OTHERS = "silence", "failure", "recording", "others"
+_DROPS = "drops"
 
 
 class Judged(NamedTuple):
@@ -61,6 +63,7 @@ class Watch:
         self.undelivered = ""
         self.errors_in_a_row = 0
         self._alerts = AlertBook(update_s=math.inf, clear_s=0.0)
+        self._drops = Drops(settings.dropped_alert_share)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._judged: Judged | None = None
@@ -115,6 +118,13 @@ class Watch:
             return list(self._alerts.absent(_RECORDING, "recording goes on", now_s))
         stopped = Alert(AlertKind.RECORDING, Cause.UNKNOWN, Severity.WARNING, failure)
         return list(self._alerts.present(_RECORDING, stopped, now_s, stamp_ns))
+
+    def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
+        """So many frames have come since the start while another one was worked on."""
+        if not (said := self._drops.look(self.frames, count, now_s)):
+            return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
+        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, said)
+        return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
 
     def others(self, said: str, now_s: float, stamp_ns: int) -> list[Alert]:
         """Other monitors of this name: ``said`` of them, empty while there are none."""

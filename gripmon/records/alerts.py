@@ -34,6 +34,7 @@ class Cause(OpenEnum):
     PLANE_MOVED = "plane_moved"
     LASER_MOVED = "laser_pointer_moved"
     NO_CAMERA = "no_camera"
+    TOO_SLOW = "monitor_too_slow"
     UNKNOWN = "unknown"
 
 
