@@ -132,13 +132,13 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
     lines = capture.get().splitlines()
     assert len(lines) <= 12
     shown = [line.split("/")[0] for line in lines if "/wrist" in line]
-    assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 7
-    below = " ".join(line.strip() for line in lines[-2:])
+    assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 6
+    below = " ".join(line.strip() for line in lines[-3:])
     assert (
         "16 monitors: 1 gone, 1 stopped, 1 silent, 1 several, 2 unknown, 1 starting, 2 suspect, 7 valid; "
         "no connection to tcp/x;" in below
     )
-    assert "9 more than fit here, none in more trouble" in below
+    assert "10 more than fit here, none in more trouble" in below and fleet_table.LEGEND in below
 
 
 @pytest.mark.parametrize(("width", "has_sigma"), [(80, False), (120, True)])
@@ -154,7 +154,7 @@ def test_a_narrow_terminal_keeps_the_bound_and_the_drift(width: int, has_sigma: 
 
 def test_a_log_gets_aligned_columns_or_one_line():
     lines = fleet_table.plain(THE_WORST_FIRST, "").splitlines()
-    assert len(lines) == 1 + len(THE_WORST_FIRST) + 1
+    assert len(lines) == 1 + len(THE_WORST_FIRST) + 2 and lines.pop() == fleet_table.LEGEND
     start = lines[0].index("verdict")
     assert {line[start:].split()[0] for line in lines[1:-1]} == {"unknown", "suspect", "valid"}
     assert fleet_table.line(status("arm", message="jaw unknown")) == (

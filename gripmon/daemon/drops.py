@@ -38,8 +38,8 @@ class Drops:
 
 
 def _in_words(handled_per_s: float, came_per_s: float, share: float) -> str:
+    remedy = "lower the camera's rate (source.fps, or its driver's) to that, give smaller images, or free the processor"
     return (
         f"{100.0 * share:.0f} % of the frames were dropped in {OVER_S:g} s: {came_per_s:.3g} a second came, the "
-        f"monitor had time for {handled_per_s:.3g}; lower the camera's rate (source.fps, or its driver's) to that, give "
-        "smaller images, or free the processor of other work"
+        f"monitor had time for {handled_per_s:.3g}; {remedy} of other work"
     )

@@ -150,6 +150,7 @@ class Daemon(Loop):
     def _monitor_state(self) -> MonitorState:
         state = self._monitor.state()
         self._open_alerts = state.alerts
+        self._proposal_id = "" if state.proposal is None else state.proposal.reference_id
         return state
 
     def _make_reference_known(self) -> None:

@@ -38,6 +38,7 @@ from gripmon.records import (
     State,
     StateRecord,
     Verdict,
+    accepting,
 )
 from gripmon.sources import Source, Waiting
 
@@ -94,6 +95,7 @@ class Loop(ABC):
         self._reports = reports or Reports()
         self._notices = notices
         self._open_alerts: tuple[OpenAlert, ...] = ()  # of what judges the frames
+        self._proposal_id = ""  # the new reference that waits for an operator
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
@@ -258,21 +260,38 @@ class Loop(ABC):
         others = self._ask(self._reports.others, nobody)
         return f"{in_words(others)}; nothing is usable until it or this one is stopped" if others else ""
 
+    def _what_waits(self) -> str:
+        """What an operator is waited for, and what to type; empty if for nothing."""
+        if not self._proposal_id:
+            return ""
+        return f"a new reference waits for an operator: {accepting(self._proposal_id, self._robot, self._camera)}"
+
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
-        watch, said, reports = self._watch, self._said, self._reports
-        alone = not (several := self._not_alone())
-        verdict = watch.verdict if alone else Verdict.UNKNOWN
-        faults = (watch.message, several, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
-        message = "; ".join(fault for fault in faults if fault)
+        watch, said = self._watch, self._said
+        several, waits = self._not_alone(), self._what_waits()
+        verdict = Verdict.UNKNOWN if several else watch.verdict
+        reported = (self._ask(fault, None) for fault in self._reports.faults)
+        message = "; ".join(fault for fault in (watch.message, several, waits, watch.undelivered, *reported) if fault)
         now = (watch.state, verdict, self._source.connected, message, self._in_force[1])
         due = now_s >= self._next_state_s
         if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
             return
+        if waits and (said is None or said.proposal_id != self._proposal_id):
+            _log.warning("%s (or reject)", waits)
         if said is None or (watch.state, verdict) != (said.state, said.verdict):
             said_more = f" ({message})" if message else ""
             _log.info("state %s, %s %s%s", watch.state, self.verdict_of, verdict, said_more)
-        self._said = StateRecord(
+        self._said = self._state_record(verdict, message, now_s, alone=not several)
+        self._deliver("state", self._told.state, self._said)
+        self._deliver("state's recording", self._kept.state, self._said)
+        if due:
+            self._next_state_s = now_s + self._settings.state_period_s
+            self._keep_house()
+
+    def _state_record(self, verdict: Verdict, message: str, now_s: float, *, alone: bool) -> StateRecord:
+        watch, reports = self._watch, self._reports
+        return StateRecord(
             robot=self._robot,
             camera=self._camera,
             state=watch.state,
@@ -297,12 +316,8 @@ class Loop(ABC):
             open_alerts=watch.standing(self._open_alerts),
             transforms_unsent=self._ask(reports.unsent, 0),
             malformed=self._ask(reports.malformed, 0),
+            proposal_id=self._proposal_id,
         )
-        self._deliver("state", self._told.state, self._said)
-        self._deliver("state's recording", self._kept.state, self._said)
-        if due:
-            self._next_state_s = now_s + self._settings.state_period_s
-            self._keep_house()
 
     def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
         """What somebody reports; one who fails at that is no reason to stop."""

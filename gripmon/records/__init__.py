@@ -22,6 +22,7 @@ from gripmon.records.commands import (
     CommandRequest,
     Snapshot,
     SnapshotImage,
+    accepting,
 )
 from gripmon.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
@@ -109,6 +110,7 @@ __all__ = [
     "Transform",
     "Verdict",
     "Vibration",
+    "accepting",
     "from_json",
     "json_schema",
     "largest_bytes",

@@ -35,6 +35,11 @@ class Command(msgspec.Struct, frozen=True):
     argument: str = ""
 
 
+def accepting(reference_id: str, robot: str, camera: str) -> str:
+    """What an operator types to let a proposed reference in."""
+    return f"gripmon send accept {reference_id} --robot {robot} --camera {camera}"
+
+
 _PRINTED = r"^[^\x00-\x1f\x7f]*(?![\s\S])"  # it appears in logs and on terminals: no control characters
 
 

@@ -72,6 +72,9 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         int, Meta(description="messages received that were none: jaw openings, pulses, frames, commands")
     ] = 0
     monitor_id: Annotated[str, Meta(description="of this start of the monitor; empty from one before ids")] = ""
+    proposal_id: Annotated[
+        str, Meta(description="the new reference that waits for an operator to accept or reject it; empty if none does")
+    ] = ""
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
