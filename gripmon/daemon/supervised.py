@@ -13,7 +13,7 @@ from typing import ParamSpec, TypeVar
 import msgspec
 
 from gripmon import __version__
-from gripmon.daemon.neighbours import CommandFeed, Reports
+from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
@@ -47,6 +47,8 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
+_RESTS_FOR = 3.0
+"""After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
 
@@ -100,7 +102,7 @@ class Loop(ABC):
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
         self._said: StateRecord | None = None
-        self._next_state_s = self._start_s
+        self._next_state_s = self._next_command_s = self._start_s
         self._stop = stop
         self._source_broke = False
         self._faults: dict[str, str] = {}  # of the frame in hand: what could not be delivered, and why
@@ -190,9 +192,15 @@ class Loop(ABC):
 
     def _obey(self) -> None:
         """Carry out one command, if one waits: never so many that frames wait for them."""
-        asked = None if self._commands is None else self._commands.poll()
+        begun_s = time.monotonic()
+        asked = None if self._commands is None or begun_s < self._next_command_s else self._commands.poll()
         if asked is None:
             return
+        self._carry_out_and_answer(asked)
+        now_s = time.monotonic()
+        self._next_command_s = now_s + _RESTS_FOR * (now_s - begun_s)
+
+    def _carry_out_and_answer(self, asked: Asked) -> None:
         command, answer = asked.command, None
         stamp_ns = time.time_ns()
         try:

@@ -119,7 +119,8 @@ class ZenohCommands:
         self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
-        self._answers = Answers("commands")
+        flooded = CommandError(CommandFault.BUSY, "too many requests wait already; try again later")
+        self._answers = Answers("commands", _reply("", flooded, self._monitor_id))
         link.attach(self._attach, self.close)
 
     @property

@@ -177,6 +177,10 @@ def _keeping_publisher(
     )
 
 
+def _too_many_ask(query: zenoh.Query) -> None:
+    query.reply_err(b"busy: too many ask; try again later", encoding=zenoh.Encoding.TEXT_PLAIN)
+
+
 class _LastValue:
     """A key whose last value is there for whoever asks."""
 
@@ -216,7 +220,7 @@ class _Wire:
     def __init__(self, session: zenoh.Session, keys: Keys, monitor_id: str) -> None:
         self._session, self._keys = session, keys
         self._tokens = [keys["alive"], *([keys[f"alive/{monitor_id}"]] if monitor_id else [])]
-        self._answers = Answers("latest")
+        self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
         self.values: dict[str, _LastValue] = {}
