@@ -16,8 +16,10 @@ from gripmon.wire import Keys, Link
 
 _log = logging.getLogger(__name__)
 
-VANISHES_WITHIN_S = 12.0
-"""A monitor that lost its power or its line stays visible for Zenoh's lease, 10 s by default, and a little."""
+VANISHES_WITHIN_S = 20.0
+"""A monitor that hangs, or lost its power or its line, stays visible for Zenoh's lease, 10 s by default, and until that
+is looked at: 14.5 s after a SIGSTOP were measured.
+"""
 
 _CONNECTED_WITHIN_S = 2.0  # a router that isn't there yet is no reason to wait longer
 _LOOK_EVERY_S = 0.5
