@@ -67,7 +67,8 @@ class _Queue:
             self._judge.look_around()
         elif self._say_s is not None and now_s >= self._say_s:
             self._say_s = None
-            return self._judge.latest()
+            self._given = self._judge.latest()
+            return self._given
         return None
 
     def _patience_s(self) -> float | None:
