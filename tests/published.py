@@ -4,25 +4,32 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.publish import ZenohCommands, ZenohJaw, ZenohPublisher
-from gripmon.wire import Link, PublishSettings
+from gripmon.publish import Presence, ZenohCommands, ZenohJaw, ZenohPublisher
+from gripmon.wire import Keys, Link, PublishSettings
 
 
 class Published(ZenohPublisher):
-    """``jaw``, ``commands`` and ``link`` beside the publisher's own."""
+    """``jaw``, ``commands``, ``link`` and, with ``identified``, ``presence`` beside the publisher's own."""
 
     def __init__(
-        self, settings: PublishSettings, robot: str = "arm", camera: str = "wrist", *, relative_to: Path = Path()
+        self,
+        settings: PublishSettings,
+        robot: str = "arm",
+        camera: str = "wrist",
+        *,
+        relative_to: Path = Path(),
+        identified: bool = False,
     ) -> None:
         self.link = Link(settings, relative_to)
         try:
-            super().__init__(self.link, robot, camera)
+            self.presence = Presence(self.link, Keys(robot, camera)) if identified else None
+            super().__init__(self.link, robot, camera, self.presence)
         except ValueError:
             self.link.close()
             raise
         self.jaw = ZenohJaw(self.link, self.keys["jaw"])
         if settings.commands:
-            self.commands = ZenohCommands(self.link, self.keys)
+            self.commands = ZenohCommands(self.link, self.keys, self.presence)
 
     @property
     def connected(self) -> bool:

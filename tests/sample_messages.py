@@ -54,6 +54,7 @@ from gripmon.records import (
 FOLDER = Path(__file__).resolve().parent / "wire_samples"
 
 STAMP_NS = 1_767_225_600_123_456_789  # beyond what a double holds exactly: readers need 64-bit integers
+MONITOR_ID = "arm-pc-4711-1f0c9a2b"
 POSE = Transform((0.0116, -0.0021, 0.1327), (0.5, -0.5, 0.5, 0.5))
 
 
@@ -109,6 +110,7 @@ MEASURED = FrameRecord(
     ),
     alerts=(MOVED,),
     latency_ns=2_650_000,
+    monitor_id=MONITOR_ID,
     name="/dev/video0",
     protection=Protection(3.5e-4, 4.4e-3, 1e-5, "an edge belongs to something else"),
 )
@@ -241,6 +243,7 @@ SAMPLES: dict[str, msgspec.Struct] = {
         recording_dropped=0,
         message="no jaw opening for 1 s or longer",
         version="0.1.0",
+        monitor_id=MONITOR_ID,
         tcp_shift_m=(0.0015, -0.0002, 0.0001),
         sigma_m=8e-5,
         protection_m=3.5e-4,

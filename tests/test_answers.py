@@ -88,6 +88,43 @@ def test_when_too_many_wait_a_query_ends_unanswered(stalled: StalledQuery):
     answers.close()
 
 
+def test_when_too_many_wait_the_others_are_told_so(stalled: StalledQuery):
+    answers = Answers("test", lambda query: query.reply_err("", b"busy"))  # type: ignore[arg-type]
+    for _ in range(_WAITING_MOST):
+        answers.send(stalled, lambda query: query.reply("", b""))  # type: ignore[arg-type]
+    more = [StalledQuery() for _ in range(500)]
+    for query in more:
+        query.given_up.set()
+        answers.send(query, lambda query: query.reply("", b""))  # type: ignore[arg-type]
+    wait_until(lambda: all(query.dropped for query in more), "all to be told")
+    assert all(query.payloads == [b"busy"] for query in more) and not stalled.payloads
+    stalled.given_up.set()
+    wait_until(lambda: len(stalled.payloads) == _WAITING_MOST, "all others")
+    answers.close()
+
+
+def test_a_flood_of_commands_is_answered_to_the_last_one():
+    """Nobody carries anything out: some wait until their time is over, all others hear that it is busy."""
+    endpoint = free_endpoint()
+    publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
+    answered: list[str] = []
+    try:
+        with plain_session(connect=endpoint) as session:
+
+            def take(reply: zenoh.Reply) -> None:
+                assert reply.err is not None
+                answered.append(json.loads(reply.err.payload.to_bytes())["error"])
+
+            for _ in range(3000):
+                session.get(
+                    "gripmon/arm/wrist/cmd/undo", zenoh.handlers.Callback(take, indirect=False), timeout=2.0 * WAIT_S
+                )
+            wait_until(lambda: len(answered) == 3000, "an answer to each")
+    finally:
+        publisher.close()
+    assert set(answered) == {"busy", "timeout"} and answered.count("timeout") < 100
+
+
 def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("gripmon.publish.answers._CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
     before = set(threading.enumerate())

@@ -11,7 +11,8 @@ import pytest
 from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from published import Published
 
-from gripmon.client import Policy, Reading, TransformClient
+from gripmon.client import Policy, Reading, TransformClient, Unusable
+from gripmon.records import Verdict
 from gripmon.wire import PublishSettings
 
 PATIENT = Policy(max_age_s=3600.0)
@@ -156,3 +157,36 @@ def test_closing_ends_every_wait(join: Callable[..., TransformClient]):
     for thread in waiting:
         thread.join(WAIT_S)
     assert not any(thread.is_alive() for thread in waiting)
+
+
+def test_an_iterator_says_that_nobody_has_the_name_and_who_is_there(publisher: Published):
+    with TransformClient("arm1", connect=publisher.link.settings.listen) as wrong:
+        reading = next(iter(wrong))
+        assert reading.why is Unusable.NOTHING_YET and reading.verdict is Verdict.UNKNOWN
+        assert reading.reason == "no transform came yet, and no monitor of this name is seen; there are arm/wrist"
+        told: list[Reading] = []
+        wrong.on_transform(told.append)
+        wait_until(lambda: told, "the callback")
+        assert [each.why for each in told] == [Unusable.NOTHING_YET]
+
+
+def test_an_asynchronous_iterator_says_it_too(publisher: Published):
+    async def first() -> Reading:
+        with TransformClient("arm1", connect=publisher.link.settings.listen) as wrong:
+            return await anext(aiter(wrong))
+
+    assert asyncio.run(first()).reason.endswith("; there are arm/wrist")
+
+
+def test_an_iterator_says_whom_there_is_no_connection_to():
+    with TransformClient("arm", connect=[free_endpoint()]) as alone:
+        assert next(iter(alone)).why is Unusable.NOT_CONNECTED
+
+
+def test_an_iterator_that_has_said_so_waits_on(publisher: Published):
+    with TransformClient("arm", connect=publisher.link.settings.listen) as client:
+        readings = iter(client)
+        said = next(readings)
+        assert said.why is Unusable.NOTHING_YET and said.reason == "no transform came yet"
+        threading.Timer(0.5, lambda: publisher.transform(frame_record(4))).start()
+        assert next(readings).seq == 4

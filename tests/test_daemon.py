@@ -25,6 +25,9 @@ from gripmon.records import (
     AlertKind,
     Cause,
     CauseWeight,
+    Command,
+    CommandName,
+    CommandReply,
     Frame,
     FrameRecord,
     Severity,
@@ -342,3 +345,28 @@ def test_lines_for_people_on_stderr(capsys: pytest.CaptureFixture[str]):
     assert lines[0].endswith("INFO watching arm/wrist against plate-2, revision 3")
     assert any("state tracking, transform valid" in line for line in lines)
     assert lines[-1].endswith("INFO stopped after 3 frames, 0 refused, 0 dropped")
+
+
+def test_commands_get_a_quarter_of_the_loops_time_at_most():
+    """A flood of them delays frames little: the loop lives for a second, and each takes 20 ms."""
+    took_s = 0.02
+
+    class Slow(ScriptedMonitor):
+        def command(self, command: Command, stamp_ns: int) -> CommandReply:
+            time.sleep(took_s)
+            return super().command(command, stamp_ns)
+
+    class Asked:
+        command = Command(CommandName.RESET)
+
+        def answer(self, answer: object, attachment: bytes | None = None) -> None: ...
+
+    class Flood:
+        def poll(self) -> Asked:
+            return Asked()
+
+    bench = Bench((each for seq in range(10**6) for each in (pause(0.001), seq)), Slow())
+    begun_s = time.monotonic()
+    bench.run(commands=Flood(), duration_s=1.0)
+    lasted_s = time.monotonic() - begun_s
+    assert 0 < len(bench.monitor.obeyed) * took_s <= 0.25 * lasted_s + took_s

@@ -29,7 +29,7 @@ class Fleet:
         self.folder = folder
         self.regional, self.central = free_endpoint(), free_endpoint()
         for file in (ROOT / "configs" / "zenoh").glob("*.json5"):
-            text = file.read_text()
+            text = file.read_text().replace("arm1", "arm")
             for port, endpoint in ((":7447", self.regional), (":7448", self.central)):
                 text = text.replace(f"127.0.0.1{port}", endpoint.partition("/")[2])
             (folder / file.name).write_text(text)
@@ -37,7 +37,10 @@ class Fleet:
             text = (folder / f"{name}.json5").read_text()
             text = text.replace(self.regional.partition("/")[2], self.central.partition("/")[2])
             (folder / f"central-{name}.json5").write_text(text)
-        assert main(["certificates", "--out", str(folder / "certificates")]) == 0
+        robots = ["--robot", "arm", "--robot", "arm2", "--rules", str(folder / "regional.json5")]
+        assert main(["certificates", *robots, "--out", str(folder / "certificates")]) == 0
+        second = (folder / "monitor.json5").read_text().replace("monitor-arm", "monitor-arm2")
+        (folder / "monitor-arm2.json5").write_text(second)
         assert main(["certificates", "central", "--host", "127.0.0.1", "--out", str(folder / "certificates")]) == 0
 
     def session(self, name: str) -> zenoh.Session:
@@ -140,7 +143,7 @@ def test_a_monitor_that_dies_is_seen_above(fleet: Fleet, monitor: Published):
         _tokens = above.liveliness().declare_subscriber(
             "gripmon/*/*/alive", lambda sample: seen.append((sample.kind, str(sample.key_expr))), history=True
         )
-        second = Published(PublishSettings(zenoh_config="monitor.json5"), "arm2", relative_to=fleet.folder)
+        second = Published(PublishSettings(zenoh_config="monitor-arm2.json5"), "arm2", relative_to=fleet.folder)
         key = "gripmon/arm2/wrist/alive"
         try:
             wait_until(lambda: (zenoh.SampleKind.PUT, key) in seen, "its token")

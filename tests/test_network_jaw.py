@@ -229,7 +229,7 @@ def test_good_ones_for_some_seconds_end_the_words_but_not_the_count(
     clock[0] += malformed.CALM_S
     assert seen.fault() == "" and seen.count == 20
     seen.add("too short")
-    assert seen.fault() == "over 10 malformed frames on a/b: too short"
+    assert seen.fault() == "1 malformed frame on a/b: too short", "counted anew after the calm"
     clock[0] += 2.0 * malformed.CALM_S
     assert seen.fault(), "silence is no good sign"
     assert len(caplog.records) == 1, "one occasion, said once"
@@ -250,3 +250,33 @@ def test_a_stranger_writes_no_lines_of_his_own(caplog: pytest.LogCaptureFixture)
     text = seen.fault()
     assert len(text) < 300 and text.isprintable() and "\x1b" not in caplog.records[0].message
     assert "bad 2026-01-01 INFO all is well?[2J?xxx" in text
+
+
+def test_what_is_said_is_the_fault_that_there_is(clock: list[float], caplog: pytest.LogCaptureFixture):
+    """One broken image, 20 s of good ones, then hundreds of another size; and the other way round without a calm."""
+    seen = Malformed("frame", "a/b")
+    with caplog.at_level("WARNING", logger="gripmon"):
+        seen.add("damaged JPEG file")
+        for _ in range(20):
+            clock[0] += 1.0
+            seen.good()
+        for _ in range(4):
+            clock[0] += 1.0
+            seen.add("640x480 pixels; 1280x720 as configured")
+    assert seen.fault() == "some malformed frames on a/b: 640x480 pixels; 1280x720 as configured"
+    assert [record.getMessage() for record in caplog.records] == [
+        "malformed frame on a/b: damaged JPEG file (said once)",
+        "malformed frame on a/b: 640x480 pixels; 1280x720 as configured (said once)",
+    ]
+    for _ in range(120):
+        seen.add("damaged JPEG file")
+    assert seen.fault() == "over 100 malformed frames on a/b: damaged JPEG file"
+
+
+def test_reasons_that_a_stranger_makes_up_fill_neither_log_nor_memory(caplog: pytest.LogCaptureFixture):
+    seen = Malformed("frame", "a/b")
+    with caplog.at_level("WARNING", logger="gripmon"):
+        for i in range(5000):
+            seen.add("x" * (i % 190) + f" {i}")
+    assert len(caplog.records) < 20 and seen.count == 5000
+    assert seen.fault().startswith("over 1,000 malformed frames on a/b: x")

@@ -38,8 +38,8 @@ def configured(folder: Path, publish: str, *more: str) -> Path:
 
 
 @contextmanager
-def running(config: Path) -> Iterator[subprocess.Popen[str]]:
-    command = [sys.executable, "-m", "gripmon", "run", str(config)]
+def running(config: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+    command = [sys.executable, "-m", "gripmon", "run", str(config), *options]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     try:
         yield process

@@ -22,7 +22,7 @@ from router_process import ROOT, running
 from sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
-from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient
+from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.publish import ZenohPulses, ZenohSpotPublisher
 from gripmon.records import CommandName, CommandReply
 from gripmon.wire import Link, PublishSettings
@@ -57,19 +57,26 @@ class Site:
 
 
 def own_files(folder: Path, endpoint: str) -> None:
-    """The shipped files with another port, and certificates beside them."""
+    """The shipped files with another port, for the robot "arm", and certificates beside them."""
     for file in (ROOT / "configs" / "zenoh").glob("*.json5"):
-        text = file.read_text()
+        text = file.read_text().replace("arm1", "arm")
         folder.joinpath(file.name).write_text(text.replace("127.0.0.1:7447", endpoint.partition("/")[2]))
-    assert main(["certificates", "--out", str(folder / "certificates")]) == 0
+    assert main(["certificates", "--robot", "arm", "--out", str(folder / "certificates")]) == 0
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
     made = Site(tmp_path_factory.mktemp("site"), free_endpoint())
     own_files(made.folder, made.endpoint)
+    more = ["--robot", "arm2", "--rules", str(made.file("router")), "--out", str(made.folder / "certificates")]
+    assert main(["certificates", *more]) == 0
+    for name in ("monitor", "robot"):
+        text = made.file(name).read_text()
+        made.file(f"{name}-arm2").write_text(text.replace(f"{name}-arm", f"{name}-arm2"))
     with running(made.file("router"), made.endpoint):
-        made.monitor = Published(PublishSettings(zenoh_config="monitor.json5"), relative_to=made.folder)
+        made.monitor = Published(
+            PublishSettings(zenoh_config="monitor.json5"), relative_to=made.folder, identified=True
+        )
         answering = threading.Thread(target=made.answer)
         answering.start()
         try:
@@ -90,7 +97,7 @@ def test_readers_read_everything(site: Site, name: str):
     assert site.monitor is not None
     with Client("arm", "wrist", zenoh_config_file=str(site.file(name))) as client:
         wait_until(lambda: site.monitor.transform(frame_record()) or client.latest(), "a transform")
-        assert client.latest() == frame_record()
+        assert client.latest() == frame_record(monitor_id=site.monitor.monitor_id)
         assert client.state().seq == 3 and client.reference().revision == 4
         assert client.alive() == (("arm", "wrist"),)
 
@@ -289,3 +296,66 @@ def test_a_name_that_no_rule_knows_gets_nothing(site: Site):
         assert not list(visitor.get(f"{PREFIX}/state", timeout=1.0))
         assert not list(visitor.liveliness().get("gripmon/*/*/alive", timeout=1.0))
         assert not stolen
+
+
+def test_a_robots_keys_speak_for_no_other_robot(site: Site):
+    """All that could fool a controller: transforms, alerts, states, who is there, answers, the jaw's opening."""
+    leaves = ("transform", "alert", "state", "reference", "spot", "jaw", "image")
+    read: list[tuple[str, bytes]] = []
+    with (
+        site.session("controller") as controller,
+        site.session("monitor") as own,
+        site.session("monitor-arm2") as stranger,
+        site.session("robot-arm2") as driver,
+    ):
+
+        def take(sample: zenoh.Sample) -> None:
+            read.append((str(sample.key_expr), sample.payload.to_bytes()))
+
+        _reader = [controller.declare_subscriber(f"gripmon/*/*/{leaf}", take) for leaf in leaves[:5]]
+        _inputs = [own.declare_subscriber(f"{PREFIX}/{leaf}", take) for leaf in leaves[5:]]
+        for leaf in leaves:
+            for each in (stranger, driver):
+                each.put(f"{PREFIX}/{leaf}", b"666")
+        _tokens = [stranger.liveliness().declare_token(f"{PREFIX}/alive/{name}") for name in ("a", "b")]
+        _answers = stranger.declare_queryable(f"{PREFIX}/state", lambda query: query.reply(query.key_expr, b"666"))
+        wait_until(
+            lambda: stranger.put("gripmon/arm2/wrist/state", b"1") or ("gripmon/arm2/wrist/state", b"1") in read,
+            "what it may say of its own robot",
+        )
+        assert [key for key, said in read if said == b"666"] == []
+        assert ask(controller, f"{PREFIX}/state")[0]["seq"] == 3
+        alive = controller.liveliness().get("gripmon/arm/*/alive/*", timeout=2.0)
+        tokens = [str(reply.ok.key_expr) for reply in alive]
+        assert tokens == [f"{PREFIX}/alive/{site.monitor.monitor_id}"]
+        assert site.monitor.presence.others() == ()
+
+
+def test_two_monitors_are_seen_through_the_rules(site: Site):
+    second = Published(PublishSettings(zenoh_config="monitor.json5"), relative_to=site.folder, identified=True)
+    try:
+        with TransformClient("arm", "wrist", zenoh_config_file=str(site.file("controller"))) as client:
+            wait_until(lambda: client.latest().why is Unusable.SEVERAL, "the client to see both")
+        wait_until(lambda: second.presence.others() and site.monitor.presence.others(), "each to see the other")
+        assert second.presence.wait_alone(0.0), "also by asking"
+    finally:
+        second.close()
+    wait_until(lambda: not site.monitor.presence.others(), "the first one to be alone again")
+
+
+def test_certificates_that_spoke_for_every_robot_go_on_with_the_lines_that_are_there(tmp_path: Path):
+    endpoint = free_endpoint()
+    own_files(tmp_path, endpoint)
+    assert main(["certificates", "monitor", "robot", "--out", str(tmp_path / "certificates")]) == 0
+    for name in ("monitor", "robot"):
+        text = (tmp_path / f"{name}.json5").read_text()
+        (tmp_path / f"{name}.json5").write_text(text.replace(f"{name}-arm", name))
+    router = tmp_path / "router.json5"
+    router.write_text(re.sub(r"(?m)^( +)// (?=[{ ].*[\[\]\",]$)", r"\1", router.read_text()))
+    with running(router, endpoint):
+        monitor = Published(PublishSettings(zenoh_config="monitor.json5"), "any", relative_to=tmp_path)
+        try:
+            with TransformClient("any", "wrist", zenoh_config_file=str(tmp_path / "controller.json5")) as client:
+                wait_until(lambda: monitor.transform(frame_record()) or client.latest().usable, "a transform")
+        finally:
+            monitor.close()

@@ -81,7 +81,7 @@ def test_what_a_file_does_not_say_is_cautious(tmp_path: Path):
 
 def test_certificates_count_from_their_file_and_are_there(folder: Path, tmp_path: Path):
     config = zenoh_config(PublishSettings(zenoh_config="monitor.json5"), folder)
-    assert said(config, "transport/link/tls/connect_certificate") == str(folder / "certificates" / "monitor.pem")
+    assert said(config, "transport/link/tls/connect_certificate") == str(folder / "certificates" / "monitor-arm1.pem")
     (tmp_path / "monitor.json5").write_bytes((folder / "monitor.json5").read_bytes())
     with pytest.raises(PublishError) as caught:
         zenoh_config(PublishSettings(zenoh_config="monitor.json5"), tmp_path)
@@ -97,7 +97,7 @@ def test_where_certificates_are_made_a_missing_one_can_be(tmp_path: Path):
     assert main(["certificates", "operator", "--out", str(certificates)]) == 0
     for name in ("router", "monitor"):
         (tmp_path / f"{name}.json5").write_bytes((ROOT / "configs" / "zenoh" / f"{name}.json5").read_bytes())
-    with pytest.raises(ZenohFileError, match=f"; gripmon certificates monitor --out {certificates} makes it$"):
+    with pytest.raises(ZenohFileError, match=f"; gripmon certificates monitor-arm1 --out {certificates} makes it$"):
         load_file(tmp_path / "monitor.json5")
     with pytest.raises(ZenohFileError, match=f"certificates router --out {certificates} --host ADDRESS makes it$"):
         load_file(tmp_path / "router.json5")
@@ -107,7 +107,7 @@ def test_a_key_that_others_may_read_is_refused(tmp_path: Path):
     assert main(["certificates", "--out", str(tmp_path / "certificates")]) == 0
     path = tmp_path / "monitor.json5"
     path.write_bytes((ROOT / "configs" / "zenoh" / "monitor.json5").read_bytes())
-    key = tmp_path / "certificates" / "monitor-key.pem"
+    key = tmp_path / "certificates" / "monitor-arm1-key.pem"
     key.chmod(0o640)
     with pytest.raises(PublishError, match=f"others may read {key}; chmod 600 {key}$"):
         zenoh_config(PublishSettings(zenoh_config=str(path)))
@@ -123,19 +123,19 @@ def test_certificates_are_made_once_and_their_keys_are_private(tmp_path: Path, c
     assert [key.name.removesuffix("-key.pem") for key in keys] == [
         "ca",
         "controller",
-        "monitor",
+        "monitor-arm1",
         "operator",
-        "robot",
+        "robot-arm1",
         "router",
     ]
     assert {stat.S_IMODE(key.stat().st_mode) for key in keys} == {0o600}
     before = {file: file.read_bytes() for file in tmp_path.iterdir()}
-    assert main(["certificates", "monitor", "arm7", "--out", str(tmp_path)]) == 0
+    assert main(["certificates", "operator", "arm7", "--out", str(tmp_path)]) == 0
     printed = capsys.readouterr().out
     hosts = "localhost, 127.0.0.1, ::1, 10.0.0.5, site.example"
     assert f"router-key.pem: made, common name router, for a router (and as a client) at {hosts}\n" in printed
-    text = "there already, left alone: common name monitor, for a client only; to change that, delete both files\n"
-    assert f"monitor-key.pem: {text}" in printed
+    text = "there already, left alone: common name operator, for a client only; to change that, delete both files\n"
+    assert f"operator-key.pem: {text}" in printed
     assert "arm7-key.pem: made, common name arm7, for a client only (--host makes it a router's)\n" in printed
     assert {file: file.read_bytes() for file in before} == before
     authority = x509.load_pem_x509_certificate(before[tmp_path / "ca.pem"])
@@ -243,6 +243,42 @@ def test_a_router_says_where_it_listens_and_stops_when_told(tmp_path: Path):
         assert router.process.stderr.readline() == f"router: listening on {endpoint}\n"
         assert router.stop() == (0, "router: stopped\n")
         assert not accepts(endpoint)
+
+
+def test_rules_for_more_robots_are_added_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "router.json5"
+    shipped = (ROOT / "configs" / "zenoh" / "router.json5").read_text()
+    path.write_text(shipped)
+    command = ["certificates", "--robot", "arm2", "--robot", "cell.7", "--rules", str(path), "--out", str(tmp_path)]
+    assert main(command) == 0
+    assert "restart the router" in capsys.readouterr().out
+    with_three = path.read_text()
+    assert set(shipped.splitlines()) < set(with_three.splitlines())
+    for robot in ("arm2", "cell.7"):  # the shipped robot's own lines, with another name
+        for line in shipped.splitlines():
+            if "arm1" in line and not line.lstrip().startswith("//"):
+                assert line.replace("arm1", robot) in with_three
+    assert main(command) == 0 and path.read_text() == with_three
+    assert "already" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said_text"),
+    [
+        (["--rules", "router.json5"], "--rules for whom? add --robot NAME"),
+        (["--robot", "a/b"], "--robot: 'a/b' can't be a robot's name in a certificate; letters, digits, - _ and ."),
+        (["--robot", "a", "--rules", "{folder}/none"], "can't be written (No such file or directory)"),
+        (["--robot", "a", "--rules", "{folder}/other"], "has no line '// robots: rules', before which"),
+    ],
+)
+def test_rules_that_cannot_be_added(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], said_text: str
+):
+    (tmp_path / "other").write_text("{}")
+    given = [option.format(folder=tmp_path) for option in options]
+    assert main(["certificates", *given, "--out", str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert said_text in line and (tmp_path / "other").read_text() == "{}"
 
 
 def test_nothing_unpickles():

@@ -23,10 +23,16 @@ def state(**changes: object) -> StateRecord:
     return msgspec.structs.replace(state_record(), **({"tcp_shift_m": (0.001, 0.0, 0.0), "sigma_m": 2e-5} | changes))
 
 
-def status(robot: str, *, age_s: float = 0.5, gone: bool = False, **changes: object) -> MonitorStatus:
+def status(
+    robot: str, *, age_s: float = 0.5, gone: bool = False, several: bool = False, **changes: object
+) -> MonitorStatus:
     said = None if changes.get("state") == "none" else state(**changes)
     return MonitorStatus(
-        name=MonitorName(robot, "wrist"), state=said, state_age_s=age_s, gone_since_ns=GONE_NS if gone else None
+        name=MonitorName(robot, "wrist"),
+        state=said,
+        state_age_s=age_s,
+        gone_since_ns=GONE_NS if gone else None,
+        several=several,
     )
 
 
@@ -40,6 +46,7 @@ THE_WORST_FIRST = [
     status("gone", gone=True),
     status("stopped", gone=True, message="stopped", state=State.STALE, **UNKNOWN),
     status("hangs", age_s=9.0),
+    status("twice", several=True),
     status("lost-with-error", state=State.LOST, open_alerts=(standing(Severity.ERROR),), **UNKNOWN),
     status("lost", state=State.LOST, **UNKNOWN),
     status("new", state="none", age_s=0.1),
@@ -125,13 +132,13 @@ def test_a_terminal_gets_as_many_as_fit_and_the_count_of_the_rest():
     lines = capture.get().splitlines()
     assert len(lines) <= 12
     shown = [line.split("/")[0] for line in lines if "/wrist" in line]
-    assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 7
-    below = " ".join(line.strip() for line in lines[-2:])
+    assert shown == [s.name.robot for s in THE_WORST_FIRST[: len(shown)]] and len(shown) == 6
+    below = " ".join(line.strip() for line in lines[-3:])
     assert (
-        "15 monitors: 1 gone, 1 stopped, 1 silent, 2 unknown, 1 starting, 2 suspect, 7 valid; no connection to tcp/x;"
-        in below
+        "16 monitors: 1 gone, 1 stopped, 1 silent, 1 several, 2 unknown, 1 starting, 2 suspect, 7 valid; "
+        "no connection to tcp/x;" in below
     )
-    assert "8 more than fit here, none in more trouble" in below
+    assert "10 more than fit here, none in more trouble" in below and fleet_table.LEGEND in below
 
 
 @pytest.mark.parametrize(("width", "has_sigma"), [(80, False), (120, True)])
@@ -147,7 +154,7 @@ def test_a_narrow_terminal_keeps_the_bound_and_the_drift(width: int, has_sigma: 
 
 def test_a_log_gets_aligned_columns_or_one_line():
     lines = fleet_table.plain(THE_WORST_FIRST, "").splitlines()
-    assert len(lines) == 1 + len(THE_WORST_FIRST) + 1
+    assert len(lines) == 1 + len(THE_WORST_FIRST) + 2 and lines.pop() == fleet_table.LEGEND
     start = lines[0].index("verdict")
     assert {line[start:].split()[0] for line in lines[1:-1]} == {"unknown", "suspect", "valid"}
     assert fleet_table.line(status("arm", message="jaw unknown")) == (
@@ -173,8 +180,8 @@ def test_json_has_what_the_table_is_made_from():
     data = msgspec.json.encode([fleet_table.as_data(s) for s in THE_WORST_FIRST])
     told = json.loads(data)
     assert [each["condition"] for each in told] == [s.condition.value for s in THE_WORST_FIRST]
-    assert told[0]["gone_since_ns"] == GONE_NS and told[6]["drift_m"] == pytest.approx(0.005)
-    assert told[6]["state"]["schema"] == "gripmon.state/1" and told[5]["state"] is None
+    assert told[0]["gone_since_ns"] == GONE_NS and told[7]["drift_m"] == pytest.approx(0.005)
+    assert told[7]["state"]["schema"] == "gripmon.state/1" and told[6]["state"] is None
 
 
 ARM = MonitorName("arm", "wrist")

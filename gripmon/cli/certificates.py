@@ -14,21 +14,26 @@ if TYPE_CHECKING:
 
 _DESCRIPTION = """\
 Make a small private certificate authority in a folder, and certificates for those who shall talk to
-each other: the names that the access rules of configs/zenoh/router.json5 know. What is there already
-stays, so that names can be added later. Private keys can be read by their owner alone.
+each other: the names that the access rules of configs/zenoh/router.json5 know. Every robot has two of
+its own, monitor-NAME and robot-NAME (gripper and camera driver), which can't speak for another robot.
+What is there already stays, so that names can be added later. Private keys can be read by their owner
+alone.
 
 The authority's key, ca-key.pem, makes more certificates: keep it away from the robots."""
 
 _EXAMPLES = """\
-  gripmon certificates --out certificates                     router, monitor, controller, operator, robot
+  gripmon certificates --out certificates                     router, controller, operator, robot arm1
   gripmon certificates --out certificates --host 10.0.0.5     the router will be reached at 10.0.0.5
-  gripmon certificates arm1 arm2 --out certificates           more clients
+  gripmon certificates --robot arm2 --robot arm3 --rules router.json5 --out certificates
+                                                              two more robots, in the router's rules, too
+  gripmon certificates dashboard --out certificates           one more client
   gripmon certificates central --host 10.0.0.1 --out certificates       another router; without --host a client
 
 It needs the package cryptography: pip install '.[certificates]' in gripmon's checkout.
 exit codes: 0 done; 2 wrong usage, a folder that can't be written to"""
 
-_CLIENTS = ("monitor", "controller", "operator", "robot")
+_CLIENTS = ("controller", "operator")
+_ROBOT = "arm1"  # the one in the shipped files
 _LOCAL = ("localhost", "127.0.0.1", "::1")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
 _LONGEST_NAME = 50
@@ -40,7 +45,21 @@ def add_parser(commands: Any) -> None:
         commands, "certificates", make, "make keys and certificates for mutual TLS", _DESCRIPTION, _EXAMPLES
     )
     parser.add_argument(
-        "names", metavar="NAME", nargs="*", type=_name, help=f"common names; default: router, {', '.join(_CLIENTS)}"
+        "names",
+        metavar="NAME",
+        nargs="*",
+        type=_name,
+        help=f"common names; default: router, {', '.join(_CLIENTS)} and those of the robots",
+    )
+    parser.add_argument(
+        "--robot",
+        action="append",
+        metavar="ROBOT",
+        default=[],
+        help=f"a robot's name, for its two certificates; several times if need be; default: {_ROBOT}",
+    )
+    parser.add_argument(
+        "--rules", metavar="FILE", help="add the rules for these robots to the router's file (router.json5 or like it)"
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="the folder; made if it is missing")
     parser.add_argument(
@@ -60,11 +79,12 @@ def make(arguments: argparse.Namespace) -> int:
     except ImportError:
         text = "certificates: the package cryptography is missing; pip install '.[certificates]' in gripmon's checkout"
         raise common.CommandFailedError(text, common.EXIT_USAGE) from None
+    if arguments.rules and not arguments.robot:
+        raise common.CommandFailedError("certificates: --rules for whom? add --robot NAME", common.EXIT_USAGE)
+    wanted = _wanted(arguments)
     folder = common.make_directory(Path(arguments.out))
-    if arguments.names:
-        wanted = dict.fromkeys(arguments.names, arguments.host)
-    else:
-        wanted = {"router": [*_LOCAL, *arguments.host], **{name: [] for name in _CLIENTS}}
+    if arguments.rules:
+        _add_rules(Path(arguments.rules), arguments.robot)
     try:
         authority = Authority(folder)
         if authority.is_new:
@@ -81,6 +101,40 @@ def make(arguments: argparse.Namespace) -> int:
     except ValueError as error:
         raise common.CommandFailedError(f"certificates: {error}", common.EXIT_USAGE) from None
     return common.EXIT_DONE
+
+
+def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
+    """The names for which there shall be certificates, each with its hosts."""
+    from gripmon.wire.rules import names_of
+
+    try:
+        robots = [name for robot in arguments.robot for name in names_of(robot)]
+        if arguments.names:
+            return dict.fromkeys(arguments.names, arguments.host) | {name: [] for name in robots}
+        names = (*_CLIENTS, *(robots or names_of(_ROBOT)))
+    except ValueError as error:
+        raise common.CommandFailedError(f"certificates: --robot: {error}", common.EXIT_USAGE) from None
+    return {"router": [*_LOCAL, *arguments.host], **{name: [] for name in names}}
+
+
+def _add_rules(path: Path, robots: list[str]) -> None:
+    """Put rules for the robots into a router's file."""
+    from gripmon.atomic import write_atomically
+    from gripmon.wire.rules import with_robot
+
+    try:
+        before = text = path.read_text(encoding="utf-8")
+        for robot in robots:
+            text = with_robot(text, robot)
+        if text != before:
+            write_atomically(path, text.encode())
+    except OSError as error:
+        raise common.not_writable(path, error, "--rules") from None
+    except ValueError as error:
+        said = "is no text" if isinstance(error, UnicodeDecodeError) else str(error)
+        raise common.CommandFailedError(f"certificates: --rules {path} {said}", common.EXIT_USAGE) from None
+    which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
+    print(f"{path}: {which}{'; restart the router' if text != before else ' already'}")
 
 
 def _in_words(issued: Issued) -> str:

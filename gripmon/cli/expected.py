@@ -78,7 +78,9 @@ def _drift(config: Config, outlook: Outlook) -> dict[str, Any]:
 
 
 def _recalibration(config: Config, outlook: Outlook) -> dict[str, Any]:
-    """Whether the corners that this view shows give a full pose by themselves."""
+    """Whether the corners that this view shows give a full pose by themselves, and how certain one frame's is: what is
+    averaged over frames whose errors last is hardly more certain.
+    """
     from gripmon.monitor import CORNER_COUNTS
     from gripmon.recalibrate import coplanar, refusal
 
@@ -91,6 +93,9 @@ def _recalibration(config: Config, outlook: Outlook) -> dict[str, Any]:
         "coplanar": bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
         "possible": reason is None,
         "reason": reason,
+        "sigma_m": float(max(outlook.sigma[:3])) if outlook.enough else None,
+        "sure_sigma_m": config.settings.monitor.recalibration.sure_sigma_m,
+        "mode": config.settings.monitor.recalibration.mode,
     }
 
 
@@ -145,7 +150,16 @@ def _recalibration_text(values: dict[str, Any]) -> str:
     if not values["possible"]:
         return f"NOT from corners in this view: {values['reason']}; past the limit the reference stays"
     where = "in one plane (4 are needed)" if values["coplanar"] else "(6 are needed)"
-    return f"past the limit from {values['corners']} corners {where}"
+    text = f"past the limit from {values['corners']} corners {where}"
+    sigma_m, sure_m = values["sigma_m"], values["sure_sigma_m"]
+    if values["mode"] == "off" or sigma_m is None:
+        return text
+    if values["mode"] == "confirm":
+        return f"{text}; an operator has to accept it (recalibration.mode)"
+    if sigma_m <= sure_m:
+        return f"{text}; certain to {1e3 * sigma_m:.3f} mm, taken without an operator up to {1e3 * sure_m:g} mm"
+    asked = f"an operator has to accept most, above {1e3 * sure_m:g} mm (monitor.recalibration.sure_sigma_m)"
+    return f"{text}; certain to {1e3 * sigma_m:.3f} mm: {asked}"
 
 
 def _sigmas(values: dict[str, list[float]]) -> str:

@@ -15,12 +15,13 @@ if TYPE_CHECKING:
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
 _SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
-_FRAME_LINES = 5  # of a terminal: title, head, rule, summary, and one that stays free
+_FRAME_LINES = 6  # of a terminal: title, head, rule, summary, legend, and one that stays free
 _STYLES = {
-    "gone": "bold red", "silent": "bold red", "unknown": "red", "starting": "yellow", "suspect": "yellow",
-    "stopped": "dim", "valid": "green"
+    "gone": "bold red", "silent": "bold red", "several": "bold red", "unknown": "red", "starting": "yellow",
+    "suspect": "yellow", "stopped": "dim", "valid": "green"
 }  # fmt: skip
 _MARKS = {"error": "!!", "warning": "!", "info": "i"}
+LEGEND = "open alerts: !! errors, ! warnings, i notes, with their number and the worst one's text"
 
 
 class Row(NamedTuple):
@@ -36,7 +37,7 @@ def row(status: MonitorStatus) -> Row:
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     rate = status.transforms_per_s if status.transforms_per_s is not None or state is None else state.frames_per_s
     cells = (
-        printable(str(status.name)),
+        printable(f"{status.name} {status.monitor_id}" if status.several else str(status.name)),
         _what(status),
         state.verdict.value if state is not None and there else "unknown",
         _number(1e3, status.drift_m, ".3f"),
@@ -63,7 +64,8 @@ def plain(statuses: Sequence[MonitorStatus], fault: str) -> str:
     lines = [COLUMNS, *(row(status).cells for status in statuses)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     table = ["  ".join(c.ljust(width) for c, width in zip(cells, widths, strict=True)).rstrip() for cells in lines]
-    return "\n".join([*table, summary(statuses, fault)])
+    legend = [LEGEND] if any(status.alerts for status in statuses) else []
+    return "\n".join([*table, summary(statuses, fault), *legend])
 
 
 def line(status: MonitorStatus) -> str:
@@ -97,6 +99,8 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
         out.add_row(*(Text(cell) for name, cell in named if name in chosen), style=_STYLES[condition])
     rest = len(statuses) - len(shown)
     out.caption = Text(summary(statuses, fault) + (f"; {rest} more than fit here, none in more trouble" * (rest > 0)))
+    if any(status.alerts for status in shown):
+        out.caption.append(f"\n{LEGEND}")
     out.caption_justify = "left"
     return out
 
@@ -106,6 +110,7 @@ def as_data(status: MonitorStatus) -> dict[str, Any]:
     return {
         "robot": status.name.robot,
         "camera": status.name.camera,
+        "monitor_id": status.monitor_id,
         "condition": status.condition.value,
         "gone_since_ns": status.gone_since_ns,
         "state_age_s": round(status.state_age_s, 3),
@@ -141,7 +146,8 @@ def _what(status: MonitorStatus) -> str:
     if status.gone_since_ns is not None:
         return f"{status.condition} since {clock(status.gone_since_ns)}"
     state = "starting" if status.state is None else printable(status.state.state)
-    return f"silent, was {state}" if status.condition == "silent" else state
+    before = {"silent": "silent, was ", "several": "several, "}
+    return f"{before.get(status.condition, '')}{state}"
 
 
 def _age_s(status: MonitorStatus) -> float:
@@ -149,13 +155,26 @@ def _age_s(status: MonitorStatus) -> float:
 
 
 def _alerts(status: MonitorStatus) -> str:
-    """How many of which severity, and the worst one's text; without one, what the monitor says is wrong."""
+    """What waits for an operator; how many of which severity, and the worst one's text; without one, what the monitor
+    says is wrong.
+    """
+    waits = _waits(status)
     if not status.alerts:
-        return printable(status.state.message) if status.state is not None else ""
+        return waits or (printable(status.state.message) if status.state is not None else "")
     counts = Counter(alert.severity for alert in status.alerts)
     marks = " ".join(f"{_MARKS[severity]}{count}" for severity, count in counts.items())
     worst = status.alerts[0]
-    return f"{marks} {printable(worst.text)}{' (acknowledged)' * worst.acknowledged}"
+    text = f"{marks} {printable(worst.text)}{' (acknowledged)' * worst.acknowledged}"
+    return f"{waits}; {text}" if waits else text
+
+
+def _waits(status: MonitorStatus) -> str:
+    """The command to type where a new reference waits for an operator; empty if none does."""
+    from gripmon.records import accepting
+
+    if status.state is None or not status.state.proposal_id or status.gone_since_ns is not None:
+        return ""
+    return "waits: " + printable(accepting(status.state.proposal_id, *status.name))
 
 
 def _bound(state: StateRecord | None) -> str:

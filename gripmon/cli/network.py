@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
     from gripmon.daemon import JawFeed, Reports
     from gripmon.metrics import MetricsServer
-    from gripmon.publish import Publisher, ZenohCommands
+    from gripmon.publish import Presence, Publisher, ZenohCommands
     from gripmon.sources import Source
     from gripmon.wire import Keys, Link
 
@@ -34,8 +34,10 @@ class Network:
     reports: Reports
 
 
-def open_network(config: Config) -> Network:
-    """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
+def open_network(config: Config, *, take_over: bool = False) -> Network:
+    """Open all of it; ends the command with exit code 2 where it can't be opened as configured, and with 4 where the
+    robot's and camera's name is another monitor's, unless it is to ``take_over``.
+    """
     from gripmon.config import ConfigError, check_network
     from gripmon.daemon import Reports
     from gripmon.publish import NullPublisher
@@ -50,26 +52,43 @@ def open_network(config: Config) -> Network:
         return Network(None, NullPublisher(), jaw, None, Reports())
     with contextlib.ExitStack() as failed:
         failed.callback(link.close)  # a process must not end while its session is being opened
-        network = _on_link(config, link, jaw)
+        network = _on_link(config, link, jaw, alone(link, settings.robot, settings.camera_name, take_over=take_over))
         failed.pop_all()
     return network
 
 
-def _on_link(config: Config, link: Link, jaw: JawFeed | None) -> Network:
+def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
+    """Who this start of the monitor is; ends the command where another monitor has the name and keeps it."""
+    from gripmon.publish import Presence
+    from gripmon.publish.presence import in_words
+    from gripmon.wire import Keys
+
+    presence = Presence(link, Keys(robot, camera))
+    _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
+    others = () if take_over else presence.wait_alone()
+    if others:
+        remedy = "stop it, give this one another name, or start it with --take-over and stop the other one then"
+        raise common.CommandFailedError(f"{in_words(others)}; {remedy}", common.EXIT_TAKEN)
+    return presence
+
+
+def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
     from gripmon.daemon import Reports
     from gripmon.publish import Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
 
     settings = config.settings
-    publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
+    publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
         jaw = _network_jaw(config, link, publisher.keys)
-    commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
     heard = [each for each in (jaw, commands) if isinstance(each, (ZenohJaw, ZenohCommands))]
     ros2 = _ros2_node(config, link)
     _show_listeners(config, link)
     publishers = Publishers(publisher, {} if ros2 is None else {"ROS 2": ros2})
     faults = (link.fault, publishers.fault)
-    reports = Reports(faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard))
+    reports = Reports(
+        faults, lambda: publisher.unsent, lambda: sum(each.malformed for each in heard), others=presence.others
+    )
     return Network(link, publishers, jaw, commands, reports)
 
 

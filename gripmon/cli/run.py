@@ -49,7 +49,8 @@ _EXAMPLES = """\
 Messages are on the Zenoh keys gripmon/<robot>/<camera>/{transform,state,alert,reference}; a second
 camera's on {spot,state,alert}, and it hears pulses on …/pulse.
 exit codes: 0 the source ended, the time was over, or SIGTERM; 2 wrong usage or configuration; 3 no
-usable frame, pulses of which none showed its spot, or an internal error that persisted; 130 Ctrl-C"""
+usable frame, pulses of which none showed its spot, or an internal error that persisted; 4 another
+monitor of this robot and camera is on the network; 130 Ctrl-C"""
 
 
 def add_parser(commands: Any) -> None:
@@ -72,6 +73,12 @@ def add_parser(commands: Any) -> None:
         action="store_true",
         help="start from the configured reference; a kept state is set aside as <file>.replaced-<n>",
     )
+    parser.add_argument(
+        "--take-over",
+        action="store_true",
+        help="start also where another monitor of this robot and camera is on the network; nothing is usable until "
+        "one of the two is stopped",
+    )
     viewing.add_option(parser)
     parser.add_argument("--verbose", action="store_true", help="say more on stderr")
 
@@ -85,7 +92,12 @@ def run(arguments: argparse.Namespace) -> int:
             raise common.CommandFailedError(text, common.EXIT_USAGE)
         out = None if arguments.out is None else common.make_directory(Path(arguments.out))
         return second_run.run_second(
-            second, out=out, duration_s=arguments.duration, verbose=arguments.verbose, view=arguments.view
+            second,
+            out=out,
+            duration_s=arguments.duration,
+            verbose=arguments.verbose,
+            view=arguments.view,
+            take_over=arguments.take_over,
         )
     config = common.load(arguments.config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
@@ -98,6 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         keep_state=True,
         fresh_state=arguments.fresh_state,
         view=arguments.view,
+        take_over=arguments.take_over,
     )
 
 
@@ -114,6 +127,7 @@ def run_daemon(
     keep_state: bool = False,
     fresh_state: bool = False,
     view: str | None = None,
+    take_over: bool = False,
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
@@ -121,7 +135,7 @@ def run_daemon(
     goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
     ``warns``: it is logged when the view can't keep the alert limits.  ``keep_state``: what survives a restart is read
     from the configuration's state file, unless ``fresh_state``, and kept there.  ``view`` is one of
-    :data:`gripmon.cli.viewing.KINDS`.
+    :data:`gripmon.cli.viewing.KINDS`; ``take_over``: see :func:`gripmon.cli.network.open_network`.
     """
     import cv2
 
@@ -151,7 +165,7 @@ def run_daemon(
         )  # fmt: skip
         if monitor.look_refused is not None:
             _log.warning("%s", monitor.look_refused)
-        network = open_network(config)
+        network = open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)

@@ -51,7 +51,13 @@ def with_pulses(config: SecondConfig) -> SecondConfig:
 
 
 def run_second(
-    config: SecondConfig, *, out: Path | None, duration_s: float | None, verbose: bool, view: str | None = None
+    config: SecondConfig,
+    *,
+    out: Path | None,
+    duration_s: float | None,
+    verbose: bool,
+    view: str | None = None,
+    take_over: bool = False,
 ) -> int:
     """Open everything that the configuration names and run the daemon on it; returns the exit code."""
     import cv2
@@ -68,7 +74,7 @@ def run_second(
     live = None if view is None else LiveView(settings.view, view, str(config.path))
     with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()
-        network = _open_network(config)
+        network = _open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
         publisher = _with_metrics(config, network.publisher)
         opened.callback(publisher.close)
@@ -97,8 +103,8 @@ def run_second(
         )
 
 
-def _open_network(config: SecondConfig) -> _Network:
-    """Open all of it; ends the command with exit code 2 where it can't be opened as configured."""
+def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
+    """Open all of it; ends the command as :func:`gripmon.cli.network.open_network` does."""
     from gripmon.config import ConfigError, check_second_network
     from gripmon.daemon import Reports
     from gripmon.publish import NullPublisher
@@ -115,23 +121,29 @@ def _open_network(config: SecondConfig) -> _Network:
         raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
     with contextlib.ExitStack() as failed:
         failed.callback(link.close)  # a process must not end while its session is being opened
-        network = _on_link(config, link)
+        network = _on_link(config, link, take_over=take_over)
         failed.pop_all()
     return network
 
 
-def _on_link(config: SecondConfig, link: Link) -> _Network:
+def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
+    from gripmon.cli.network import alone
     from gripmon.daemon import Reports
     from gripmon.publish import ZenohCommands, ZenohPulses, ZenohSpotPublisher
 
     settings = config.settings
-    publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name)
+    presence = alone(link, settings.robot, settings.camera_name, take_over=take_over)
+    publisher = ZenohSpotPublisher(link, settings.robot, settings.camera_name, presence)
     pulses = ZenohPulses(link, publisher.keys["pulse"]) if settings.laser.pulses is None else None
-    commands = ZenohCommands(link, publisher.keys) if settings.publish.commands else None
+    commands = ZenohCommands(link, publisher.keys, presence) if settings.publish.commands else None
     heard = [each for each in (pulses, commands) if each is not None]
     faults = [link.fault] if pulses is None else [link.fault, pulses.fault]
     return _Network(
-        link, publisher, pulses, commands, Reports(faults, malformed=lambda: sum(h.malformed for h in heard))
+        link,
+        publisher,
+        pulses,
+        commands,
+        Reports(faults, malformed=lambda: sum(h.malformed for h in heard), others=presence.others),
     )
 
 

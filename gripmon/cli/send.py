@@ -54,6 +54,9 @@ def add_parser(commands: Any) -> None:
     )
     parser.add_argument("--robot", required=True, metavar="NAME", help="the robot's name in the configuration")
     parser.add_argument("--camera", metavar="NAME", help="the camera's name; needed if the robot has several")
+    parser.add_argument(
+        "--monitor", metavar="ID", default="", help="which one, where two monitors have one name: its id, as printed"
+    )
     joining.add_options(parser, "the monitor's")
     parser.add_argument(
         "--timeout", type=common.positive_number, default=5.0, metavar="S", help="how long to wait (s); default: 5"
@@ -103,7 +106,7 @@ def _misuse(arguments: argparse.Namespace) -> str:
 
 def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
-    from gripmon.client import Client, NotCarriedOut
+    from gripmon.client import Ambiguous, Client, NotCarriedOut
     from gripmon.records import CommandFault, CommandName
     from gripmon.wire import PublishError
 
@@ -121,13 +124,17 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     with client:
         try:
             if arguments.out is not None:
-                return client.snapshot(arguments.timeout)
+                return client.snapshot(arguments.timeout, monitor_id=arguments.monitor)
             name = CommandName(arguments.name)
-            return client.send(name, arguments.id, arguments.timeout, request_id=arguments.request), None
+            reply = client.send(
+                name, arguments.id, arguments.timeout, request_id=arguments.request, monitor_id=arguments.monitor
+            )
+            return reply, None
         except ValueError as error:
             raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
-        except LookupError as error:
-            raise common.CommandFailedError(f"send: {error.args[0]} (--camera)", common.EXIT_USAGE) from None
+        except Ambiguous as error:
+            option = {"camera": "--camera", "monitor_id": "--monitor ID"}[error.argument]
+            raise common.CommandFailedError(f"send: {error} ({option})", common.EXIT_USAGE) from None
         except NotCarriedOut as error:
             again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
             raise common.CommandFailedError(f"send: {printable(str(error))}{again}", common.EXIT_FAILED) from None

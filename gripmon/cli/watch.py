@@ -21,6 +21,10 @@ A live table of all monitors on the network, the worst first: those that are gon
 transform, then the suspect ones, then by the severest open alert and by drift. A monitor that
 vanished stays listed.
 
+The last column begins with the command to type where a new reference waits for an operator, then has
+the open alerts: !! is for errors, ! for warnings, i for notes, each with their number, so that
+"!!1 !1" is one error and one warning; after them the text of the worst one.
+
 On a terminal the table is drawn anew with every period. Elsewhere one line is printed whenever a
 monitor's state, verdict, reference or alerts change; with --json one line of JSON with every period.
 
@@ -201,9 +205,10 @@ class _Changes:
             state = status.state
             what = (
                 status.condition,
-                state and (state.state, state.verdict, state.revision, state.message),
+                state and (state.state, state.verdict, state.revision, state.message, state.proposal_id),
                 tuple((alert.alert_id, alert.severity, alert.acknowledged) for alert in status.alerts),
             )
-            if self._said.get(status.name) != what:
-                self._said[status.name] = what
+            who = (status.name, status.monitor_id if status.several else "")
+            if self._said.get(who) != what:
+                self._said[who] = what
                 print(f"{fleet_table.clock(time.time_ns())}  {fleet_table.line(status)}", flush=True)

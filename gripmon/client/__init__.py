@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from gripmon.client.fleet import Fleet
 from gripmon.client.names import MonitorName
-from gripmon.client.reader import Client, NotCarriedOut
+from gripmon.client.reader import Ambiguous, Client, NotCarriedOut
 from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
 from gripmon.client.status import Condition, MonitorStatus, trouble
 from gripmon.client.transforms import TransformClient
 
 __all__ = [
+    "Ambiguous",
     "Client",
     "Condition",
     "Fleet",

@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from gripmon.client.names import MonitorName, monitor_name
+from gripmon.client.names import MonitorName, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.status import MonitorStatus
 from gripmon.records import AlertRecord, MessageRefused, StateRecord, from_json
@@ -30,9 +30,18 @@ _RATE_OVER = 64
 _ALERTS_REMEMBERED = 64  # of each monitor: twice what its publisher repeats to whoever comes late
 
 
+_MOST_STARTS = 16  # of one name: two are too many already
+
+_Said = tuple[StateRecord | None, float]
+"""The last state message, and when it was heard by the monotonic clock, s."""
+
+
 @dataclass(slots=True)
 class _Known:
-    """What is known of one monitor; times by the monotonic clock unless they end with ``_ns``."""
+    """What is known of one monitor; times by the monotonic clock unless they end with ``_ns``.
+
+    ``starts``: by the id of each that is there, what it said; more than one are several monitors of one name.
+    """
 
     heard_s: float
     present: bool = False
@@ -40,6 +49,7 @@ class _Known:
     state: StateRecord | None = None
     unreadable: str = ""
     transforms_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_OVER))
+    starts: dict[str, _Said] = field(default_factory=dict)
     alerts: deque[int] = field(default_factory=lambda: deque(maxlen=_ALERTS_REMEMBERED))
 
 
@@ -82,10 +92,10 @@ class Fleet:
         self.close()
 
     def monitors(self) -> list[MonitorStatus]:
-        """Everyone seen since the start, in no order."""
+        """Everyone seen since the start, in no order; of several that have one name each that is there."""
         now_s = time.monotonic()
         with self._lock:
-            return [_status(name, known, now_s) for name, known in self._known.items()]
+            return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
 
     def fault(self) -> str:
         """Why there is no session, in a few words; empty if there is one."""
@@ -104,6 +114,7 @@ class Fleet:
         self._declared = [
             session.declare_subscriber(keys["state"], callback(self._take_state)),
             tokens.declare_subscriber(keys["alive"], callback(self._take_token), history=True),
+            tokens.declare_subscriber(keys["alive/*"], callback(self._take_start), history=True),
         ]
         if self._transforms:
             self._declared.append(session.declare_subscriber(keys["transform"], callback(self._take_transform)))
@@ -125,6 +136,22 @@ class Fleet:
             known = self._about(name)
             if known is not None:
                 known.state, known.heard_s = record, time.monotonic()
+                if record.monitor_id in known.starts:
+                    known.starts[record.monitor_id] = record, known.heard_s
+
+    def _take_start(self, token: zenoh.Sample) -> None:
+        start, now_s = start_of(token.key_expr), time.monotonic()
+        with self._lock:
+            known = self._about(start.monitor)
+            if known is None:
+                return
+            if token.kind == zenoh.SampleKind.DELETE:
+                known.starts.pop(start.monitor_id, None)
+                if known.starts:  # what is left of several is not what the other one said
+                    known.state, known.heard_s = next(reversed(known.starts.values()))
+            elif len(known.starts) < _MOST_STARTS:
+                state = known.state if known.state and known.state.monitor_id == start.monitor_id else None
+                known.starts.setdefault(start.monitor_id, (state, now_s))
 
     def _take_token(self, token: zenoh.Sample) -> None:
         name, now_s = monitor_name(token.key_expr), time.monotonic()
@@ -185,6 +212,15 @@ class Fleet:
         return known
 
 
+def _statuses(name: MonitorName, known: _Known, now_s: float) -> list[MonitorStatus]:
+    if len(known.starts) < 2 or not known.present:
+        return [_status(name, known, now_s)]
+    return [
+        MonitorStatus(name=name, state=state, state_age_s=now_s - heard_s, monitor_id=monitor_id, several=True)
+        for monitor_id, (state, heard_s) in known.starts.items()
+    ]
+
+
 def _status(name: MonitorName, known: _Known, now_s: float) -> MonitorStatus:
     times_s = known.transforms_s
     rate = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 and times_s[-1] > times_s[0] else None
@@ -195,4 +231,5 @@ def _status(name: MonitorName, known: _Known, now_s: float) -> MonitorStatus:
         gone_since_ns=known.gone_since_ns,
         transforms_per_s=rate,
         transform_age_s=now_s - times_s[-1] if times_s else None,
+        monitor_id=known.state.monitor_id if known.state is not None else next(iter(known.starts), ""),
     )

@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
 from gripmon.client.message import transform_message
-from gripmon.client.names import MonitorName
+from gripmon.client.names import MonitorName, Start
 from gripmon.records import ClockReading, FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
@@ -21,6 +21,8 @@ MOST_PRESENT = 16
 HELD_BACK_S = 1.0
 """So long a transform of which it isn't known how old it is waits for that, before those who wait for one are told.
 The monitor is asked meanwhile; an answer takes milliseconds."""
+SENDS_S = 1.0
+"""Who sent a transform within that time is there, also where a router's rules let no token of its start through."""
 
 
 class Entry(NamedTuple):
@@ -31,13 +33,18 @@ class Entry(NamedTuple):
     arrival_s: float
     sent: Sent | None = None
 
+    @property
+    def start(self) -> Start:
+        return Start(self.monitor, self.record.monitor_id)
+
 
 class Heard(NamedTuple):
     """What readings are made from; replaced as a whole, so that who reads it needs no lock.
 
     ``present``: the monitors that are there, by their tokens or because they send; ``cut``: the sender of ``entry``
     vanished since; ``unreadable``: what was wrong with the last message, if it could not be read; ``leads``: what is
-    known of the monitors' clocks.
+    known of the monitors' clocks.  ``starts``: by their tokens, which processes these monitors are; ``senders``: when
+    each that sends was heard last; ``elsewhere``: other monitors on the network, where somebody has looked for them.
     """
 
     entry: Entry | None = None
@@ -46,6 +53,9 @@ class Heard(NamedTuple):
     unreadable: str = ""
     closed: bool = False
     leads: Leads = NO_LEADS
+    starts: frozenset[Start] = frozenset()
+    senders: tuple[tuple[Start, float], ...] = ()
+    elsewhere: frozenset[MonitorName] = frozenset()
 
 
 class Waiter(Protocol):
@@ -75,7 +85,14 @@ class Inbox:
             return
         with self._lock:
             leads = self.heard.leads if sent is None else without_contradicted(self.heard.leads, sent)
-            self._set(entry=entry, present=self._present_with(monitor), cut=False, unreadable="", leads=leads)
+            self._set(
+                entry=entry,
+                present=self._present_with(monitor),
+                cut=False,
+                unreadable="",
+                leads=leads,
+                senders=_with_sender(self.heard.senders, entry),
+            )
             self._hand_over(entry)
 
     def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
@@ -103,8 +120,31 @@ class Inbox:
         with self._lock:
             entry = self.heard.entry
             cut = self.heard.cut or (entry is not None and entry.monitor == monitor)
-            self._set(present=self.heard.present - {monitor}, cut=cut)
+            senders = tuple(sender for sender in self.heard.senders if sender[0].monitor != monitor)
+            self._set(present=self.heard.present - {monitor}, cut=cut, senders=senders)
             self._wake()
+
+    def started(self, start: Start) -> None:
+        """The token of this start is there."""
+        with self._lock:
+            if len(self.heard.starts) < MOST_PRESENT:
+                self._set(starts=self.heard.starts | {start})
+            self._wake()
+
+    def ended(self, start: Start) -> None:
+        """It is gone; another process may speak under the same name."""
+        with self._lock:
+            entry = self.heard.entry
+            cut = self.heard.cut or (entry is not None and entry.start == start)
+            senders = tuple(sender for sender in self.heard.senders if sender[0] != start)
+            self._set(starts=self.heard.starts - {start}, cut=cut, senders=senders)
+            self._wake()
+
+    def found(self, monitor: MonitorName) -> None:
+        """It is on the network, whether it is the one that is meant or not."""
+        with self._lock:
+            if len(self.heard.elsewhere) < MOST_PRESENT:
+                self._set(elsewhere=self.heard.elsewhere | {monitor})
 
     def close(self) -> None:
         """No more will come."""
@@ -145,15 +185,27 @@ class Inbox:
     def _set(self, **changes: object) -> None:
         before = self.heard
         self.heard = before._replace(**changes)  # type: ignore[arg-type]
-        if len(self.heard.present) > 1 >= len(before.present):
-            _log.error("%s", several(self.heard.present))
+        if len(self.heard.present) > 1 >= len(before.present) or len(self.heard.starts) > 1 >= len(before.starts):
+            _log.error("%s", several(self.heard, 0.0))
 
     def _wake(self) -> None:
         for waiter in self._waiters:
             waiter.wake()
 
 
-def several(present: frozenset[MonitorName]) -> str:
-    """What to tell somebody who has not named the camera."""
-    names = ", ".join(map(str, sorted(present)))
-    return f"more than one monitor is there: {names}; name the camera"
+def several(heard: Heard, now_s: float) -> str:
+    """What to say where more than one monitor is there at ``now_s``; empty if there is one at most."""
+    if len(heard.present) > 1:  # the camera isn't named
+        names = ", ".join(map(str, sorted(heard.present)))
+        return f"more than one monitor is there: {names}; name the camera"
+    starts = heard.starts.union(start for start, sent_s in heard.senders if now_s - sent_s < SENDS_S)
+    if len(starts) < 2:
+        return ""
+    return f"more than one monitor has the same name: {', '.join(map(str, sorted(starts)))}; stop all but one"
+
+
+def _with_sender(senders: tuple[tuple[Start, float], ...], entry: Entry) -> tuple[tuple[Start, float], ...]:
+    """With who sent just now, and without those that are silent."""
+    start, now_s = entry.start, entry.arrival_s
+    others = tuple(sender for sender in senders if sender[0] != start and now_s - sender[1] < SENDS_S)
+    return (*others[1 - MOST_PRESENT :], (start, now_s))

@@ -25,12 +25,12 @@ def judge(
     ``heard`` says who is there; ``fault`` is asked only where there is no entry: whom there is no connection to.
     """
     if entry is None:
-        why, reason = _cut_off(heard, None) or _silence(heard, fault)
+        why, reason = _cut_off(heard, None, now_s) or _silence(heard, fault)
         return Reading(monitor=None, verdict=Verdict.UNKNOWN, usable=False, why=why, reason=reason, age_s=math.inf)
     record = entry.record
     age_s = _age_s(heard, entry, policy, now_s, wall_ns)
     lost = (
-        _cut_off(heard, entry)
+        _cut_off(heard, entry, now_s)
         or _unknown(record)
         or _from_the_future(record, policy, wall_ns)
         or _of_unknown_age(entry, age_s)
@@ -54,6 +54,7 @@ def judge(
         seq=record.seq,
         reference_id=record.reference_id,
         revision=record.revision,
+        monitor_id=record.monitor_id,
     )
 
 
@@ -66,17 +67,24 @@ def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: in
     return math.inf if on_its_way_s is None else age_s + on_its_way_s
 
 
-def _cut_off(heard: Heard, entry: Entry | None) -> _Refusal | None:
+def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None:
     """Is it unclear whether the monitor, and which one, still stands by what it said?"""
     if heard.closed:
         return Unusable.CLOSED, "the client is closed"
-    if len(heard.present) > 1:
-        return Unusable.SEVERAL, several(heard.present)
+    if text := several(heard, now_s):
+        return Unusable.SEVERAL, text
     if entry is None or not heard.cut:
         return None
-    if entry.monitor in heard.present:
+    if _is_back(heard, entry):
         return Unusable.RESTARTED, "the monitor was gone and is back, but has sent no transform yet"
     return Unusable.GONE, "the monitor is gone"
+
+
+def _is_back(heard: Heard, entry: Entry) -> bool:
+    """Is the monitor that vanished there again?  Of its two tokens either may be the last to go."""
+    if entry.monitor not in heard.present:
+        return False
+    return not entry.record.monitor_id or any(start.monitor == entry.monitor for start in heard.starts)
 
 
 def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
@@ -84,7 +92,10 @@ def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
         return Unusable.UNREADABLE, f"no transform came that can be read: {heard.unreadable}"
     if text := fault():
         return Unusable.NOT_CONNECTED, text
-    return Unusable.NOTHING_YET, f"no transform came yet{'' if heard.present else ', and no monitor is seen'}"
+    if heard.present:
+        return Unusable.NOTHING_YET, "no transform came yet"
+    others = f"; there are {', '.join(map(str, sorted(heard.elsewhere)))}" if heard.elsewhere else ""
+    return Unusable.NOTHING_YET, f"no transform came yet, and no monitor of this name is seen{others}"
 
 
 def _unknown(record: FrameRecord) -> _Refusal | None:

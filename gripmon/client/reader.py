@@ -11,7 +11,7 @@ from typing import Self, TypeVar
 import msgspec
 import zenoh
 
-from gripmon.client.names import MonitorName, monitor_name
+from gripmon.client.names import MonitorName, Start, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.records import (
     CommandError,
@@ -41,6 +41,14 @@ class NotCarriedOut(Exception):
     def __init__(self, text: str, fault: CommandFault | None = None, request_id: str = "") -> None:
         super().__init__(text)
         self.fault, self.request_id = fault, request_id
+
+
+class Ambiguous(LookupError):
+    """More than one monitor could be meant; ``argument`` is the one that would say which."""
+
+    def __init__(self, text: str, argument: str) -> None:
+        super().__init__(text)
+        self.argument = argument
 
 
 class Client:
@@ -126,21 +134,28 @@ class Client:
         return tuple(sorted({monitor_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
 
     def send(
-        self, name: CommandName, argument: str = "", timeout_s: float = 5.0, *, request_id: str | None = None
+        self,
+        name: CommandName,
+        argument: str = "",
+        timeout_s: float = 5.0,
+        *,
+        request_id: str | None = None,
+        monitor_id: str = "",
     ) -> CommandReply:
         """Tell the monitor something (:class:`gripmon.records.Command`) and wait for its answer.
 
         A refused command has changed nothing.  ``request_id`` (64 characters at most; by default a new one) is that of
         an earlier attempt: if it was carried out then, its answer comes again.  Raises :class:`NotCarriedOut`;
-        LookupError if the name is that of more than one monitor; ValueError for a request that can't be one.
+        :class:`Ambiguous` if the name is that of more than one monitor; ValueError for a request that can't be one.
+        ``monitor_id`` names the start of the monitor that is meant; without it there must be one.
         """
-        return self._ask(name, argument, timeout_s, request_id)[0]
+        return self._ask(CommandRequest(argument, _or_new(request_id), monitor_id), name, timeout_s)[0]
 
-    def snapshot(self, timeout_s: float = 5.0) -> tuple[CommandReply, bytes | None]:
+    def snapshot(self, timeout_s: float = 5.0, *, monitor_id: str = "") -> tuple[CommandReply, bytes | None]:
         """The monitor's state and newest frame, and a file of its image, as ``reply.snapshot.image`` says; None if it
         has none.  Raises as :meth:`send`.
         """
-        return self._ask(CommandName.SNAPSHOT, "", timeout_s, None)
+        return self._ask(CommandRequest("", _or_new(None), monitor_id), CommandName.SNAPSHOT, timeout_s)
 
     def close(self) -> None:
         """Leave the network; iterations and callbacks end.
@@ -171,18 +186,22 @@ class Client:
                 answer = from_json(reply.ok.payload.to_bytes(), record_type)
         return answer
 
-    def _ask(
-        self, name: CommandName, argument: str, timeout_s: float, request_id: str | None
-    ) -> tuple[CommandReply, bytes | None]:
+    def _ask(self, request: CommandRequest, name: CommandName, timeout_s: float) -> tuple[CommandReply, bytes | None]:
         """The answer of the one monitor that is meant, and what is attached to it."""
+        from_json(to_json(request), CommandRequest)  # what the monitor would refuse
         monitor = self._only_one(timeout_s)
-        request = CommandRequest(argument, uuid.uuid4().hex if request_id is None else request_id)
-        payload = to_json(request)
-        from_json(payload, CommandRequest)  # what the monitor would refuse
+        start = self._only_start(monitor, request.monitor_id)
+        # From now on this start alone is meant, also where another one appears.
+        payload = to_json(msgspec.structs.replace(request, monitor_id=start.monitor_id))
+        another: zenoh.Reply | None = None
         for reply in self._session.get(
             Keys(*monitor)[f"cmd/{name.value}"], payload=payload, timeout=timeout_s, target=zenoh.QueryTarget.ALL
         ):
-            return _answer(reply, monitor, request.id)
+            if not _is_of_another(reply):
+                return _answer(reply, monitor, request.id)
+            another = reply
+        if another is not None:
+            return _answer(another, monitor, request.id)
         # A router's access rules drop without a word what they don't allow.
         raise NotCarriedOut(
             f"{monitor} doesn't answer; it may be told not to take commands (publish.commands), or the router's rules "
@@ -200,10 +219,25 @@ class Client:
             time.sleep(0.02)
         if len(alive) > 1:
             names = ", ".join(map(str, alive))
-            raise LookupError(
-                f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {names}; name the camera"
+            raise Ambiguous(
+                f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {names}; name the camera", "camera"
             )
         return alive[0]
+
+    def _only_start(self, monitor: MonitorName, monitor_id: str) -> Start:
+        """The one start of it that is meant; one without an id where none shows any."""
+        replies = self._session.liveliness().get(Keys(*monitor)["alive/*"], timeout=1.0)
+        starts = sorted({start_of(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+        names = ", ".join(start.monitor_id for start in starts)
+        if monitor_id:
+            if starts and Start(monitor, monitor_id) not in starts:
+                raise NotCarriedOut(f"{monitor} is not {monitor_id}, but {names}")
+            return Start(monitor, monitor_id)
+        if len(starts) > 1:
+            raise Ambiguous(
+                f"{len(starts)} monitors are {monitor}: {names}; stop all but one, or name one", "monitor_id"
+            )
+        return starts[0] if starts else Start(monitor, "")
 
     def _in_its_place(self) -> str:
         """Who is there instead of the monitor that is meant."""
@@ -221,6 +255,20 @@ class Client:
             raise LookupError(
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
+
+
+def _or_new(request_id: str | None) -> str:
+    return uuid.uuid4().hex if request_id is None else request_id
+
+
+def _is_of_another(reply: zenoh.Reply) -> bool:
+    """Is it a monitor's word that it isn't the one that is meant?"""
+    if reply.err is None or reply.err.encoding != zenoh.Encoding.APPLICATION_JSON:
+        return False
+    try:
+        return from_json(reply.err.payload.to_bytes(), CommandError).error is CommandFault.ANOTHER
+    except MessageRefused:
+        return False
 
 
 def _answer(reply: zenoh.Reply, who: MonitorName, request_id: str) -> tuple[CommandReply, bytes | None]:

@@ -80,7 +80,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     the time since the monitor was handed the frame: what it needed for it, how long the message was on its way at most
     (:mod:`gripmon.client.age`), and the time since it arrived; the way of the image into the monitor is not in it.
     Infinite if no transform came yet, or nothing tells how long it was on its way.  ``stamp_ns`` is the capture time by
-    the monitor's clock.
+    the monitor's clock, ``monitor_id`` the start of the monitor that it is from.
     """
 
     monitor: MonitorName | None
@@ -99,9 +99,12 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
     seq: int = -1
     reference_id: str = ""
     revision: int = -1
+    monitor_id: str = ""
 
     def same_revision_as(self, other: Reading) -> bool:
-        """Do both rest on the same reference?  Only then may one be subtracted from the other.  False without one."""
+        """Do both rest on the same reference of one start of the monitor?  Only then may one be subtracted from the
+        other.  False without one.
+        """
         return self.revision >= 0 and self._rests_on() == other._rests_on()
 
     def sigma_m(self) -> float:
@@ -128,8 +131,8 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         matrix[:3, 3] = pose.translation_m
         return matrix
 
-    def _rests_on(self) -> tuple[MonitorName | None, str, int]:
-        return self.monitor, self.reference_id, self.revision
+    def _rests_on(self) -> tuple[MonitorName | None, str, str, int]:
+        return self.monitor, self.monitor_id, self.reference_id, self.revision
 
 
 def largest_sigma_m(covariance: tuple[float, ...] | None) -> float:

@@ -22,6 +22,7 @@ class Condition(enum.StrEnum):
     GONE = "gone"
     STOPPED = "stopped"
     SILENT = "silent"
+    SEVERAL = "several"
     UNKNOWN = "unknown"
     STARTING = "starting"
     SUSPECT = "suspect"
@@ -36,8 +37,10 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
 
     ``state`` is its last state message, None before the first; ``state_age_s`` the time since that arrived, or since
     the monitor was first seen.  ``gone_since_ns``: when its liveliness token vanished, by our clock; None while it is
-    there.  ``transforms_per_s`` and ``transform_age_s`` (since the last one arrived, however long it was on
-    its way: to move by it ask a TransformClient) are None unless transforms are listened to and came.
+    there.  ``monitor_id`` is that of its start, empty before it is known; ``several``: another start of the same
+    name is there, too, so that neither may be used.  ``transforms_per_s`` and ``transform_age_s`` (since the last one
+    arrived, however long it was on its way: to move by it ask a TransformClient) are None unless transforms are
+    listened to and came.
     """
 
     name: MonitorName
@@ -46,6 +49,8 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
     gone_since_ns: int | None = None
     transforms_per_s: float | None = None
     transform_age_s: float | None = None
+    monitor_id: str = ""
+    several: bool = False
 
     @property
     def condition(self) -> Condition:
@@ -56,6 +61,8 @@ class MonitorStatus(msgspec.Struct, frozen=True, kw_only=True):
             return Condition.STOPPED if said_so else Condition.GONE
         if self.state_age_s > SILENT_AFTER_S:
             return Condition.SILENT
+        if self.several:
+            return Condition.SEVERAL
         if self.state is None:
             return Condition.STARTING
         return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -14,11 +15,13 @@ from gripmon.client.asking import ClockAsker
 from gripmon.client.inbox import Entry, Inbox
 from gripmon.client.iterators import AsyncReadings, Readings
 from gripmon.client.judging import judge
-from gripmon.client.names import monitor_name
+from gripmon.client.names import monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
 from gripmon.records import ClockReading, MessageRefused, from_json
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
+
+_LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds
 
 
 class TransformClient:
@@ -56,6 +59,7 @@ class TransformClient:
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what nobody refers to
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
+        self._session: zenoh.Session | None = None
         self._link.attach(self._declare)
 
     def __enter__(self) -> Self:
@@ -134,6 +138,17 @@ class TransformClient:
         """The reading of a message, as of now."""
         return judge(self._inbox.heard, entry, self.policy, time.monotonic(), time.time_ns(), self._fault)
 
+    def look_around(self) -> None:
+        """Ask, without waiting, which monitors are on the network; what was heard then stands in the ``reason``."""
+        found = zenoh.handlers.Callback(self._find, indirect=False)
+        if self._session is not None:
+            with contextlib.suppress(zenoh.ZError):  # another thread closes it just now
+                self._session.liveliness().get(Keys("*", "*")["alive"], found, timeout=_LOOK_WITHIN_S)
+
+    def _find(self, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._inbox.found(monitor_name(reply.ok.key_expr))
+
     def _fault(self) -> str:
         try:
             return self._link.fault()
@@ -141,13 +156,16 @@ class TransformClient:
             return "the client is being closed"
 
     def _declare(self, session: zenoh.Session) -> None:
+        self._session = session
         # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
         transforms = zenoh.handlers.Callback(self._receive, indirect=False)
         tokens = zenoh.handlers.Callback(self._see, indirect=False)
         self._asker.use(session)
+        starts = zenoh.handlers.Callback(self._see_start, indirect=False)
         self._declared = (
             session.declare_subscriber(self.keys["transform"], transforms),
             session.liveliness().declare_subscriber(self.keys["alive"], tokens, history=True),
+            session.liveliness().declare_subscriber(self.keys["alive/*"], starts, history=True),
         )
 
     def _receive(self, sample: zenoh.Sample) -> None:
@@ -159,11 +177,14 @@ class TransformClient:
                 self._asker.ask(known=self._inbox.age_known)
 
     def _see(self, token: zenoh.Sample) -> None:
+        seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
+        seen(monitor_name(token.key_expr))
         if token.kind == zenoh.SampleKind.PUT:
-            self._inbox.appeared(monitor_name(token.key_expr))
             self._asker.ask(known=False)  # so that its first transform is usable
-        else:
-            self._inbox.vanished(monitor_name(token.key_expr))
+
+    def _see_start(self, token: zenoh.Sample) -> None:
+        seen = self._inbox.started if token.kind == zenoh.SampleKind.PUT else self._inbox.ended
+        seen(start_of(token.key_expr))
 
 
 def _sent(sample: zenoh.Sample, arrived_ns: int) -> Sent | None:

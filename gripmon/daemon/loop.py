@@ -24,6 +24,7 @@ from gripmon.records import (
     FrameRecord,
     MonitorState,
     unmeasured_record,
+    withheld,
 )
 from gripmon.sources import Source
 
@@ -86,7 +87,8 @@ class Daemon(Loop):
         self._seq = frame.seq
         frame, record, failure = self._judge(frame)
         record = msgspec.structs.replace(record, latency_ns=time.monotonic_ns() - arrived_ns)
-        self._deliver("transform", self._publisher.transform, record)
+        several = self._not_alone()
+        self._deliver("transform", self._publisher.transform, withheld(record, several) if several else record)
         self._newest = Newest(frame, record, time.monotonic())
         # The rest is less urgent.
         self._deliver("state's keeping", self._keep_changes)
@@ -151,6 +153,7 @@ class Daemon(Loop):
     def _monitor_state(self) -> MonitorState:
         state = self._monitor.state()
         self._open_alerts = state.alerts
+        self._proposal_id = "" if state.proposal is None else state.proposal.reference_id
         return state
 
     def _make_reference_known(self) -> None:

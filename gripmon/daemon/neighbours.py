@@ -69,10 +69,12 @@ class Reports:
     """What the state message says of things that the loop doesn't see itself; asked in its thread, at once answered.
 
     ``faults`` say what is wrong in a few words, empty or None while nothing is; ``unsent`` counts transforms that could
-    not be sent, ``malformed`` messages received that were none; ``alert_limit_m`` as configured.
+    not be sent, ``malformed`` messages received that were none; ``alert_limit_m`` as configured; ``others`` are the ids
+    of other monitors of this name.
     """
 
     faults: Sequence[Callable[[], str | None]] = ()
     unsent: Callable[[], int] = int
     malformed: Callable[[], int] = int
     alert_limit_m: float | None = None
+    others: Callable[[], tuple[str, ...]] = tuple

@@ -171,7 +171,9 @@ class SecondCamera(Loop):
 
     def _pass_on(self, outcome: Outcome) -> None:
         record = outcome.record
-        self._deliver("spot", self._publisher.spot, record)
+        several = self._not_alone()
+        said = msgspec.structs.replace(record, verdict=Verdict.UNKNOWN, reason=several) if several else record
+        self._deliver("spot", self._publisher.spot, said)
         self._tell(record.alerts, record.state, record.stamp_ns, recorded=True)
         if record.used:
             self._believed_s, self._unused = time.monotonic(), ""

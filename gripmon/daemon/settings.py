@@ -19,6 +19,10 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     no_camera_alert_after_s: Annotated[
         float, msgspec.Meta(gt=0.0, description="no frame for this long: an alert (s)")
     ] = 3.0
+    dropped_alert_share: Annotated[
+        float,
+        msgspec.Meta(gt=0.0, le=1.0, description="more of the frames of 10 s dropped, for want of time: an alert"),
+    ] = 0.2
     give_up_after_errors: Annotated[
         int, msgspec.Meta(ge=1, description="internal errors in so many frames in a row: stop, exit code 3")
     ] = 50

@@ -13,11 +13,12 @@ from typing import ParamSpec, TypeVar
 import msgspec
 
 from gripmon import __version__
-from gripmon.daemon.neighbours import CommandFeed, Reports
+from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.publish import StatePublisher
+from gripmon.publish.presence import in_words
 from gripmon.recording import EventRecorder
 from gripmon.records import (
     Alert,
@@ -36,6 +37,8 @@ from gripmon.records import (
     Severity,
     State,
     StateRecord,
+    Verdict,
+    accepting,
 )
 from gripmon.sources import Source, Waiting
 
@@ -44,6 +47,8 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 EXIT_DONE, EXIT_FAILED = 0, 3
+_RESTS_FOR = 3.0
+"""After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
 
 _ROOM_POLL_S = 0.002
 """Pause of a source that can wait for the recording."""
@@ -95,11 +100,12 @@ class Loop(ABC):
         self._reports = reports or Reports()
         self._notices = notices
         self._open_alerts: tuple[OpenAlert, ...] = ()  # of what judges the frames
+        self._proposal_id = ""  # the new reference that waits for an operator
         self._seq = -1
         self._start_s = time.monotonic()
         self._watch = Watch(settings, self._start_s)
         self._said: StateRecord | None = None
-        self._next_state_s = self._start_s
+        self._next_state_s = self._next_command_s = self._start_s
         self._stop = stop
         self._source_broke = False
         self._faults: dict[str, str] = {}  # since the frame before: what could not be delivered, and why
@@ -182,16 +188,26 @@ class Loop(ABC):
                 self._alert(alert, self._watch.state)
         else:
             self._handle(item)
-        for alert in self._watch.recording(self._kept.failure, time.monotonic(), time.time_ns()):
-            self._alert(alert, self._watch.state)
+        watch, now_s, stamp_ns = self._watch, time.monotonic(), time.time_ns()
+        alerts = watch.recording(self._kept.failure, now_s, stamp_ns)
+        alerts += watch.dropped(self._source.dropped, now_s, stamp_ns)
+        alerts += watch.others(self._not_alone(), now_s, stamp_ns)
+        for alert in alerts:
+            self._alert(alert, watch.state)
         self._say_state(time.monotonic())
         return not self._watch.gives_up
 
     def _obey(self) -> None:
         """Carry out one command, if one waits: never so many that frames wait for them."""
-        asked = None if self._commands is None else self._commands.poll()
+        begun_s = time.monotonic()
+        asked = None if self._commands is None or begun_s < self._next_command_s else self._commands.poll()
         if asked is None:
             return
+        self._carry_out_and_answer(asked)
+        now_s = time.monotonic()
+        self._next_command_s = now_s + _RESTS_FOR * (now_s - begun_s)
+
+    def _carry_out_and_answer(self, asked: Asked) -> None:
         command, answer = asked.command, None
         stamp_ns = time.time_ns()
         try:
@@ -251,23 +267,50 @@ class Loop(ABC):
         if not recorded:
             self._deliver("alert's recording", self._kept.alert, message)
 
+    def _not_alone(self) -> str:
+        """What to say while other monitors have this name, else empty: nobody can tell then whose transform is right,
+        so that none is published.
+        """
+        nobody: tuple[str, ...] = ()
+        others = self._ask(self._reports.others, nobody)
+        return f"{in_words(others)}; nothing is usable until it or this one is stopped" if others else ""
+
+    def _what_waits(self) -> str:
+        """What an operator is waited for, and what to type; empty if for nothing."""
+        if not self._proposal_id:
+            return ""
+        return f"a new reference waits for an operator: {accepting(self._proposal_id, self._robot, self._camera)}"
+
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""
-        watch, said, reports = self._watch, self._said, self._reports
-        faults = (watch.message, watch.undelivered, *(self._ask(fault, None) for fault in reports.faults))
-        message = "; ".join(fault for fault in faults if fault)
-        now = (watch.state, watch.verdict, self._source.connected, message, self._in_force[1])
+        watch, said = self._watch, self._said
+        several, waits = self._not_alone(), self._what_waits()
+        verdict = Verdict.UNKNOWN if several else watch.verdict
+        reported = (self._ask(fault, None) for fault in self._reports.faults)
+        message = "; ".join(fault for fault in (watch.message, several, waits, watch.undelivered, *reported) if fault)
+        now = (watch.state, verdict, self._source.connected, message, self._in_force[1])
         due = now_s >= self._next_state_s
         if said and not due and now == (said.state, said.verdict, said.camera_connected, said.message, said.revision):
             return
-        if said is None or (watch.state, watch.verdict) != (said.state, said.verdict):
+        if waits and (said is None or said.proposal_id != self._proposal_id):
+            _log.warning("%s (or reject)", waits)
+        if said is None or (watch.state, verdict) != (said.state, said.verdict):
             said_more = f" ({message})" if message else ""
-            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, watch.verdict, said_more)
-        self._said = StateRecord(
+            _log.info("state %s, %s %s%s", watch.state, self.verdict_of, verdict, said_more)
+        self._said = self._state_record(verdict, message, now_s, alone=not several)
+        self._deliver("state", self._told.state, self._said)
+        self._deliver("state's recording", self._kept.state, self._said)
+        if due:
+            self._next_state_s = now_s + self._settings.state_period_s
+            self._keep_house()
+
+    def _state_record(self, verdict: Verdict, message: str, now_s: float, *, alone: bool) -> StateRecord:
+        watch, reports = self._watch, self._reports
+        return StateRecord(
             robot=self._robot,
             camera=self._camera,
             state=watch.state,
-            verdict=watch.verdict,
+            verdict=verdict,
             stamp_ns=time.time_ns(),
             seq=self._seq,
             reference_id=self._in_force[0],
@@ -282,19 +325,15 @@ class Loop(ABC):
             recording_images_dropped=self._kept.images_dropped,
             message=message,
             version=__version__,
-            tcp_shift_m=watch.tcp_shift_m,
-            sigma_m=watch.sigma_m,
-            protection_m=watch.protection_m,
+            tcp_shift_m=watch.tcp_shift_m if alone else None,
+            sigma_m=watch.sigma_m if alone else None,
+            protection_m=watch.protection_m if alone else None,
             alert_limit_m=reports.alert_limit_m,
             open_alerts=watch.standing(self._open_alerts),
             transforms_unsent=self._ask(reports.unsent, 0),
             malformed=self._ask(reports.malformed, 0),
+            proposal_id=self._proposal_id,
         )
-        self._deliver("state", self._told.state, self._said)
-        self._deliver("state's recording", self._kept.state, self._said)
-        if due:
-            self._next_state_s = now_s + self._settings.state_period_s
-            self._keep_house()
 
     def _ask(self, report: Callable[[], _T], otherwise: _T) -> _T:
         """What somebody reports; one who fails at that is no reason to stop."""

@@ -7,6 +7,7 @@ import re
 from collections import deque
 from typing import NamedTuple
 
+from gripmon.daemon.drops import Drops
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.policy import AlertBook
 from gripmon.records import (
@@ -28,6 +29,7 @@ _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _UPDATE_S = 10.0
 """Pause between two reasons of what fails: a disk that is gone and then full is news, figures that change are none."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
+_OTHERS, _DROPS = "others", "drops"
 
 
 class Judged(NamedTuple):
@@ -63,6 +65,7 @@ class Watch:
         self.undelivered = ""
         self.errors_in_a_row = 0
         self._alerts = AlertBook(update_s=_UPDATE_S, clear_s=0.0)
+        self._drops = Drops(settings.dropped_alert_share)
         self._frame_times_s: deque[float] = deque(maxlen=_RATE_OVER_FRAMES)
         self._last_frame_s = now_s
         self._judged: Judged | None = None
@@ -129,6 +132,20 @@ class Watch:
         before = self._alerts.about(topic)
         news = before is not None and _kind(before.text) != _kind(alert.text)
         return list(self._alerts.present(topic, alert, now_s, stamp_ns, news=news))
+
+    def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
+        """So many frames have come since the start while another one was worked on."""
+        if not (said := self._drops.look(self.frames, count, now_s)):
+            return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
+        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, said)
+        return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
+
+    def others(self, said: str, now_s: float, stamp_ns: int) -> list[Alert]:
+        """Other monitors of this name: ``said`` of them, empty while there are none."""
+        if not said:
+            return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
+        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, said)
+        return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
 
     def stopped(self) -> None:
         """The end: whoever keeps the last state message must not go on trusting the last transform."""

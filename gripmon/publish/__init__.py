@@ -7,7 +7,7 @@ Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod
 ``state``      once a second and on every change; late joiners get the last one
 ``reference``  on every new revision; late joiners get the last one
 ``alert``      when there is one; an advanced subscriber with history gets the last 32
-``alive``      liveliness token, gone as soon as the process is
+``alive``      liveliness token, gone as soon as the process is; ``alive/<id>`` another one, of this start alone
 ``spot``       of a second camera in place of ``transform`` and ``reference``: what became of each pulse of the laser
 ``pulse``      read, not written: the pulses, from the robot's program
 ``jaw``        read, not written: ``{"stamp_ns": …, "opening_m": …}`` from the robot
@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from gripmon.publish.commands import PendingCommand, ZenohCommands
 from gripmon.publish.jaw import ZenohJaw
+from gripmon.publish.presence import Presence
 from gripmon.publish.publisher import (
     NullPublisher,
     Publisher,
@@ -35,6 +36,7 @@ from gripmon.publish.several import Publishers, SpotPublishers
 __all__ = [
     "NullPublisher",
     "PendingCommand",
+    "Presence",
     "Publisher",
     "Publishers",
     "SpotPublisher",

@@ -7,9 +7,11 @@ import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
 
+import msgspec
 import zenoh
 
 from gripmon.publish.answers import Answers, send_now
+from gripmon.publish.presence import Presence, in_words
 from gripmon.records import (
     Command,
     CommandError,
@@ -44,8 +46,9 @@ class PendingCommand:
     It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
     """
 
-    def __init__(self, command: Command, timeout_s: float, answers: Answers) -> None:
-        self.command = command
+    def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
+        """``monitor_id`` is that of the monitor which answers."""
+        self.command, self._monitor_id = command, monitor_id
         self._answers = answers
         self._timeout_s = timeout_s
         self._lock = threading.Lock()  # guards what follows
@@ -65,9 +68,9 @@ class PendingCommand:
                 return False
             answer = self._answer
             if answer is None:
-                self._askers.append(asker := _Asker(query, key, self._answers))
+                self._askers.append(asker := _Asker(query, key, self._answers, self._monitor_id))
         if answer is not None:
-            self._answers.send(query, _reply(key, answer))
+            self._answers.send(query, _reply(key, answer, self._monitor_id))
         else:
             asker.wait(self._timeout_s, lambda: self._time_is_over(asker))
         return True
@@ -105,8 +108,10 @@ class ZenohCommands:
     What was carried out under an id is not carried out again: the last 256 answers are remembered.
     """
 
-    def __init__(self, link: Link, keys: Keys, *, timeout_s: float = TIMEOUT_S) -> None:
-        self._keys = keys
+    def __init__(
+        self, link: Link, keys: Keys, presence: Presence | None = None, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        self._keys, self._presence = keys, presence
         self._malformed = Malformed("command", keys["cmd"])
         self._timeout_s = timeout_s
         self._waiting: deque[PendingCommand] = deque()
@@ -114,7 +119,8 @@ class ZenohCommands:
         self._known: OrderedDict[str, PendingCommand] = OrderedDict()
         self._queryable: zenoh.Queryable[None] | None = None
         self._closed = False
-        self._answers = Answers("commands")
+        flooded = CommandError(CommandFault.BUSY, "too many requests wait already; try again later")
+        self._answers = Answers("commands", _reply("", flooded, self._monitor_id))
         link.attach(self._attach, self.close)
 
     @property
@@ -152,7 +158,7 @@ class ZenohCommands:
             _log.debug("command on %s", key, exc_info=fault)
             error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
         if error is not None:
-            self._answers.send(query, _reply(key, error))
+            self._answers.send(query, _reply(key, error, self._monitor_id))
 
     def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
         """Let the loop answer; an error if it won't."""
@@ -163,6 +169,8 @@ class ZenohCommands:
         if isinstance(request, CommandError):
             self._malformed.add(request.text)
             return request
+        if wrong := self._meant_for_another(request):
+            return wrong
         command = Command(name, request.argument)
         with self._lock:
             if self._closed:
@@ -177,11 +185,26 @@ class ZenohCommands:
                 return None
             if len(self._waiting) >= _WAITING_MOST:
                 return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
-            pending = PendingCommand(command, self._timeout_s, self._answers)
+            pending = PendingCommand(command, self._timeout_s, self._answers, self._monitor_id)
             pending.join(query, key)
             self._remember(request.id, pending)
             self._waiting.append(pending)
         return None
+
+    @property
+    def _monitor_id(self) -> str:
+        return "" if self._presence is None else self._presence.monitor_id
+
+    def _meant_for_another(self, request: CommandRequest) -> CommandError | None:
+        """Of several monitors of one name each command is carried out by the one that it names, or by none."""
+        if request.monitor_id and request.monitor_id != self._monitor_id:
+            text = f"this is the monitor {self._monitor_id or 'without id'}, and {request.monitor_id} is meant"
+            return CommandError(CommandFault.ANOTHER, text)
+        others = () if self._presence is None or request.monitor_id else self._presence.others()
+        if not others:
+            return None
+        text = f"{in_words(others)} beside {self._monitor_id}; name the one that is meant in monitor_id"
+        return CommandError(CommandFault.SEVERAL, text)
 
     def _remember(self, request_id: str, pending: PendingCommand) -> None:
         if request_id and pending.command.name not in _QUESTIONS:
@@ -194,8 +217,8 @@ class ZenohCommands:
 class _Asker:
     """One query that waits for its answer."""
 
-    def __init__(self, query: zenoh.Query, key: str, answers: Answers) -> None:
-        self._query, self._key, self._answers = query, key, answers
+    def __init__(self, query: zenoh.Query, key: str, answers: Answers, monitor_id: str) -> None:
+        self._query, self._key, self._answers, self._monitor_id = query, key, answers, monitor_id
         self._timer: threading.Timer | None = None
 
     def wait(self, timeout_s: float, is_over: Callable[[], None]) -> None:
@@ -206,7 +229,7 @@ class _Asker:
     def tell(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
         if self._timer is not None:
             self._timer.cancel()
-        reply = _reply(self._key, answer, attachment)
+        reply = _reply(self._key, answer, self._monitor_id, attachment)
         if attachment is None:
             self._answers.send(self._query, reply)
         else:  # large: whoever made it has a thread for that, and makes no more of them meanwhile
@@ -241,14 +264,15 @@ def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
 
 
 def _reply(
-    key: str, answer: CommandReply | CommandError, attachment: bytes | None = None
+    key: str, answer: CommandReply | CommandError, monitor_id: str, attachment: bytes | None = None
 ) -> Callable[[zenoh.Query], None]:
-    """What sends an answer to a query."""
+    """What sends an answer to a query, with the id of the monitor that gives it."""
 
     def send(query: zenoh.Query) -> None:
+        payload = to_json(msgspec.structs.replace(answer, monitor_id=monitor_id))
         if isinstance(answer, CommandReply):
-            query.reply(key, to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON, attachment=attachment)
+            query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON, attachment=attachment)
         else:
-            query.reply_err(to_json(answer), encoding=zenoh.Encoding.APPLICATION_JSON)
+            query.reply_err(payload, encoding=zenoh.Encoding.APPLICATION_JSON)
 
     return send

@@ -6,14 +6,17 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, TypeVar
 
+import msgspec
 import zenoh
 
 from gripmon.publish.answers import Answers
+from gripmon.publish.presence import Presence
 from gripmon.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
 from gripmon.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
 
+_T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
 _HEARTBEAT_S = 1.0
@@ -54,9 +57,12 @@ class NullPublisher:
 class _ZenohStates:
     """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
 
-    def __init__(self, link: Link, robot: str, camera: str) -> None:
-        """Raises ValueError for a name that can't be part of a key."""
+    def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
+        """``presence``: whose id stands in everything that is said.  Raises ValueError for a name that can't be part of
+        a key.
+        """
         self.keys = Keys(check_name("robot", robot), check_name("camera", camera))
+        self.monitor_id = "" if presence is None else presence.monitor_id
         self.unsent = 0
         self._link = link
         self._wire: _Wire | None = None
@@ -67,11 +73,11 @@ class _ZenohStates:
 
     def state(self, record: StateRecord) -> None:
         """Send the state, and keep it for late joiners."""
-        self._put_last("state", to_json(record))
+        self._put_last("state", to_json(self._signed(record)))
 
     def alert(self, record: AlertRecord) -> None:
         """Send an alert."""
-        self._put_each("alert", to_json(record))
+        self._put_each("alert", to_json(self._signed(record)))
 
     def close(self) -> None:
         """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
@@ -79,6 +85,10 @@ class _ZenohStates:
 
     def _declared(self, wire: _Wire) -> None:
         """Declare what is the subclass's own."""
+
+    def _signed(self, record: _T) -> _T:
+        """The record with the id of this start."""
+        return msgspec.structs.replace(record, monitor_id=self.monitor_id) if self.monitor_id else record
 
     def _put_last(self, leaf: str, payload: bytes) -> None:
         with self._lock:
@@ -95,7 +105,7 @@ class _ZenohStates:
 
     def _adopt(self, session: zenoh.Session) -> None:
         """Declare everything on a new session and send what was kept for it."""
-        wire = _Wire(session, self.keys)
+        wire = _Wire(session, self.keys, self.monitor_id)
         self._declared(wire)
         wire.appear()
         with self._lock:
@@ -126,7 +136,7 @@ class ZenohPublisher(_ZenohStates):
         if wire is None:
             self.unsent += 1
         else:
-            wire.puts["transform"](to_json(record))
+            wire.puts["transform"](to_json(self._signed(record)))
 
     def reference(self, record: ReferenceRecord) -> None:
         """Send the reference, and keep it for late joiners."""
@@ -145,7 +155,7 @@ class ZenohSpotPublisher(_ZenohStates):
 
     def spot(self, record: SpotRecord) -> None:
         """Send what became of a pulse, and keep the last one for late joiners."""
-        self._put_each("spot", to_json(record))
+        self._put_each("spot", to_json(self._signed(record)))
 
     def _declared(self, wire: _Wire) -> None:
         wire.declare_kept("spot", _ALERTS_KEPT)
@@ -166,6 +176,10 @@ def _keeping_publisher(
         sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
         publisher_detection=True,
     )
+
+
+def _too_many_ask(query: zenoh.Query) -> None:
+    query.reply_err(b"busy: too many ask; try again later", encoding=zenoh.Encoding.TEXT_PLAIN)
 
 
 class _LastValue:
@@ -227,14 +241,15 @@ class _TimedStream(_LastValue):
 class _Wire:
     """Everything declared on one open session; ``puts`` by the last part of the key."""
 
-    def __init__(self, session: zenoh.Session, keys: Keys) -> None:
+    def __init__(self, session: zenoh.Session, keys: Keys, monitor_id: str) -> None:
         self._session, self._keys = session, keys
-        self._answers = Answers("latest")
+        self._tokens = [keys["alive"], *([keys[f"alive/{monitor_id}"]] if monitor_id else [])]
+        self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
         self.values: dict[str, _LastValue] = {}
         self.declare_kept("state")
-        self._alive: zenoh.LivelinessToken | None = None
+        self._alive: list[zenoh.LivelinessToken] = []
 
     def declare_newest(self, leaf: str) -> None:
         """A key of a stream, without a cache: a message of it is worth nothing to who didn't ask for the last one."""
@@ -253,8 +268,8 @@ class _Wire:
         self._add(leaf, publisher)
 
     def appear(self) -> None:
-        """Show the liveliness token, when all is declared."""
-        self._alive = self._session.liveliness().declare_token(self._keys["alive"])
+        """Show the liveliness tokens, when all is declared: the one that every monitor has, and that of this start."""
+        self._alive = [self._session.liveliness().declare_token(key) for key in self._tokens]
 
     def _add(
         self,
@@ -266,6 +281,6 @@ class _Wire:
         self.puts[leaf] = self.values[leaf].put
 
     def close(self) -> None:
-        if self._alive is not None:
-            self._alive.undeclare()
+        for token in self._alive:
+            token.undeclare()
         self._answers.close()

@@ -22,6 +22,7 @@ from gripmon.records.commands import (
     CommandRequest,
     Snapshot,
     SnapshotImage,
+    accepting,
 )
 from gripmon.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
 from gripmon.records.frames import (
@@ -35,6 +36,7 @@ from gripmon.records.frames import (
     State,
     Verdict,
     unmeasured_record,
+    withheld,
 )
 from gripmon.records.json_schema import json_schema, summary
 from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
@@ -109,6 +111,7 @@ __all__ = [
     "Transform",
     "Verdict",
     "Vibration",
+    "accepting",
     "from_json",
     "json_schema",
     "largest_bytes",
@@ -116,4 +119,5 @@ __all__ = [
     "summary",
     "to_json",
     "unmeasured_record",
+    "withheld",
 ]

@@ -34,6 +34,7 @@ class Cause(OpenEnum):
     PLANE_MOVED = "plane_moved"
     LASER_MOVED = "laser_pointer_moved"
     NO_CAMERA = "no_camera"
+    TOO_SLOW = "monitor_too_slow"
     UNKNOWN = "unknown"
 
 
@@ -58,6 +59,7 @@ class AlertKind(OpenEnum):
     SOURCE = "source"
     RECORDING = "recording"
     OUTPUT = "output"
+    SEVERAL = "several_monitors"
 
 
 class AlertEvent(enum.StrEnum):

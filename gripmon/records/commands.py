@@ -35,6 +35,11 @@ class Command(msgspec.Struct, frozen=True):
     argument: str = ""
 
 
+def accepting(reference_id: str, robot: str, camera: str) -> str:
+    """What an operator types to let a proposed reference in."""
+    return f"gripmon send accept {reference_id} --robot {robot} --camera {camera}"
+
+
 _PRINTED = r"^[^\x00-\x1f\x7f]*(?![\s\S])"  # it appears in logs and on terminals: no control characters
 
 
@@ -61,6 +66,14 @@ class CommandRequest(
             max_length=64,
             pattern=_PRINTED,
             description="of this request: sent again, it gets the same answer and isn't carried out again; empty: none",
+        ),
+    ] = ""
+    monitor_id: Annotated[
+        str,
+        Meta(
+            max_length=64,
+            pattern=_PRINTED,
+            description="the start of the monitor that is meant, any other refuses; empty: the only one of its name",
         ),
     ] = ""
 
@@ -110,6 +123,7 @@ class CommandReply(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
             "same"
         ),
     ] = True
+    monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""
 
 
 class CommandFault(OpenEnum):
@@ -118,6 +132,7 @@ class CommandFault(OpenEnum):
     UNKNOWN = "unknown_command"
     MALFORMED = "malformed"
     SEVERAL = "several_monitors"
+    ANOTHER = "another_monitor"
     BUSY = "busy"
     TIMEOUT = "timeout"
     STOPPING = "stopping"
@@ -130,3 +145,4 @@ class CommandError(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
 
     error: CommandFault
     text: Annotated[str, Meta(description="what went wrong, in one line for a person")]
+    monitor_id: Annotated[str, Meta(description="of the start that answers; empty from a monitor before ids")] = ""

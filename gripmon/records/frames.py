@@ -140,6 +140,9 @@ class FrameRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
         Protection | None,
         Meta(description="bounds on the error of cam_T_grip, null with it; a held one's grow, or end"),
     ] = None
+    monitor_id: Annotated[
+        str, Meta(description="of this start of the monitor; empty in a replay, and from a monitor before ids")
+    ] = ""
 
     @property
     def measured(self) -> bool:
@@ -163,6 +166,20 @@ class MeasurementTrace:
     edge_residual_px: Array
     predicted_edges_uv_px: tuple[Array, ...]
     predicted_corners_uv_px: Array
+
+
+def withheld(record: FrameRecord, reason: str) -> FrameRecord:
+    """The record without what anybody could move by."""
+    return msgspec.structs.replace(
+        record,
+        verdict=Verdict.UNKNOWN,
+        cam_T_grip=None,
+        covariance=None,
+        smoothed=None,
+        drift=None,
+        protection=None,
+        reason=reason,
+    )
 
 
 def unmeasured_record(

@@ -115,3 +115,6 @@ class SpotRecord(msgspec.Struct, frozen=True, kw_only=True, tag_field="schema", 
     revision: Annotated[int, Meta(description="of that; 0")]
     alerts: Annotated[tuple[Alert, ...], Meta(description="what this pulse raised, updated or cleared")]
     latency_ns: Annotated[int, Meta(description="from when its frames were complete to when it was judged, ns")] = 0
+    monitor_id: Annotated[
+        str, Meta(description="of this start of the monitor; empty in a replay, and from a monitor before ids")
+    ] = ""

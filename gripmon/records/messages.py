@@ -74,6 +74,10 @@ class StateRecord(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.
     recording_images_dropped: Annotated[
         int, Meta(description="images that should be in the recording and aren't, of frames that are")
     ] = 0
+    monitor_id: Annotated[str, Meta(description="of this start of the monitor; empty from one before ids")] = ""
+    proposal_id: Annotated[
+        str, Meta(description="the new reference that waits for an operator to accept or reject it; empty if none does")
+    ] = ""
 
 
 class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gripmon.alert/1"):
@@ -86,6 +90,7 @@ class AlertRecord(Alert, frozen=True, kw_only=True, tag_field="schema", tag="gri
     state: State
     reference_id: Annotated[str, Meta(description="the reference in force")]
     revision: Annotated[int, Meta(description="of the reference in force")]
+    monitor_id: Annotated[str, Meta(description="of this start of the monitor; empty from one before ids")] = ""
 
 
 class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.clock/1"):

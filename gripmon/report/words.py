@@ -23,6 +23,7 @@ CAUSES: dict[str, str] = {
     Cause.PLANE_MOVED: "the plane under the laser moved",
     Cause.LASER_MOVED: "the laser pointer moved on the arm",
     Cause.NO_CAMERA: "there was no camera",
+    Cause.TOO_SLOW: "the monitor was too slow for the camera",
     Cause.UNKNOWN: "cause unknown",
 }
 _MOST_TOLD = 3

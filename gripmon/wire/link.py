@@ -73,6 +73,11 @@ class Link:
             self._look(session)
         return self._fault
 
+    def unconnected(self) -> str:
+        """The same as of this moment: for a start, which waits for it."""
+        self._next_look_s = 0.0
+        return self.fault()
+
     def attach(self, declare: Callable[[zenoh.Session], None], leave: Callable[[], None] | None = None) -> None:
         """Call ``declare`` with the session: now, or in another thread when it opens; ``leave`` before it is closed.
 

@@ -1,0 +1,74 @@
+"""A new reference that waits for an operator: who looks anywhere sees it, with the command to type."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import msgspec
+import pytest
+from daemon_bench import Bench
+from loopback import reference_record, state_record
+from stand_ins import ScriptedMonitor
+
+from gripmon.cli import fleet_table
+from gripmon.client import MonitorName, MonitorStatus
+from gripmon.config import builtin_config, is_second, load_config
+from gripmon.outlook import expect
+from gripmon.records import AlertKind, MonitorState, Severity, StandingAlert
+
+ROOT = Path(__file__).resolve().parent.parent
+COMMAND = "gripmon send accept recalibration-4-1f0c9a2b --robot arm --camera wrist"
+
+
+class Proposing(ScriptedMonitor):
+    """From frame 2 on a reference waits, from frame 4 on none does."""
+
+    def process(self, frame):  # type: ignore[no-untyped-def]
+        record = super().process(frame)
+        self.state_revision += frame.seq in (2, 4)
+        return record
+
+    def state(self) -> MonitorState:
+        draft = msgspec.structs.replace(reference_record(4), reference_id="recalibration-4-1f0c9a2b")
+        waits = bool(self.frames) and 2 <= self.frames[-1].seq < 4
+        return MonitorState((self.reference,), proposal=draft if waits else None)
+
+
+def test_the_state_and_the_log_say_what_to_type(caplog: pytest.LogCaptureFixture):
+    bench = Bench(range(6), Proposing())
+    with caplog.at_level(logging.INFO, logger="gripmon"):
+        bench.run()
+    waiting = [(state.proposal_id, COMMAND in state.message) for state in bench.network.states]
+    assert set(waiting) == {("", False), ("recalibration-4-1f0c9a2b", True)}
+    assert waiting[-1] == ("", False)
+    said = [record.getMessage() for record in caplog.records if COMMAND in record.getMessage()]
+    assert said == [f"a new reference waits for an operator: {COMMAND} (or reject)"]
+
+
+def status(**changes: object) -> MonitorStatus:
+    state = msgspec.structs.replace(state_record(), proposal_id="recalibration-4-1f0c9a2b", **changes)
+    return MonitorStatus(name=MonitorName("arm", "wrist"), state=state, state_age_s=0.1)
+
+
+def test_watch_begins_with_the_command_and_explains_its_marks():
+    alerts = (StandingAlert("1-a", AlertKind.STEP, Severity.ERROR, "a step", since_ns=5, acknowledged=False),)
+    shown = fleet_table.plain([status(open_alerts=alerts)], "")
+    assert f"waits: {COMMAND}; !!1 a step" in shown
+    assert shown.splitlines()[-1] == fleet_table.LEGEND
+    assert f"waits: {COMMAND}" in fleet_table.line(status())
+    assert fleet_table.LEGEND not in fleet_table.plain([status()], "")
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
+def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(name: str):
+    """By what one frame of it is certain to; the mean of frames whose errors last is hardly more."""
+    path = builtin_config(name)
+    if is_second(path):
+        return
+    config = load_config(path, check_source=False, with_taught=False)
+    monitor = config.settings.monitor
+    if monitor.recalibration.mode == "off":
+        return
+    outlook = expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
+    assert outlook.enough and max(outlook.sigma[:3]) <= monitor.recalibration.sure_sigma_m
