@@ -150,7 +150,7 @@ def test_replay_with_the_taught_model_is_right_where_it_was_a_fifth_of_a_millime
 
 
 def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(rig / "config.yaml")]) == 0
+    assert main(["check", str(rig / "config.yaml"), "--verbose"]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("taught ")]
     assert "10 edges from 3 images" in line and "µm" in line and "px)" in line and "not taught" not in line
     assert main(["check", str(rig / "config.yaml"), "--json"]) == 0
@@ -164,7 +164,7 @@ def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest
     assert main(["check", str(rig / "config.yaml"), "--sweep", "--distance", "0.12", "--tilt", "30", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
     assert present["sigma"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
-    assert main(["check", str(rig / "untaught.yaml")]) == 0
+    assert main(["check", str(rig / "untaught.yaml"), "--verbose"]) == 0
     assert "gripmon teach" in capsys.readouterr().out
 
 

@@ -172,7 +172,7 @@ def _given(calibrated: Path) -> list[object]:
 
 def _checked(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert main(["check", str(config)]) == 0
+    assert main(["check", str(config), "--verbose"]) == 0
     said = capsys.readouterr().out
     assert "sound" in said and "smallest step that is noticed" in said and "weakest" in said
 

@@ -10,16 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, promising, second_run, viewing
+from gripmon.cli import camera_source, common, promising, second_run, viewing
 
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
     from gripmon.records import Alert, MonitorState
-    from gripmon.sources import Source
     from gripmon.statefile import StateFile
-    from gripmon.wire import Link
 
 _log = logging.getLogger(__name__)
 
@@ -88,6 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
             second, out=out, duration_s=arguments.duration, verbose=arguments.verbose, view=arguments.view
         )
     config = common.load(arguments.config)
+    camera_source.look_ahead(config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
     return run_daemon(
         config,
@@ -158,7 +157,7 @@ def run_daemon(
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
-        source = _open_source(config, network.link)
+        source = camera_source.open_source(config, network.link)
         opened.pop_all()  # from here on the daemon closes them
         return daemon.run(
             monitor,
@@ -204,18 +203,6 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 
     texts = () if kept is None else kept.notices
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
-
-
-def _open_source(config: Config, link: Link | None) -> Source:
-    from gripmon.sources import SourceError, open_source
-    from gripmon.wire import Keys
-
-    settings = config.settings
-    keys = Keys(settings.robot, settings.camera_name)
-    try:
-        return open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
-    except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 
 
 def _open_recorder(
