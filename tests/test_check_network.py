@@ -82,7 +82,7 @@ def test_packages_that_are_missing(
     jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}
     line = refused(written(tmp_path, **sections, **jaw), capsys)
     assert f"config.yaml: {key}: " in line
-    assert "; pip install '.[ros2]' in gripmon's checkout" in line
+    assert "; pip install -e '.[ros2]' in gripmon's checkout" in line
     typestore.cache_clear()
 
 

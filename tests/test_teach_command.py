@@ -29,6 +29,7 @@ from gripmon.corners.taught import TaughtEdge, gripper_digest
 from gripmon.geometry import to_record
 from gripmon.gripper import load_gripper
 from gripmon.teaching.document import to_yaml
+from gripmon.teaching.picture import Labels
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4
@@ -400,3 +401,16 @@ def test_the_gripper_files_digest_is_that_of_its_content():
     one, two = load_gripper(BOX_FINGERS), load_gripper(BOX_FINGERS)
     assert gripper_digest(one) == gripper_digest(two) and len(gripper_digest(one)) == 64
     assert TaughtEdge.__struct_config__.forbid_unknown_fields
+
+
+def test_labels_in_the_picture_do_not_lie_over_each_other_nor_leave_it():
+    picture = np.full((300, 400, 3), 128, np.uint8)
+    labels = Labels(picture)
+    labels.title("a_gripper_with_a_long_name: sharp model (blue), taught outlines (orange), creases (green)", "offsets")
+    for k, at in enumerate([(200, 150)] * 4 + [(2, 2), (398, 298), (398, 2), (203, 152)]):
+        labels.put(f"left_inner_near {k}", at, (0, 200, 255))
+    assert len(labels.boxes) == 10
+    for k, (left, top, right, bottom) in enumerate(labels.boxes):
+        assert left >= 0 and top >= 0 and right <= 400 and bottom <= 300
+        for other in labels.boxes[:k]:
+            assert left >= other[2] or right <= other[0] or top >= other[3] or bottom <= other[1]

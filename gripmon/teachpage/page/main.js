@@ -122,6 +122,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 
 function key(event) {
   const control = event.ctrlKey || event.metaKey, letter = event.key.toLowerCase();
+  if (event.key === "Escape" && !$("#help").hidden) { help(); event.preventDefault(); return; }
   if (event.target.matches("input, select")) return;
   if (control && (letter === "y" || (letter === "z" && event.shiftKey))) { if (corners.redo()) changed(); }
   else if (control && letter === "z") { if (corners.undo()) changed(); }
@@ -179,6 +180,7 @@ async function take() {
 }
 
 async function save() {
+  if (!$("#help").hidden) help();
   busy = true;
   show();
   let result;
