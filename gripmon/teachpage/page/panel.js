@@ -70,7 +70,7 @@ export function corners(list, reply, selected, choose) {
       agree.append(meter, ` ${Math.round(100 * corner.inliers)} %`);
       row.append(element("td", corner.sigma_px.toFixed(3)), agree);
     } else {
-      const text = reply && !reply.refused ? corner?.reason ?? "" : state === "put" ? "put" : "not put yet";
+      const text = reply && !reply.refused ? corner?.reason ?? "" : state === "put" ? "placed" : "not placed yet";
       row.append(element("td", text, { colspan: 2, class: state === "refused" ? "reason" : "quiet" }));
     }
     row.addEventListener("click", () => choose(name));
