@@ -346,6 +346,6 @@ def test_a_replay_says_first_what_it_judges_otherwise():
             now = msgspec.structs.replace(now, alerts=(msgspec.structs.replace(worse, severity=Severity.ERROR),))
         differences.add(then, now)
     assert differences.text(from_jpeg=False) == (
-        "1 frame with another verdict (first frame 8: suspect, recorded valid); alerts differ: creep becomes error at "
-        "frame 6, not recorded; numbers differ in 2, the TCP by up to 0 mm"
+        "1 frame with another verdict (the first: frame 8, suspect instead of valid); alerts differ: creep becomes "
+        "error at frame 6, not recorded; numbers differ in 2, the TCP by up to 0 mm"
     )

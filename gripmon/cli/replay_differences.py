@@ -32,7 +32,7 @@ class Differences:
         for what in ("verdict", "state"):
             before, after = getattr(then, what), getattr(now, what)
             if before is not after:
-                self._first.setdefault(what, f"frame {now.seq}: {after}, recorded {before}")
+                self._first.setdefault(what, f"frame {now.seq}, {after} instead of {before}")
         self._verdicts += then.verdict is not now.verdict
         self._states += then.state is not now.state
         if then.cam_T_grip is not None and now.cam_T_grip is not None:
@@ -47,7 +47,7 @@ class Differences:
             return f"all {self.frames} as they were recorded, every number the same"
         alerts = self._alerts_now.against(self._alerts_then)
         judged = [
-            f"{_frames(count)} with another {what} (first {self._first[what]})"
+            f"{_frames(count)} with another {what} (the first: {self._first[what]})"
             for what, count in (("verdict", self._verdicts), ("state", self._states))
             if count
         ]
@@ -86,7 +86,7 @@ class _AlertChanges:
             if len(now_at) > len(then_at):
                 texts.append(f"{what} at frame {now_at[len(then_at)]}, not recorded")
             elif len(now_at) < len(then_at):
-                texts.append(f"{what} no more, recorded at frame {then_at[len(now_at)]}")
+                texts.append(f"no {what}, recorded at frame {then_at[len(now_at)]}")
             elif now_at != then_at:
                 now_seq, then_seq = next(pair for pair in zip(now_at, then_at, strict=True) if pair[0] != pair[1])
                 texts.append(f"{what} at frame {now_seq}, recorded at {then_seq}")
