@@ -108,13 +108,13 @@ def _mount(reference: dict[str, Any]) -> Finding:
 def _view(in_view: dict[str, Any], gripper: dict[str, Any]) -> Finding:
     if not in_view["enough"]:
         return Finding("FAIL", "view", f"nothing can be measured: {in_view['reason']}")
-    seen = f"{in_view['corners']} of {gripper['corners']} corners and {in_view['edges']} edges"
+    seen = f"{in_view['corners']} of {gripper['corners']} corners and {in_view['edges']} edges can be measured"
     spans = in_view["camera_may_move"]["shift_m"].values()
     shifts = [amount for span in spans for amount in span if amount is not None]
     if not shifts:
         return Finding("OK", "view", seen)
     shortest_m, limit_m = min(shifts), in_view["limit_m"]
-    text = f"{seen}, until the camera shifts by {1e3 * shortest_m:.1f} mm"
+    text = f"{seen}; too few once the camera shifts by {1e3 * shortest_m:.1f} mm"
     if shortest_m < limit_m:
         limit = f"{1e3 * limit_m:g} mm (monitor.policy.limit_m)"
         return Finding("WARN", "view", f"{text}: less than the shift that leads to a recalibration, {limit}")
