@@ -243,3 +243,20 @@ def test_a_target_comes_from_a_calibration_too(tmp_path: Path, capsys: pytest.Ca
             target_of(str(path))
     assert calibrate("x.png", "--target", str(tmp_path / "none.yaml"), "--out", str(tmp_path / "c.yaml")) == 2
     assert "none.yaml" in capsys.readouterr().err
+
+
+def test_a_target_that_is_described_too_small_is_refused_though_some_images_show_no_more(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    for k in (0, 1, 2, 4, 5, 6):
+        image = cv2.imread(str(folder / f"{k}.png"), cv2.IMREAD_UNCHANGED)
+        if k > 2:
+            image[:, :220] = image.mean()
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    target, out = ("--target", "checkerboard:8x6:0.02"), tmp_path / "camera.yaml"
+    assert calibrate(*images(tmp_path, (4, 5, 6)), *target, "--out", str(tmp_path / "part.yaml")) == 0
+    capsys.readouterr()
+    assert calibrate(*images(tmp_path, (0, 1, 2, 4, 5, 6)), *target, "--out", str(out)) == 2
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert re.fullmatch(r"--target: \d of 6 images show a larger one \(.*9 x 6 .* 8 x 6\); its full size", last)
+    assert not out.exists()

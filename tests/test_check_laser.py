@@ -132,7 +132,7 @@ def test_spots_are_found_in_images_too(laser, tmp_path, capsys):
     ("arguments", "said"),
     [
         (["--laser", "{nothing}"], "there is no such file; a file of gripmon calibrate laser"),
-        (["--laser", "{other}"], "schema: is None"),
+        (["--laser", "{other}"], "schema: is missing"),
         (["--laser", "{laser}", "{nothing}"], "nothing.csv: there is no such file; a table of samples"),
         (["--laser", "{laser}", "{bad}"], "line 2: has no column tx_m"),
         (["--laser", "{laser}", "{outside}"], "is outside of the camera's image of 640 x 480 px"),

@@ -82,14 +82,14 @@ def test_packages_that_are_missing(
     jaw = {"jaw": {"source": "fixed"}} if "jaw" not in sections else {}
     line = refused(written(tmp_path, **sections, **jaw), capsys)
     assert f"config.yaml: {key}: " in line
-    assert "; pip install '.[ros2]' in gripmon's checkout" in line
+    assert "; pip install -e '.[ros2]' in gripmon's checkout" in line
     typestore.cache_clear()
 
 
 def test_how_the_network_would_be_joined_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def said(publish: dict[str, object]) -> str:
         path = written(tmp_path, publish=publish)
-        assert main(["check", path]) == 0
+        assert main(["check", path, "--verbose"]) == 0
         return next(line for line in capsys.readouterr().out.splitlines() if line.startswith("Zenoh"))
 
     assert said({}).endswith("gripmon/demo/wrist/, peer, listens on tcp/127.0.0.1:7447")

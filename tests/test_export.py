@@ -27,6 +27,7 @@ from gripmon.playback import FrameTable
 from gripmon.records import (
     AlertEvent,
     AlertRecord,
+    Cause,
     CommandName,
     Drift,
     FrameRecord,
@@ -244,8 +245,11 @@ def test_the_queries_of_the_page_say_what_the_records_say(
 ):
     start_ns = MIDNIGHT_NS - 3000 * MILLISECOND_NS
     records, others = moving(60, start_ns), moving(21, MIDNIGHT_NS)
-    raised = [alert(start_ns + k * DAY_NS, AlertEvent.RAISED) for k in range(3)]
-    events = (*raised, alert(start_ns + 5, AlertEvent.CLEARED))
+    # Each alert was raised before its cause was known, and said it then.
+    unknown = {"cause": Cause.UNKNOWN, "part": None}
+    raised = [alert(start_ns + k * DAY_NS, AlertEvent.RAISED, alert_id=f"1-{k}", **unknown) for k in range(3)]
+    known = [alert(start_ns + k * DAY_NS + 3, AlertEvent.UPDATED, alert_id=f"1-{k}") for k in range(3)]
+    events = (*raised, *known, alert(start_ns + 5, AlertEvent.CLEARED, alert_id="1-0", **unknown))
     export(
         tmp_path / "fleet",
         Run(records, alerts=events, references=(sample_messages.CONFIGURED, sample_messages.RECALIBRATED)),
@@ -270,7 +274,7 @@ def test_the_queries_of_the_page_say_what_the_records_say(
     assert isinstance(table, pl.DataFrame)
     (row,) = table.drop("first", "last").rows()  # arm2's alert names a reference that arm2 has never had
     assert row == ("arm1", "wrist", "step", "camera_mount_moved", "recalibration-3-1f0c9a2b", "recalibration", 3)
-    assert table["last"].to_physical().to_list() == [raised[2].stamp_ns]
+    assert table["last"].to_physical().to_list() == [known[2].stamp_ns]
     assert "arm2" in capsys.readouterr().out
 
 

@@ -34,7 +34,7 @@ def test_the_settings_and_their_defaults_are_those_of_the_code():
 
 
 def test_the_line_of_check_is_what_check_prints(capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(builtin_config("demo.yaml"))]) == 0
+    assert main(["check", str(builtin_config("demo.yaml")), "--verbose"]) == 0
     (line,) = re.findall(r"^promise .*$", capsys.readouterr().out, re.MULTILINE)
     assert line in TEXT
 

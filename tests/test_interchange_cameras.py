@@ -304,7 +304,7 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(kind: str):
 
 def test_content_that_is_none_of_them_is_said():
     for data in (b"", b"\x00\xff\x89PNG", b"a: 1\n", b"[1, 2]"):
-        with pytest.raises(InterchangeError, match="is in no format that can be told; --format ros or"):
+        with pytest.raises(InterchangeError, match="is in no format that is recognised; --format ros or"):
             format_of(data, "x")
 
 

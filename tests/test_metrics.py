@@ -218,7 +218,7 @@ def test_a_missing_package_is_said_by_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
     config = configured(tmp_path, "{enabled: false}", "metrics: {enabled: true}")
-    assert main(["check", str(config)]) == 0
+    assert main(["check", str(config), "--verbose"]) == 0
     assert "metrics    http://127.0.0.1:9464/metrics\n" in capsys.readouterr().out
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert main(["check", str(config)]) == 2

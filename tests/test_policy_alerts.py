@@ -99,6 +99,12 @@ def test_vibration_says_its_size_and_frequency(rms_mm: float, severity: str):
     assert f"{rms_mm:.3f} mm" in alert.text and "12 Hz" in alert.text
 
 
+@pytest.mark.parametrize(("hertz", "said"), [(0.23, " rms at about 0.23 Hz"), (9.7, " at about 9.7 Hz"), (0.0, " rms")])
+def test_a_slow_vibration_is_not_one_at_0_hz(hertz: float, said: str):
+    [alert] = settled().feed(seen(vibration=Vibration(1e-4, hertz))).alerts
+    assert alert.text.endswith(said)
+
+
 # --- the stream of frames ---
 
 FROZEN = ("frozen", Cause.CAMERA_FROZEN, "the same image 9 times")

@@ -74,7 +74,7 @@ def test_a_gripper_file_that_is_known_less_well_promises_less():
 
 
 def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(DEMO)]) == 0
+    assert main(["check", str(DEMO), "--verbose"]) == 0
     text = capsys.readouterr().out
     assert main(["check", str(DEMO), "--json"]) == 0
     values = json.loads(capsys.readouterr().out)
@@ -88,7 +88,7 @@ def test_check_says_what_is_promised(capsys: pytest.CaptureFixture[str]):
 
 def test_a_limit_that_can_not_be_kept_is_said_by_check_and_sweep(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = with_policy(tmp_path, "alert_limit_m: 2.0e-5")
-    assert main(["check", str(path)]) == 0
+    assert main(["check", str(path), "--verbose"]) == 0
     text = capsys.readouterr().out
     found = re.search(
         r"^promise .* is good to ([\d.]+) mm .*NOT reachable: valid needs alert_limit_m of at least ([\d.e-]+) \(",

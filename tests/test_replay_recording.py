@@ -21,12 +21,28 @@ from rerun.chunk import RrdReader
 from gripmon.cli import main
 from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds
 from gripmon.cli.replay import _recorder
+from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
 from gripmon.config import load_config
 from gripmon.config.recorded import to_recorded
 from gripmon.recording import open_recorder
-from gripmon.records import Frame, Origin, Protection, Refusal, Verdict
+from gripmon.records import (
+    Alert,
+    AlertEvent,
+    AlertKind,
+    Cause,
+    Frame,
+    Origin,
+    Protection,
+    Refusal,
+    Severity,
+    Verdict,
+)
 from gripmon.sources.folder import FolderSettings, FolderSource
+
+WARNED = Alert(
+    AlertKind.CREEP, Cause.UNKNOWN, Severity.WARNING, "a creep", event=AlertEvent.RAISED, alert_id="1-a", since_ns=1
+)
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +159,7 @@ def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path
     said = capsys.readouterr().err
     counted = re.search(r"holds images of (\d+) frames; (\d+) more were recorded without", said)
     assert counted and int(counted[1]) == len(lines) < 30 and int(counted[1]) + int(counted[2]) == 30
-    assert re.search(rf"replay: \d+ of {len(lines)} otherwise than recorded", said)
+    assert re.search(r"numbers differ in \d+, the TCP by up to [\d.e-]+ mm \(the images were recorded as JPEG\)", said)
 
 
 def test_a_damaged_recording_is_replayed_as_far_as_it_is_whole(
@@ -306,7 +322,7 @@ def test_a_recording_from_before_protection_levels_is_compared_by_what_it_says()
     assert as_recorded_before_bounds(held).reason == "hidden"
     run = RecordedRun.__new__(RecordedRun)
     run.source = SimpleNamespace(passed_over=0, images_damaged=0, record=then)
-    run._frames = run._same = run._verdicts = run._states = run._unbounded = 0
+    run._differences, run._unbounded, run.recorded_config = Differences(), 0, None
     run.compare(record)
     assert run.summary() == (
         "replay: all 1 as they were recorded, every number the same; "
@@ -314,4 +330,22 @@ def test_a_recording_from_before_protection_levels_is_compared_by_what_it_says()
     )
     run.source.record = msgspec.structs.replace(then, rms_px=9.0)
     run.compare(record)
-    assert "1 of 2 otherwise than recorded" in run.summary()
+    assert run.summary().startswith(
+        "replay: verdicts, states and alerts of all 2 frames as recorded; numbers differ in 1, the TCP by up to 0 mm; "
+    )
+
+
+def test_a_replay_says_first_what_it_judges_otherwise():
+    differences = Differences()
+    worse = msgspec.structs.replace(WARNED, event=AlertEvent.UPDATED, text="more")
+    for seq in range(10):
+        alerts = {3: (WARNED,), 6: (worse,)}.get(seq, ())
+        then = recorded.record(seq, alerts=alerts)
+        now = msgspec.structs.replace(then, verdict=Verdict.SUSPECT, reason="far off") if seq == 8 else then
+        if seq == 6:
+            now = msgspec.structs.replace(now, alerts=(msgspec.structs.replace(worse, severity=Severity.ERROR),))
+        differences.add(then, now)
+    assert differences.text(from_jpeg=False) == (
+        "1 frame with another verdict (the first: frame 8, suspect instead of valid); alerts differ: creep becomes "
+        "error at frame 6, not recorded; numbers differ in 2, the TCP by up to 0 mm"
+    )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import html
 import re
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
 from gripmon.hindsight import correct
+from gripmon.playback import Picture
 from gripmon.records import (
     AlertEvent,
     AlertKind,
@@ -25,6 +28,7 @@ from gripmon.records import (
 from gripmon.records.recorded import RecordedFile
 from gripmon.report import Report, build
 from gripmon.report.page import page
+from gripmon.report.pictures import Looked, together
 
 SECOND_NS = 1_000_000_000
 
@@ -396,3 +400,61 @@ def test_a_step_that_no_alert_told_of_is_found_afterwards():
     assert event.kind == "step" and event.noticed_ns is None and event.onset.found_by == "hindsight"
     assert event.onset.earliest_ns <= START_NS + 500 * PERIOD_NS <= event.onset.latest_ns
     assert event.moved.size_m == pytest.approx(1e-3, abs=1e-5)
+
+
+def test_a_drift_that_was_one_step_is_placed_at_its_change_point():
+    """Noticed two seconds late, when nothing was certain at the time: afterwards the frames show when it was."""
+    shifts_m = np.zeros((500, 3))
+    shifts_m[200:, 1] = 9e-4
+    run = records(shifts_m)
+    rng = np.random.default_rng(1)
+    for i in range(200, 260):  # what was measured meanwhile is wild
+        wild = records(np.array([shifts_m[i] + rng.normal(size=3) * 8e-4]), seed=i)[0]
+        run[i] = msgspec.structs.replace(run[i], cam_T_grip=wild.cam_T_grip, drift=wild.drift, verdict=Verdict.SUSPECT)
+    said(run, 300, kind=AlertKind.DRIFT, severity=Severity.WARNING)
+    recording = only(Run(run))
+    (event,) = recording.events
+    assert event.kind == "step" and event.onset.found_by == "hindsight"
+    assert abs(event.onset.stamp_ns - (START_NS + 200 * PERIOD_NS)) <= 2 * PERIOD_NS
+    assert event.moved.size_m == pytest.approx(9e-4, rel=0.2)
+    (old,) = [a for a in recording.affected if a.what == "old_calibration"]
+    assert old.start_ns == event.onset.stamp_ns and "it moved at once" in recording.summary
+
+
+def test_a_drift_that_takes_its_time_stays_one_and_its_times_off_do_not_overlap():
+    t = np.arange(1000) / FPS
+    shifts_m = np.zeros((1000, 3))
+    shifts_m[:, 1] = np.clip(t - 5.0, 0.0, 6.0) * 2e-4
+    shifts_m[450:500, 1] = 2e-5  # for a second nearly back, and out again
+    run = records(shifts_m)
+    said(run, 400, kind=AlertKind.DRIFT, severity=Severity.WARNING)
+    report, told = build([Run(run)])
+    (recording,) = report.recordings
+    assert [event.kind for event in recording.events][:1] == ["drift"]
+    old = [a for a in recording.affected if a.what == "old_calibration"]
+    assert len(old) == 2 and old[0].end_ns <= old[1].start_ns
+    within_s = 1e-9 * sum(a.end_ns - a.start_ns for a in old)
+    assert within_s < 1e-9 * (recording.end_ns - old[0].start_ns) - 0.5
+    assert f"Old calibration off {within_s:.1f} s" in text_of(page(report, told))
+
+
+def test_a_motion_has_pictures_before_it_at_it_and_after_it():
+    run = stepped(image_seqs=np.arange(0, 500, 10))
+    for i in range(250, 285):
+        run.records[i] = msgspec.structs.replace(run.records[i], verdict=Verdict.SUSPECT)
+    (event,) = only(run).events
+    assert (event.before_seq, event.at_seq, event.after_seq) == (240, 250, 290)
+
+
+def test_what_was_not_believed_is_not_shown_in_green():
+    points = np.stack([np.arange(20.0, 300.0, 4.0), np.full(70, 100.0)], axis=1).astype(np.float32)
+    picture = Picture(
+        7, START_NS, np.zeros((240, 320), np.uint8), "image/png", points, points[:0], (points[:2],), points[:0], ()
+    )
+    green = []
+    for believed in (True, False):
+        (shown,) = together([Looked(picture, believed)])
+        data = np.frombuffer(base64.b64decode(shown.uri.partition(",")[2]), np.uint8)
+        blue, middle, red = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int).transpose(2, 0, 1)
+        green.append(int((middle - np.maximum(blue, red) > 60).sum()))
+    assert green[0] > 200 and green[1] == 0

@@ -223,5 +223,5 @@ def test_without_rosbags_it_says_what_to_install(tmp_path: Path):
         capture_output=True, text=True, timeout=60.0, env=os.environ | {"PYTHONPATH": paths},
     )  # fmt: skip
     assert done.returncode == 2
-    assert "ros2.enabled: needs the package rosbags; pip install '.[ros2]' in gripmon's checkout" in done.stderr
+    assert "ros2.enabled: needs the package rosbags; pip install -e '.[ros2]' in gripmon's checkout" in done.stderr
     assert "Traceback" not in done.stderr

@@ -157,7 +157,7 @@ def test_a_gripper_without_faces_is_drawn_by_its_edges(tmp_path: Path, capsys: p
     )
     said = capsys.readouterr().out
     assert "best " in said and "no faces   The gripper file has none" in said
-    assert main(["check", str(config)]) == 0
+    assert main(["check", str(config), "--verbose"]) == 0
     assert "the gripper file has no faces: what the finger itself hides isn't known" in capsys.readouterr().out
     # The present mount's thumbnail, the second of three, shows dark lines on blank grey and little else.
     second = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)[-400:-120, 530:970]

@@ -29,6 +29,7 @@ from gripmon.corners.taught import TaughtEdge, gripper_digest
 from gripmon.geometry import to_record
 from gripmon.gripper import load_gripper
 from gripmon.teaching.document import to_yaml
+from gripmon.teaching.picture import Labels
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4
@@ -163,7 +164,7 @@ def test_replay_with_the_taught_model_is_right_where_it_was_a_fifth_of_a_millime
 
 
 def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["check", str(rig / "config.yaml")]) == 0
+    assert main(["check", str(rig / "config.yaml"), "--verbose"]) == 0
     (line,) = [x for x in capsys.readouterr().out.splitlines() if x.startswith("taught ")]
     assert "10 edges from 3 images" in line and "µm" in line and "px)" in line and "not taught" not in line
     assert main(["check", str(rig / "config.yaml"), "--json"]) == 0
@@ -177,7 +178,7 @@ def test_check_tells_of_the_taught_model(rig: Path, taught: Path, capsys: pytest
     assert main(["check", str(rig / "config.yaml"), "--sweep", "--distance", "0.12", "--tilt", "30", "--json"]) == 0
     present = json.loads(capsys.readouterr().out)["present"]
     assert present["sigma"]["tcp_m"] == pytest.approx(report["accuracy"]["expected"]["tcp_m"], rel=1e-9)
-    assert main(["check", str(rig / "untaught.yaml")]) == 0
+    assert main(["check", str(rig / "untaught.yaml"), "--verbose"]) == 0
     assert "gripmon teach" in capsys.readouterr().out
 
 
@@ -413,3 +414,16 @@ def test_the_gripper_files_digest_is_that_of_its_content():
     one, two = load_gripper(BOX_FINGERS), load_gripper(BOX_FINGERS)
     assert gripper_digest(one) == gripper_digest(two) and len(gripper_digest(one)) == 64
     assert TaughtEdge.__struct_config__.forbid_unknown_fields
+
+
+def test_labels_in_the_picture_do_not_lie_over_each_other_nor_leave_it():
+    picture = np.full((300, 400, 3), 128, np.uint8)
+    labels = Labels(picture)
+    labels.title("a_gripper_with_a_long_name: sharp model (blue), taught outlines (orange), creases (green)", "offsets")
+    for k, at in enumerate([(200, 150)] * 4 + [(2, 2), (398, 298), (398, 2), (203, 152)]):
+        labels.put(f"left_inner_near {k}", at, (0, 200, 255))
+    assert len(labels.boxes) == 10
+    for k, (left, top, right, bottom) in enumerate(labels.boxes):
+        assert left >= 0 and top >= 0 and right <= 400 and bottom <= 300
+        for other in labels.boxes[:k]:
+            assert left >= other[2] or right <= other[0] or top >= other[3] or bottom <= other[1]

@@ -192,7 +192,7 @@ def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
     with page(rig.image_path, "--camera", rig.options[1], "--out", tmp_path) as running:
         visitor = Visitor(driver, running.url)
         assert "4 of the 4 inner corners to go" in visitor.text("#status")
-        assert "Nothing snaps" in visitor.text("#status") and visitor.text("#save") == "Save corners"
+        assert "corners don't snap" in visitor.text("#status") and visitor.text("#save") == "Save corners"
         assert visitor.find("#save").get_attribute("disabled")
         u, v = rig.rough("L_in_near")["L_in_near"]
         visitor.drag("left_inner_near", u, v)

@@ -178,7 +178,7 @@ def test_a_gripper_in_no_image_has_neither_border_nor_freedom():
 
 def test_check_tells_the_margins(capsys: pytest.CaptureFixture[str]):
     path = str(builtin_config("demo.yaml"))
-    assert main(["check", path]) == 0
+    assert main(["check", path, "--verbose"]) == 0
     text = capsys.readouterr().out
     assert main(["check", path, "--json"]) == 0
     values = json.loads(capsys.readouterr().out)["in_view"]
@@ -203,10 +203,10 @@ def test_check_says_where_the_jaws_leave_the_view_and_when_the_margin_is_small(
     text = demo.read_text().replace("gripper: grippers", f"gripper: {demo.parent}/grippers")
     path = tmp_path / "near.yaml"
     path.write_text(text.replace("[0.0004, 0.0014, 0.1188]", "[0.012, 0.0014, 0.075]"))
-    assert main(["check", str(path)]) == 0
+    assert main(["check", str(path), "--verbose"]) == 0
     said = capsys.readouterr().out
     assert "NOT from" in said and "outside of the image" in said
     assert "LESS than" not in said
     path.write_text(path.read_text().replace("monitor:\n", "monitor:\n  policy: {limit_m: 0.1}\n", 1))
-    assert main(["check", str(path)]) == 0
+    assert main(["check", str(path), "--verbose"]) == 0
     assert "LESS than the shift past which the reference is measured anew, 100 mm" in capsys.readouterr().out

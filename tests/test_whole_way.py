@@ -156,11 +156,22 @@ def test_taught_without_a_page_the_running_monitor_notices_a_knock(
     live = _lines(tmp_path / "run" / "estimates.jsonl")
     assert [_decided(r) for r in live] == [_decided(r) for r in records]
     capsys.readouterr()
-    assert main(["report", str(tmp_path / "run"), "--out", str(tmp_path / "report.html")]) == 0
+    page, data = str(tmp_path / "report.html"), tmp_path / "report.json"
+    assert main(["report", str(tmp_path / "run"), "--out", page, "--json", str(data)]) == 0
     assert "moved once" in capsys.readouterr().out and (tmp_path / "report.html").exists()
+    _placed_at_the_knock(json.loads(data.read_text())["recordings"][0], live)
     estimates = str(tmp_path / "run" / "estimates.jsonl")
     assert main(["calibrate", "verify", str(calibrated / "hand_eye.yaml"), estimates]) == 3
     assert "different" in capsys.readouterr().out
+
+
+def _placed_at_the_knock(reported: dict[str, Any], live: list[dict[str, Any]]) -> None:
+    """Whatever the monitor called it at the time, and though it noticed it later."""
+    (moved,) = [event for event in reported["events"] if event["moved"] is not None]
+    off_s = 1e-9 * (moved["onset"]["stamp_ns"] - live[STEP]["stamp_ns"])
+    assert abs(off_s) < 2.5 / new_user.FPS and moved["kind"] == "step"
+    old = [each for each in reported["affected"] if each["what"] == "old_calibration"]
+    assert sum(each["end_ns"] - each["start_ns"] for each in old) <= reported["end_ns"] - moved["onset"]["earliest_ns"]
 
 
 def _given(calibrated: Path) -> list[object]:
@@ -172,7 +183,7 @@ def _given(calibrated: Path) -> list[object]:
 
 def _checked(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert main(["check", str(config)]) == 0
+    assert main(["check", str(config), "--verbose"]) == 0
     said = capsys.readouterr().out
     assert "sound" in said and "smallest step that is noticed" in said and "weakest" in said
 

@@ -196,7 +196,8 @@ def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
 def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str) -> NotFound:
     # The longer side first, as the target's.
     seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
-    return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}")
+    larger = max(seen) > max(columns, rows) or min(seen) > min(columns, rows)
+    return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}", larger)
 
 
 def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:

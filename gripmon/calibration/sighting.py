@@ -40,6 +40,7 @@ class Sighting:
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Why no target was found; one line for a person."""
+    """Why no target was found; one line for a person.  ``larger``: one was, with more points than it should have."""
 
     reason: str
+    larger: bool = False

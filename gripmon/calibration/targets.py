@@ -53,6 +53,7 @@ _FORMS: dict[str, str] = {
 def parse_target(text: str) -> Target:
     """A target from a command line.  ValueError: what is wrong; what would be right."""
     kind, *parts = text.split(":")
+    kind = "chequerboard" if kind == "checkerboard" else kind
     if kind not in _FORMS:
         raise ValueError(f"'{kind}' is no target; {' or '.join(_FORMS.values())}")
     right = _FORMS[kind]

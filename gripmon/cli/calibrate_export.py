@@ -55,7 +55,7 @@ def add_parser(methods: Any) -> None:
     parser.add_argument(
         "--fit",
         action="store_true",
-        help="cameras: if the format hasn't the lens, write the nearest Brown-Conrady; how far off it is is said",
+        help="cameras: if the format lacks this lens, write the nearest Brown-Conrady and print how far off it is",
     )
     frames = parser.add_argument_group("frames of a hand/eye transform")
     help_of = {

@@ -14,7 +14,7 @@ CAMERA_FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 
 _DESCRIPTION = """\
 Take over a camera that another program has calibrated: ROS camera_info, Kalibr camchain, OpenCV
-FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is told by the content."""
+FileStorage (YAML, XML, JSON) or mrcal .cameramodel.  The format is recognised by its content."""
 
 _EXAMPLES = """\
   gripmon calibrate import camera_info.yaml --out camera.yaml
@@ -30,7 +30,7 @@ def add_parser(methods: Any) -> None:
         methods, "import", run, "a camera from a file of ROS, Kalibr, OpenCV or mrcal", _DESCRIPTION, _EXAMPLES
     )
     parser.add_argument("file", metavar="FILE", help="file of the other program")
-    parser.add_argument("--format", choices=CAMERA_FORMATS, help="its format (default: told by the content)")
+    parser.add_argument("--format", choices=CAMERA_FORMATS, help="its format (default: recognised by its content)")
     parser.add_argument("--camera", metavar="CAM", help="which camera of a camchain, e.g. cam1 (default: the only one)")
     parser.add_argument(
         "--size", type=_size, metavar="WIDTHxHEIGHT", help="image size (px), of an OpenCV file that doesn't say it"

@@ -153,6 +153,7 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
     from gripmon.calibration.sighting import NotFound
 
     views = _Views([], {})
+    larger: list[str] = []
     with common.progress_bar(len(paths), "image") as step:
         for path, image in files.images_of(paths):
             try:
@@ -161,6 +162,7 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
                 raise common.CommandFailedError(f"--target: {error}", common.EXIT_USAGE) from None
             if isinstance(sight, NotFound):
                 views.not_found[str(path)] = sight.reason
+                larger += [f"{path}: {sight.reason}"] if sight.larger else []
             else:
                 views.sightings.append(sight)
             step()
@@ -173,6 +175,12 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
         why = reason if times == len(paths) else f"{times} of them: {reason}"
         count = "the image doesn't show" if len(paths) == 1 else f"none of {len(paths)} images shows"
         raise common.CommandFailedError(f"calibrate intrinsics: {count} the target ({why})")
+    if larger:
+        # Where the rest of it is hidden or out of view, the smaller one fits as well: those images prove nothing.
+        raise common.CommandFailedError(
+            f"--target: {len(larger)} of {len(paths)} images show a larger one ({larger[0]}); its full size",
+            common.EXIT_USAGE,
+        )
     return views
 
 

@@ -143,6 +143,8 @@ def _look(method: KnownGripper | UnknownGripper, target: Any, path: Path, image:
     except ValueError as error:
         raise common.CommandFailedError(f"--target: {error}", common.EXIT_USAGE) from None
     if isinstance(sight, NotFound):
+        if sight.larger:
+            raise common.CommandFailedError(f"--target: {path}: {sight.reason}; its full size", common.EXIT_USAGE)
         raise CalibrationError(sight.reason)
     if isinstance(method, KnownGripper):
         return method.look(image, sight, rough)

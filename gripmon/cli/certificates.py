@@ -29,7 +29,7 @@ _EXAMPLES = """\
   gripmon certificates dashboard --out certificates           one more client
   gripmon certificates central --host 10.0.0.1 --out certificates       another router; without --host a client
 
-It needs the package cryptography: pip install '.[certificates]' in gripmon's checkout.
+It needs the package cryptography: pip install -e '.[certificates]' in gripmon's checkout.
 exit codes: 0 done; 2 wrong usage, a folder that can't be written to"""
 
 _CLIENTS = ("controller", "operator")
@@ -77,7 +77,9 @@ def make(arguments: argparse.Namespace) -> int:
     try:
         from gripmon.wire.certificates import Authority, read
     except ImportError:
-        text = "certificates: the package cryptography is missing; pip install '.[certificates]' in gripmon's checkout"
+        text = (
+            "certificates: the package cryptography is missing; pip install -e '.[certificates]' in gripmon's checkout"
+        )
         raise common.CommandFailedError(text, common.EXIT_USAGE) from None
     if arguments.rules and not arguments.robot:
         raise common.CommandFailedError("certificates: --rules for whom? add --robot NAME", common.EXIT_USAGE)

@@ -7,21 +7,34 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, common, expected, margins, outside, promising, second_check, second_run, sweep
+from gripmon.cli import (
+    check_laser,
+    common,
+    expected,
+    findings,
+    margins,
+    outside,
+    promising,
+    second_check,
+    second_run,
+    sweep,
+)
 
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.config.checks import View
 
 _DESCRIPTION = """\
-Validate a configuration, its gripper file and its source, and print what the calibration expects
-to see: where the fingertip corners are in the image (px), which of them and which edges are
-visible, how far away the gripper is (mm), how exact one frame will be along each axis, what the
-view can't tell apart (an unknown jaw opening and the distance), whether its corners suffice to
-calibrate anew, how far camera and jaws may move until too little is in view.
+Validate a configuration, its gripper file and its source, and say of each thing that matters whether
+it is in order: OK, WARN (the monitor runs, but not all that is expected of it will come) or FAIL (it
+can't do its work).
 
-Of a second camera (a configuration with a section laser): its calibration and what is known of its
-errors, and where frames and pulses come from.
+With --verbose, also what the calibration expects to see: where the fingertip corners are in the image
+(px), which of them and which edges are visible, how far away the gripper is (mm), how exact one frame
+will be along each axis, what the view can't separate (an unknown jaw opening and the distance), whether
+its corners suffice to recalibrate, how far camera and jaws may move until too little is in view.  Of a
+second camera (a configuration with a section laser): its calibration, what is known of its errors, and
+what fresh spots would show.
 
 With --laser, in place of a configuration: does a laser calibration still hold?  Which motions of
 camera, plane and laser pointer fresh spots would tell, or do tell.
@@ -31,16 +44,17 @@ anyone drills a hole."""
 
 _EXAMPLES = """\
   gripmon check configs/live_camera.yaml
-  gripmon check configs/folder.yaml --json | python3 -m json.tool
+  gripmon check configs/demo.yaml --verbose
+  gripmon check configs/demo.yaml --json | python3 -m json.tool
   gripmon check configs/folder.yaml --sweep --distance 0.08:0.2:7 --tilt 10:60:6 --picture sweep.png
   gripmon check configs/folder.yaml --sweep --fov 40,60,80 --roll 0,90 --at 384,288
   gripmon check --laser laser.yaml
   gripmon check --laser laser.yaml fresh_spots.csv --arm-noise 0.0002:0.0004
 
-exit codes: 0 sound; 2 a fault in the configuration, in a file of Zenoh's that it names, or a package
-that it needs is missing (one line says file, key, what is wrong, what would be right); 3 the
-configuration is sound, but its camera can't be reached now; or something has moved since a laser
-calibration, or its spots don't tell"""
+exit codes: 0 sound, perhaps with warnings; 2 a fault in the configuration, in a file of Zenoh's that it
+names, or a package that it needs is missing (one line says file, key, what is wrong, what would be
+right); 3 a line says FAIL, such as a camera that can't be reached now; or something has moved since a
+laser calibration, or its spots don't tell"""
 
 
 def add_parser(commands: Any) -> None:
@@ -52,6 +66,7 @@ def add_parser(commands: Any) -> None:
         "config", nargs="*", metavar="CONFIG", help="configuration file (YAML); with --laser: tables of fresh spots"
     )
     parser.add_argument("--json", action="store_true", help="one JSON object instead of text; metres, radians, px")
+    parser.add_argument("--verbose", action="store_true", help="what the calibration expects to see, in numbers")
     sweep.add_options(parser)
     check_laser.add_options(parser)
 
@@ -74,11 +89,16 @@ def run(arguments: argparse.Namespace) -> int:
     sweep.refuse_without_sweep(arguments)
     second = second_run.load(arguments.config)
     if second is not None:
-        return second_check.run(second, as_json=arguments.json)
+        return second_check.run(second, as_json=arguments.json, verbose=arguments.verbose)
     config = common.load(arguments.config)
     report = {**expectation(config), "zenoh": outside.zenoh_values(config), "source": outside.source_report(config)}
-    print(json.dumps(report, indent=2) if arguments.json else _as_text(report))
-    return common.EXIT_FAILED if report["source"]["reachable"] is False else common.EXIT_DONE
+    found = findings.of_wrist(report)
+    if arguments.json:
+        print(json.dumps({"findings": findings.plain(found), **report}, indent=2))
+    else:
+        lines = findings.lines(report["config"], found)
+        print("\n".join([*lines, "", *_details(report)] if arguments.verbose else lines))
+    return findings.exit_code(found)
 
 
 def expectation(config: Config) -> dict[str, Any]:
@@ -134,7 +154,8 @@ def _camera_values(config: Config) -> dict[str, Any]:
 def _reference_values(config: Config) -> dict[str, Any]:
     import numpy as np
 
-    from gripmon.geometry import rotation_angle
+    from gripmon.geometry import invert, rotation_angle
+    from gripmon.outlook import Mount
 
     reference, cam_T_grip = config.reference, config.cam_T_grip
     return {
@@ -144,7 +165,23 @@ def _reference_values(config: Config) -> dict[str, Any]:
         "distance_m": float(np.linalg.norm(cam_T_grip[:3, 3])),
         "turn_rad": rotation_angle(cam_T_grip[:3, :3]),
         "metres_per_px": float(cam_T_grip[2, 3]) / config.camera.fx_px,
+        "tilt_rad": Mount.of(cam_T_grip).tilt_rad,
+        "camera_ahead_m": float(invert(cam_T_grip)[2, 3]),
+        "sound_as_wxyz": _sound_as_wxyz(config),
     }
+
+
+def _sound_as_wxyz(config: Config) -> bool:
+    """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips and in
+    view of them.
+    """
+    from gripmon.geometry import invert, make_transform, rotation_from_xyzw
+    from gripmon.outlook import see
+
+    w, x, y, z = config.reference.cam_T_grip.rotation_xyzw
+    cam_T_grip = make_transform(rotation_from_xyzw((x, y, z, w)), config.cam_T_grip[:3, 3])
+    behind = float(invert(cam_T_grip)[2, 3]) < 0.0
+    return behind and see(margins.rig_of(config), cam_T_grip, config.jaw_opening_m).enough
 
 
 def _taught_values(config: Config) -> dict[str, Any] | None:
@@ -184,7 +221,7 @@ def _corner_values(names: tuple[str, ...], view: View) -> list[dict[str, Any]]:
     ]
 
 
-def _as_text(report: dict[str, Any]) -> str:
+def _details(report: dict[str, Any]) -> list[str]:
     edges = [edge["id"] for edge in report["edges"] if edge["visible"]]
     seen = sum(corner["visible"] for corner in report["corners"])
     sections = {
@@ -195,18 +232,17 @@ def _as_text(report: dict[str, Any]) -> str:
         "edges": f"{len(edges)} of {len(report['edges'])} visible: {', '.join(edges)}",
         "corners": f"{seen} of {len(report['corners'])} visible:",
     }
-    lines = [f"{report['config']}: sound"]
-    lines += [f"{name:<10} {text}" for name, text in sections.items()]
+    lines = [f"{name:<10} {text}" for name, text in sections.items()]
     if not report["gripper"]["faces"]:
         # Before the corners, whose list follows.
         lines.insert(-1, " " * 11 + "the gripper file has no faces: what the finger itself hides isn't known")
     lines[2:2] = [" " * 11 + note for note in report["gripper"]["notes"]]
-    lines += [_corner_line(corner) for corner in report["corners"]]
+    width = max(len(corner["id"]) for corner in report["corners"])
+    lines += [_corner_line(corner, width) for corner in report["corners"]]
     lines += expected.accuracy_lines(report["accuracy"])
     lines.append(f"promise    {report['promise']}")
     lines += margins.in_view_lines(report["in_view"])
-    lines += outside.lines(report)
-    return "\n".join(lines)
+    return lines + outside.lines(report)
 
 
 def _camera_line(camera: dict[str, Any]) -> str:
@@ -243,7 +279,7 @@ def _taught_line(taught: dict[str, Any] | None, visible: list[str]) -> str:
     return f"{count}; {farthest}" + (f"; visible, but not taught: {', '.join(missing)}" if missing else "")
 
 
-def _corner_line(corner: dict[str, Any]) -> str:
+def _corner_line(corner: dict[str, Any], width: int) -> str:
     reason = {None: "", "outside": "outside of the image", "self_hidden": "hidden by its own finger"}[corner["reason"]]
     place = "       —       " if corner["uv_px"] is None else "({:6.1f}, {:6.1f})".format(*corner["uv_px"])
-    return f"           {corner['id']:<14} {place} px  {1e3 * corner['distance_m']:6.1f} mm  {reason}".rstrip()
+    return f"           {corner['id']:<{width}} {place} px  {1e3 * corner['distance_m']:6.1f} mm  {reason}".rstrip()

@@ -14,12 +14,12 @@ _DIRECTIONS = (
     "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
 )  # fmt: skip
 _POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
-_STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is told
-_JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is told
+_STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is given
+_JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given
 
 
 def accuracy(config: Config) -> dict[str, Any]:
-    """What one frame may tell, as plain values for JSON: metres, radians, px.  With too few edges only that."""
+    """What one frame can show, as plain values for JSON: metres, radians, px.  With too few edges only that."""
     from gripmon.outlook import EDGE_POINT_SIGMA_PX, FEWEST_EDGES, expect
 
     settings = config.settings.monitor
@@ -120,7 +120,7 @@ def accuracy_lines(values: dict[str, Any]) -> list[str]:
 def _jaw_lines(jaw: dict[str, Any]) -> list[str]:
     unknown, growth = jaw["unknown"], jaw["growth"]
     shift_m = [_JAW_ERROR_M * v for v in jaw["pose_per_jaw_m"]["tcp_m"]]
-    told = f"{'hardly tells' if growth >= _POORLY else 'tells'} the opening from {jaw['like']}"
+    told = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw['like']}"
     less = f"{growth:.1f} times less certain than with it"
     return [
         f"jaw        opening reported to {1e3 * jaw['reported_sigma_m']:.3f} mm; if it were unknown:",
@@ -137,12 +137,13 @@ def _drift_lines(drift: dict[str, Any]) -> list[str]:
         f"           {drift['correlation_frames']:.0f} frames the smallest step that is noticed: "
         + _sigmas(drift["smallest"]),
     ]
+    lines.append("           on average, by means over 1, 2, 4 … 4096 frames, each complete one frame later:")
     for size, delays in drift["delay_frames"].items():
-        told = ", ".join(
-            f"{axis} {'not at all' if frames is None else f'in {frames} frames'}"
+        noticed = ", ".join(
+            f"{axis} {'never' if frames is None else f'within {frames} frames'}"
             for axis, frames in zip("xyz", delays, strict=True)
         )
-        lines.append(f"           a step of the TCP by {1e3 * float(size):g} mm along {told}")
+        lines.append(f"           a step of the TCP by {1e3 * float(size):g} mm is noticed along {noticed}")
     return lines
 
 

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
+    import csv
+
     from gripmon.calibration.laser.calibrating import Spots
     from gripmon.calibration.laser.planning import Plan
     from gripmon.calibration.laser.samples import Samples
@@ -80,6 +82,15 @@ def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
     import csv
 
     reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
+    try:
+        return _rows_of(path, reader)
+    except csv.Error as error:
+        raise common.CommandFailedError(
+            f"{path}: line {reader.line_num}: {error} (an open quote?); a table of samples", common.EXIT_USAGE
+        ) from None
+
+
+def _rows_of(path: Path, reader: csv.DictReader[str]) -> tuple[list[dict[str, Any]], list[str]]:
     rows: list[dict[str, Any]] = []
     places = []
     header = reader.fieldnames or []
@@ -110,7 +121,7 @@ def _json(path: Path) -> Any:
 
     try:
         return json.loads(_text(path))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise common.CommandFailedError(f"{path}: not JSON: {error}; a JSON file", common.EXIT_USAGE) from None
 
 

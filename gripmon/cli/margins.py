@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from gripmon.cli.findings import past_limit
+
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.outlook import Rig
@@ -158,15 +160,11 @@ def _certainty_lines(values: dict[str, Any]) -> list[str]:
         return []
     least_m, at_m = max(known)
     lines = [f"           the TCP is least certain at {1e3 * at_m:.1f} mm of opening: to {1e3 * least_m:.3f} mm"]
-    columns = zip(values["opening_m"], values["protection_m"], values["protection_rad"], strict=True)
-    bounds = [(opening_m, bound_m, rad) for opening_m, bound_m, rad in columns if bound_m is not None]
-    limit_m, limit_rad = values["alert_limit_m"], values["alert_limit_rad"]
-    past = [opening_m for opening_m, bound_m, rad in bounds if bound_m > limit_m or rad > limit_rad]
-    if past:
-        where = f"from {1e3 * min(past):.1f} to {1e3 * max(past):.1f} mm" if len(past) > 1 else "there"
-        worst = f"{1e3 * max(m for _, m, _ in bounds):.2g} mm, {math.degrees(max(r for _, _, r in bounds)):.2g} degrees"
+    if (past := past_limit(values)) is not None:
+        worst_m, worst_rad = (max(v for v in values[k] if v is not None) for k in ("protection_m", "protection_rad"))
+        worst = f"{1e3 * worst_m:.2g} mm, {math.degrees(worst_rad):.2g} degrees"
         lines.append(
-            f"           no transform is valid {where}: bounds of up to {worst} (monitor.policy.alert_limit_m, _rad)"
+            f"           no transform is valid {past}: bounds of up to {worst} (monitor.policy.alert_limit_m, _rad)"
         )
     return lines
 

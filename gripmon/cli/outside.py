@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Sized
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from gripmon.cli import common
+from gripmon.cli import camera_source, common
 
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
@@ -55,54 +54,29 @@ def zenoh_values(config: Config | SecondConfig) -> dict[str, Any] | None:
 
 
 def source_report(config: Config | SecondConfig) -> dict[str, Any]:
-    """Kind, whether frames can come from it now (None: can't be told without starting it), and a few words."""
-    from gripmon.sources import FolderSettings, LiveSettings, NetworkSettings, VideoSettings, network_key
+    """Kind, whether frames can come from it now (None: only starting it would show), and a few words; ``odd`` where
+    something about it is.
+    """
+    from gripmon.sources import LiveSettings, NetworkSettings, network_key
     from gripmon.wire import Keys
 
     source = config.settings.source
     kind = type(source).__struct_config__.tag
-    if isinstance(source, FolderSettings | VideoSettings):
-        return {"kind": kind, "reachable": True, "detail": _first_frame(config)}
+    if (recorded := camera_source.look_ahead(config)) is not None:
+        return {"kind": kind, "reachable": True, **recorded._asdict()}
     if isinstance(source, LiveSettings):
         reachable, detail = _live_reachable(source)
-        return {"kind": kind, "reachable": reachable, "detail": detail}
+        return {"kind": kind, "reachable": reachable, "detail": detail, "odd": None}
     if isinstance(source, NetworkSettings):
         key = network_key(source, Keys(config.settings.robot, config.settings.camera_name)["image"])
-        return {
-            "kind": kind,
-            "reachable": None,
-            "detail": f"frames on {key}: can't be told without joining the network",
-        }
-    return {"kind": kind, "reachable": True, "detail": "made by this program"}
-
-
-def _first_frame(config: Config | SecondConfig) -> str:
-    """Describe the first frame of recorded input; one that doesn't fit the camera ends the command."""
-    from gripmon.records import Frame
-    from gripmon.sources import SourceError, open_source
-
-    try:
-        source = open_source(config.settings.source, config.directory)
-    except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
-    frame = source.read()
-    source.close()
-    if not isinstance(frame, Frame) or frame.image is None:
-        raise common.CommandFailedError(
-            f"{config.path}: source.path: its first frame can't be read; a readable image", common.EXIT_FAILED
-        )
-    height_px, width_px = frame.image.shape[:2]
-    if (width_px, height_px) != (config.camera.width_px, config.camera.height_px):
-        raise common.CommandFailedError(
-            f"{config.path}: {_camera_key(config)}: {config.camera.width_px} x {config.camera.height_px} px; "
-            f"{frame.name} is {width_px} x {height_px}; the calibration that belongs to these images",
-            common.EXIT_USAGE,
-        )
-    count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
-    return f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
+        detail = f"frames on {key}; only running it shows whether any arrive"
+        return {"kind": kind, "reachable": None, "detail": detail, "odd": None}
+    return {"kind": kind, "reachable": True, "detail": "made by this program", "odd": None}
 
 
 def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
+    from gripmon.sources.live import shown_name
+
     device = source.device
     if isinstance(device, int) or device.isdecimal():
         device = f"/dev/video{device}"
@@ -117,14 +91,7 @@ def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
                 return True, f"{where[0]}:{where[1]} answers"
         except OSError as error:
             return False, f"{where[0]}:{where[1]} does not answer ({error.strerror or error}); run keeps trying"
-    return None, f"{device}: can't be told without starting it"
-
-
-def _camera_key(config: Config | SecondConfig) -> str:
-    """Which key the size of an image belongs to."""
-    from gripmon.config import SecondConfig
-
-    return "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"
+    return None, f"{shown_name(device)}; only running it shows whether it delivers"
 
 
 def _zenoh_line(keys: str | None, session: dict[str, Any] | None) -> str:

@@ -76,7 +76,9 @@ def report(inputs: Inputs, looks: Sequence[Look], result: PlaneCalibration, argu
         print(json.dumps(_values(inputs, looks, result, arguments), indent=2))
         return
     width = max(len(image.sighting.name) for image in result.images)
-    print(f"{'image':<{width}}  plate points     rms  corners  residual  tilt about x, y          gap")
+    compared = any(look.coincidence.tilt_rad is not None for look in looks)
+    apart = "  tilt about x, y          gap" if compared else ""
+    print(f"{'image':<{width}}  plate points     rms  corners  residual{apart}")
     for look in looks:
         print(_image_line(look.coincidence, width))
     for note in inputs.notes:

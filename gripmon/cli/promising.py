@@ -34,6 +34,7 @@ def values(config: Config) -> dict[str, Any]:
         "alert_limit_m": policy.alert_limit_m,
         "alert_limit_rad": policy.alert_limit_rad,
         "reachable": found is not None and found.reachable,
+        "needed": None if found is None or found.reachable else found.needed,
         "promise": "nothing: too little is in view" if found is None else found.text(),
     }
 

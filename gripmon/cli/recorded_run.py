@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli import common
 from gripmon.cli.one_recording import keep
+from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
@@ -73,34 +74,27 @@ class RecordedRun:
                 f"{self.name}: holds no configuration; the one to replay with, by --config", common.EXIT_USAGE
             )
         self.config, self.past = self._begin(self.config)
-        self._frames = self._same = self._verdicts = self._states = self._unbounded = 0
+        self._differences, self._unbounded = Differences(), 0
         self._say_what_is_missing()
 
     def compare(self, record: FrameRecord) -> None:
         """Count what is decided now, about the frame that the source gave last, against what was then."""
-        import msgspec
-
         then = self.source.record
         assert then is not None, "every replayed frame has a record"
-        self._frames += 1
         said_less = then.protection is None and record.protection is not None
         self._unbounded += said_less
-        now = as_recorded_before_bounds(record) if said_less else record
-        self._same += msgspec.structs.replace(then, latency_ns=record.latency_ns) == now
-        self._verdicts += then.verdict is not record.verdict
-        self._states += then.state is not record.state
+        self._differences.add(then, as_recorded_before_bounds(record) if said_less else record)
 
     def summary(self) -> str:
-        """How many frames were judged otherwise than then."""
+        """What is otherwise than it was then."""
         lost, damaged = self.source.passed_over, self.source.images_damaged
         unread = f"; {lost} more could no longer be read" if lost else ""
         unread += f"; the recorded images of {damaged} frames are damaged" if damaged else ""
         if self._unbounded:
             unread += f"; {self._unbounded} frames were recorded by a version without protection levels"
-        if self._same == self._frames:
-            return f"replay: all {self._frames} as they were recorded, every number the same{unread}"
-        judged = f"{self._verdicts} another verdict, {self._states} another state"
-        return f"replay: {self._frames - self._same} of {self._frames} otherwise than recorded: {judged}{unread}"
+        recorded = self.recorded_config
+        from_jpeg = recorded is not None and recorded.settings.recording.image_format == "jpeg"
+        return f"replay: {self._differences.text(from_jpeg)}{unread}"
 
     @contextlib.contextmanager
     def compared_in(self, name: str) -> Iterator[ComparedRecorder]:

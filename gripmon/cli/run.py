@@ -10,16 +10,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, promising, second_run, viewing
+from gripmon.cli import camera_source, common, promising, second_run, viewing
 
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
     from gripmon.records import Alert, MonitorState
-    from gripmon.sources import Source
     from gripmon.statefile import StateFile
-    from gripmon.wire import Link
 
 _log = logging.getLogger(__name__)
 
@@ -100,6 +98,7 @@ def run(arguments: argparse.Namespace) -> int:
             take_over=arguments.take_over,
         )
     config = common.load(arguments.config)
+    camera_source.look_ahead(config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
     return run_daemon(
         config,
@@ -170,7 +169,7 @@ def run_daemon(
         publisher = with_metrics(config, network.publisher)
         opened.callback(publisher.close)
         on_network()
-        source = _open_source(config, network.link)
+        source = camera_source.open_source(config, network.link)
         opened.callback(source.close)
         patience_s = 0.0 if source.live else common.RECORDING_PATIENCE_S
         recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live, patience_s)
@@ -222,19 +221,6 @@ def _notices(kept: StateFile | None) -> list[Alert]:
 
     texts = () if kept is None else kept.notices
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
-
-
-def _open_source(config: Config, link: Link | None) -> Source:
-    from gripmon.sources import FullScale, SourceError, open_source
-    from gripmon.wire import Keys
-
-    settings, bit_depth = config.settings, config.settings.monitor.bit_depth
-    keys = Keys(settings.robot, settings.camera_name)
-    try:
-        source = open_source(settings.source, config.directory, scene=config.scene, link=link, keys=keys)
-        return source if bit_depth == 16 else FullScale(source, bit_depth)
-    except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 
 
 def _open_recorder(

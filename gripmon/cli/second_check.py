@@ -6,13 +6,13 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, common, outside
+from gripmon.cli import check_laser, findings, outside
 
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
 
 
-def run(config: SecondConfig, *, as_json: bool) -> int:
+def run(config: SecondConfig, *, as_json: bool, verbose: bool) -> int:
     """Print what the configuration comes to; returns the exit code."""
     watch = config.settings.laser.watch
     report = {
@@ -22,8 +22,13 @@ def run(config: SecondConfig, *, as_json: bool) -> int:
         "zenoh": outside.zenoh_values(config),
         "source": outside.source_report(config),
     }
-    print(json.dumps(report, indent=2) if as_json else _as_text(report))
-    return common.EXIT_FAILED if report["source"]["reachable"] is False else common.EXIT_DONE
+    found = findings.of_second(report)
+    if as_json:
+        print(json.dumps({"findings": findings.plain(found), **report}, indent=2))
+    else:
+        lines = findings.lines(report["config"], found)
+        print("\n".join([*lines, "", *_details(report)] if verbose else lines))
+    return findings.exit_code(found)
 
 
 def _values(config: SecondConfig) -> dict[str, Any]:
@@ -66,7 +71,7 @@ def _values(config: SecondConfig) -> dict[str, Any]:
     }
 
 
-def _as_text(report: dict[str, Any]) -> str:
+def _details(report: dict[str, Any]) -> list[str]:
     sections = {
         "second": f"{report['robot']}/{report['camera_name']}, watched by a pulsed laser",
         "camera": _calibration_line(report["calibration"]),
@@ -74,10 +79,9 @@ def _as_text(report: dict[str, Any]) -> str:
         "watch": _watch_line(report["watch"]),
         "pulses": _pulses_line(report["pulses"]),
     }
-    lines = [f"{report['config']}: sound"]
-    lines += [f"{name:<10} {text}" for name, text in sections.items()]
+    lines = [f"{name:<10} {text}" for name, text in sections.items()]
     lines += check_laser.expectation_lines(report["foreseen"])[1:]
-    return "\n".join([*lines, *outside.lines(report)])
+    return [*lines, *outside.lines(report)]
 
 
 def _calibration_line(calibration: dict[str, Any]) -> str:

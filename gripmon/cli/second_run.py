@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli import common
+from gripmon.cli import camera_source, common
 from gripmon.cli.viewing import LiveView
 
 if TYPE_CHECKING:
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from gripmon.daemon import Reports
     from gripmon.publish import SpotPublisher, ZenohCommands, ZenohPulses
     from gripmon.recording import SpotRecorder
-    from gripmon.sources import Source
     from gripmon.wire import Link
 
 
@@ -66,6 +65,7 @@ def run_second(
     from gripmon.cli.network import with_source
 
     settings, laser = config.settings, config.settings.laser
+    camera_source.look_ahead(config)
     lines = None if out is None else out / "spots.jsonl"
     if lines is not None:
         common.check_file(lines)
@@ -78,7 +78,7 @@ def run_second(
         opened.callback(network.publisher.close)
         publisher = _with_metrics(config, network.publisher)
         opened.callback(publisher.close)
-        source = _open_source(config, network.link)
+        source = camera_source.open_source(config, network.link)
         opened.callback(source.close)
         recorder = _open_recorder(config, out, live, 0.0 if source.live else common.RECORDING_PATIENCE_S)
         opened.callback(recorder.close)
@@ -154,18 +154,6 @@ def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublish
 
     metrics = metrics_server(config)
     return publisher if metrics is None else SpotPublishers(publisher, {"metrics": metrics})
-
-
-def _open_source(config: SecondConfig, link: Link | None) -> Source:
-    from gripmon.sources import SourceError, open_source
-    from gripmon.wire import Keys
-
-    settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
-    keys = Keys(settings.robot, settings.camera_name)
-    try:
-        return open_source(settings.source, config.directory, size_px=size_px, link=link, keys=keys)
-    except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
 
 
 def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None, patience_s: float) -> SpotRecorder:

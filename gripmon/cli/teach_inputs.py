@@ -157,7 +157,7 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
 
     with _faults_of(path):
         values = _yaml(path)
-        if "schema" not in values:
+        if "model" in values and "schema" not in values:
             lens: LensSettings = to_settings(values, LensSettings)  # type: ignore[arg-type]
             return lens, None
         made = read_camera(path)

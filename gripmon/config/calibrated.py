@@ -88,8 +88,20 @@ def _read(path: Path, kind: type[_T]) -> _T:
     values = read_yaml(path)
     tag = kind.__struct_config__.tag  # type: ignore[attr-defined]
     if values.get("schema") != tag:
-        raise ConfigError(path, "schema", f"is {values.get('schema')!r}", str(tag))
+        raise ConfigError(path, "schema", *wrong_schema(values, str(tag)))
     try:
         return to_settings(values, kind)
     except SettingsError as error:
         raise ConfigError(path, error.fault.key, error.fault.wrong, error.fault.right) from None
+
+
+_LOOKS_LIKE = {"points": "a gripper file", "gripper": "a configuration", "corners": "a file with corners"}
+
+
+def wrong_schema(values: dict[str, Any], tag: str) -> tuple[str, str]:
+    """What is wrong with a file that isn't of the wanted kind, and what would be right."""
+    schema = values.get("schema")
+    if schema is not None:
+        return f"is {schema!r}", tag
+    looks = next((f"; this looks like {what}" for key, what in _LOOKS_LIKE.items() if key in values), "")
+    return f"is missing{looks}", f"a file with schema: {tag}"

@@ -17,6 +17,7 @@ from gripmon.sources import (
     VideoSettings,
     network_key,
 )
+from gripmon.sources.live import backend_number
 from gripmon.wire import PublishSettings
 
 _NETWORK_JAWS = ("zenoh", "ros2_joint_state")
@@ -44,21 +45,30 @@ def network_fault(source: SourceSettings, publish: PublishSettings) -> Fault | N
     try:
         network_key(source, "")
     except SourceError as error:
-        key, _, text = str(error).partition(": ")
-        wrong, _, right = text.partition("; ")
-        return Fault(f"source.{key}", wrong, right)
+        return _fault_of(error)
     return None
 
 
 def source_fault(source: SourceSettings, directory: Path) -> Fault | None:
-    """A source of files that aren't there; their paths count from ``directory``."""
+    """A source of files that aren't there, or a camera that can't be any; paths count from ``directory``."""
     if isinstance(source, FolderSettings) and not (directory / source.path).is_dir():
         wrong = f"there is no folder {directory / source.path}"
         return Fault("source.path", wrong, "a folder with images, relative to this file")
     if isinstance(source, VideoSettings) and not (directory / source.path).is_file():
         wrong = f"there is no file {directory / source.path}"
         return Fault("source.path", wrong, "a video file, relative to this file")
+    if isinstance(source, LiveSettings):
+        try:
+            backend_number(source)
+        except SourceError as error:
+            return _fault_of(error)
     return None
+
+
+def _fault_of(error: SourceError) -> Fault:
+    key, _, text = str(error).partition(": ")
+    wrong, _, right = text.partition("; ")
+    return Fault(f"source.{key}", wrong, right)
 
 
 def _without_jaw(source: SourceSettings) -> str | None:

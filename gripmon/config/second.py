@@ -12,6 +12,7 @@ from msgspec import Meta
 from gripmon.calibration.laser.document import LaserCalibration
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera, make_camera
+from gripmon.config.calibrated import wrong_schema
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import network_fault, source_fault
 from gripmon.config.session import second_joined_or_fault
@@ -148,7 +149,7 @@ def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
     values = read_yaml(calibration_path)
     tag = str(LaserCalibration.__struct_config__.tag)
     if values.get("schema") != tag:
-        raise ConfigError(calibration_path, "schema", f"is {values.get('schema')!r}", tag)
+        raise ConfigError(calibration_path, "schema", *wrong_schema(values, tag))
     try:
         calibration = to_settings(values, LaserCalibration)
         make_camera(calibration.camera)

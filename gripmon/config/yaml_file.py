@@ -84,6 +84,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
         line = f"line {error.problem_mark.line + 1}" if error.problem_mark else ""
         problem = error.problem or error.context or "malformed"
         raise ConfigError(path, line, f"not YAML: {problem}", "`key: value` lines, indented with blanks") from None
+    except RecursionError:
+        raise ConfigError(path, "", "is nested too deeply", "`key: value` lines; see configs/demo.yaml") from None
     except yaml.YAMLError as error:
         raise ConfigError(path, "", f"not YAML: {error}", "`key: value` lines, indented with blanks") from None
     if value is None:

@@ -48,7 +48,7 @@ def format_of(data: bytes, file: str) -> str:
         return "kalibr"
     if "image_width" in text and "camera_matrix" in text:
         return "opencv" if Path(file).suffix == ".json" else "ros"
-    raise InterchangeError(file, "", "is in no format that can be told", f"--format {' or '.join(FORMATS)}")
+    raise InterchangeError(file, "", "is in no format that is recognised", f"--format {' or '.join(FORMATS)}")
 
 
 def read_camera(data: bytes, file: str, kind: str, options: ReadOptions = ReadOptions()) -> LensSettings:

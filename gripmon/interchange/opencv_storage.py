@@ -6,6 +6,7 @@ Its samples write ``camera_matrix`` and ``distortion_coefficients``, the interac
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import cv2
@@ -29,6 +30,15 @@ _WIDTH = ("image_width", "image_Width")
 _HEIGHT = ("image_height", "image_Height")
 _SIZE = ("cameraResolution", "image_size", "imageSize")
 _COUNTS = (0, 4, 5, 8, 12, 14)
+DEEPEST = 64
+"""Levels of nesting: what OpenCV writes has four at most, and its reader's stack is full after some 10,000."""
+
+_TAG = re.compile(rb"</|/>|<(?=[A-Za-z_])")
+_BRACKET = re.compile(rb"[][{}]")
+_TEXT = re.compile(rb'"[^"\n]*"|<!--.*?-->', re.DOTALL)
+_BLOCK_END = re.compile(rb"[][{}]")
+_INTRODUCER = re.compile(rb"(?:^|(?<=\s))-(?=\s)|:(?=\s|$)")
+_WIDEST_INDENT = 16  # blanks that one level is indented by at most in what OpenCV writes
 SYNTAXES = {
     ".yaml": cv2.FileStorage_FORMAT_YAML,
     ".yml": cv2.FileStorage_FORMAT_YAML,
@@ -44,6 +54,8 @@ def read(
 
     Raises :class:`InterchangeError`.
     """
+    if nesting(data) > DEEPEST:
+        raise InterchangeError(file, "", f"is nested more than {DEEPEST} levels deep", _RIGHT)
     try:
         storage = cv2.FileStorage(data.decode("utf-8-sig"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         opened = storage.isOpened()
@@ -62,6 +74,30 @@ def read(
     if told or is_fisheye:
         return fisheye(file, size, pinhole, numbers_of(file, key, coefficients, (4,), "4 values for a fisheye"))
     return brown_conrady(file, size, pinhole, numbers_of(file, key, coefficients, _COUNTS, "4, 5, 8 or 12 values"))
+
+
+def nesting(data: bytes) -> int:
+    """No fewer levels than OpenCV will find, whatever the bytes are: it recurses at each, until the stack is full."""
+    xml = data.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
+    signs, opening = (_TAG, (b"<",)) if xml else (_BRACKET, (b"[", b"{"))
+    # Closing signs in texts and comments must not make up for those that open.
+    deepest = max(_depth(signs.findall(each), opening) for each in (data, _TEXT.sub(b"", data)))
+    return deepest if xml else deepest + max((_introducers(line) for line in data.splitlines()), default=0)
+
+
+def _depth(signs: list[bytes], opening: tuple[bytes, ...]) -> int:
+    """The most that are open at a time."""
+    deepest = depth = 0
+    for sign in signs:
+        depth = depth + 1 if sign.startswith(opening) and sign != b"</" else max(depth - 1, 0)
+        deepest = max(deepest, depth)
+    return deepest
+
+
+def _introducers(line: bytes) -> int:
+    """What may nest on one line of YAML without brackets, ``- - a: b:``, and its indentation in levels."""
+    block = _BLOCK_END.split(line, maxsplit=1)[0]
+    return len(_INTRODUCER.findall(block)) + (len(line) - len(line.lstrip(b" "))) // _WIDEST_INDENT
 
 
 def _size(file: str, nodes: dict[str, cv2.FileNode], given: tuple[int, int] | None) -> tuple[int, int]:

@@ -27,7 +27,7 @@ def package_fault(settings: MetricsSettings) -> tuple[str, str, str] | None:
     """Key, what is wrong and what would be right, where the package is missing that the settings ask for."""
     if not settings.enabled or importlib.util.find_spec("prometheus_client") is not None:
         return None
-    right = "pip install '.[metrics]' in gripmon's checkout, or enabled: false"
+    right = "pip install -e '.[metrics]' in gripmon's checkout, or enabled: false"
     return "metrics.enabled", "is true, but the package prometheus-client is missing", right
 
 

@@ -300,7 +300,7 @@ class Policy:
         vibration = motion.vibration
         if vibration is not None:
             size_mm, hertz = 1e3 * vibration.rms_m, vibration.frequency_hz
-            text = f"the camera vibrates: TCP {size_mm:.3f} mm rms at about {hertz:.0f} Hz"
+            text = f"the camera vibrates: TCP {size_mm:.3f} mm rms{_frequency(hertz)}"
             severity = _severity(vibration.rms_m / self._settings.warn_m, 0.0, book.about(VIBRATION))
             alert = Alert(AlertKind.VIBRATION, Cause.CAMERA_MOUNT, severity, text)
             alerts += book.present(VIBRATION, alert, now_s, stamp_ns)
@@ -399,3 +399,10 @@ def _gripper_alert(explanation: Explanation) -> Alert:
     probable = explanation.probable
     kind = AlertKind.LENS if probable.cause is Cause.LENS else AlertKind.GRIPPER
     return Alert(kind, probable.cause, Severity.ERROR, explanation.text, part=probable.part, causes=explanation.causes)
+
+
+def _frequency(hertz: float) -> str:
+    """With two digits below ten; nothing where there is none, as among frames with one stamp."""
+    if hertz <= 0.0:
+        return ""
+    return f" at about {hertz:.0f} Hz" if hertz >= 9.95 else f" at about {hertz:.2g} Hz"

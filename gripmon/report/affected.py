@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,11 +41,26 @@ def motion_ranges(
     moved = track.stamp_ns >= min(onsets, default=np.iinfo(np.int64).max)
     old = _past(track, track.against_first, limits, np.zeros(len(track), np.int64), moved)
     out = [_motion_range("old_calibration", track, track.against_first, run, table_keys[0], events) for run in old]
+    out = _apart(out)
     if len(table_keys) > 1:
         stale = _past(track, track.against_reference, limits, track.reference, moved)
-        for run in stale:
-            key = table_keys[int(track.reference[run[0]])]
-            out.append(_motion_range("stale_reference", track, track.against_reference, run, key, events))
+        keys = [table_keys[int(track.reference[run[0]])] for run in stale]
+        out += _apart(
+            _motion_range("stale_reference", track, track.against_reference, run, key, events)
+            for run, key in zip(stale, keys, strict=True)
+        )
+    return out
+
+
+def _apart(ranges: Iterable[AffectedRange]) -> list[AffectedRange]:
+    """In order of time, without overlaps: of two runs past the limit by one motion only the first counts from its
+    beginning.
+    """
+    out: list[AffectedRange] = []
+    for each in ranges:
+        if out and each.start_ns < out[-1].end_ns and each.limit_ns is not None:
+            each = msgspec.structs.replace(each, start_ns=each.limit_ns)
+        out.append(each)
     return out
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.records import AlertKind, ReferenceRecord
+from gripmon.records import AlertKind, ReferenceRecord, Verdict
 from gripmon.report.affected import motion_ranges, verdict_ranges
 from gripmon.report.clock import straightened
 from gripmon.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
@@ -71,7 +71,7 @@ def _tell(source: Source, affected_m: float | None, affected_rad: float | None) 
     in_force_ns = {key: int(clock.stamp_ns[i]) for key, i in keys.items()}
     lives = lives_of(source.alerts, clock)
     hindsight = look_back(source, track, [s.stamp_ns for life in lives if life.is_motion for s in life.said], limits)
-    motions = motions_of(track, lives, hindsight.onset)
+    motions = motions_of(track, lives, hindsight)
     motions += hindsight.unsaid(motions, limits)
     events = [*motions, *happenings_of(lives), *pauses_of(clock)]
     events = with_reference_changes(events, _ordered(source.references, in_force_ns), in_force_ns)
@@ -155,25 +155,30 @@ def _numbered(events: Sequence[Event], source: Source, track: Track) -> tuple[Ev
 
 
 def _pictures(event: Event, source: Source, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
-    """The last picture before it began, with the gripper seen if there is one; and of a motion the first one at rest,
-    of all else the first one in it.
+    """The last picture before it began, with the gripper seen if there is one; the first one in it; and the first
+    believed one after it, if it is over.
     """
     if event.kind not in _SEEN:
         return {}
-    stamps_ns = track.stamp_ns[images]
+    table, stamps_ns = source.frames, track.stamp_ns[images]
     motion = event.kind in MOTIONS
-    found: dict[str, int] = {}
     before = images[stamps_ns <= event.onset.earliest_ns] if motion else images[stamps_ns < event.onset.stamp_ns]
-    measured = before[track.measured[before]]
-    if before.size:
-        found["before_seq"] = _with_overlay(source, track.seq[(measured if measured.size else before)[::-1]])
-    moment_ns = max(event.onset.latest_ns, event.end_ns or 0) if motion else event.noticed_ns or event.onset.stamp_ns
-    after = images[stamps_ns >= moment_ns]
-    measured = after[track.measured[after]]
-    if motion and measured.size:
-        after = measured
-    if after.size:
-        found["after_seq"] = _with_overlay(source, track.seq[after])
+    begun_ns = event.onset.stamp_ns if motion else event.noticed_ns or event.onset.stamp_ns
+    over_ns = max(event.onset.latest_ns, event.end_ns or 0) if motion else event.end_ns
+    at = images[stamps_ns >= begun_ns]
+    after = images[stamps_ns >= (np.iinfo(np.int64).max if over_ns is None else over_ns)]
+    valid = table.verdict[after] == table.VERDICTS.index(Verdict.VALID)
+    found: dict[str, int] = {}
+    for name, choices in (
+        ("before_seq", (before[track.measured[before]][::-1], before[::-1])),
+        ("at_seq", (at,)),
+        ("after_seq", (after[valid], after[track.measured[after]], after if motion else after[:0])),
+    ):
+        chosen = next((choice for choice in choices if choice.size), None)
+        if chosen is not None:
+            found[name] = _with_overlay(source, track.seq[chosen])
+    if found.get("at_seq") == found.get("after_seq"):
+        found.pop("at_seq", None)
     return found
 
 

@@ -71,7 +71,12 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     rate_m_per_min: Annotated[float | None, Meta(description="of a creep, as said last")] = None
     alert_id: Annotated[str, Meta(description="of the alert; empty: of none")] = ""
     before_seq: Annotated[int | None, Meta(description="frame of the picture before; null: none is recorded")] = None
-    after_seq: Annotated[int | None, Meta(description="frame of the picture after")] = None
+    at_seq: Annotated[
+        int | None, Meta(description="of a motion the first picture that shows it, of all else the first one in it")
+    ] = None
+    after_seq: Annotated[
+        int | None, Meta(description="frame of the picture after: the first that was believed, if any was")
+    ] = None
     story: Annotated[tuple[Moment, ...], Meta(description="what was said of it, in order")] = ()
 
 

@@ -18,6 +18,7 @@ from gripmon.report.track import Track, displacement
 
 _NEAR_NS = SECOND_NS // 4  # an onset in the frames and its change point are no farther apart
 _ALIKE = (0.5, 2.0)  # times as large
+_NEARLY_ALL = 0.8  # of a drift's size: what one step must make up for it to be that step
 _SURE = 5.0  # standard deviations
 _SHORT_FRAMES = 20_000  # a whole recording of so many is looked at
 _MOST_FRAMES = 60_000  # of a long one: a recording that never rests is told by its frames alone from there on
@@ -31,16 +32,27 @@ class Hindsight:
 
     points: tuple[ChangePoint, ...] = ()
 
-    def onset(self, onset: Onset, moved: Displacement | None) -> Onset:
-        """The change point that is this step's, if one is near and as large; else the onset as it is."""
-        near = [p for p in self.points if p.earliest_ns - _NEAR_NS <= onset.stamp_ns <= p.latest_ns + _NEAR_NS]
+    def onset(self, onset: Onset, moved: Displacement | None, *, least: float = _ALIKE[0]) -> Onset:
+        """The change point that is this step's, if one lies where it began and is as large, at least a share ``least``
+        of it; else the onset as it is.
+        """
+        near = [
+            p
+            for p in self.points
+            if p.earliest_ns - _NEAR_NS <= onset.latest_ns and onset.earliest_ns <= p.latest_ns + _NEAR_NS
+        ]
         if not near:
             return onset
         point = max(near, key=lambda p: float(np.linalg.norm(p.size[:3])))
         size_m = float(np.linalg.norm(point.size[:3]))
-        if moved is not None and not _ALIKE[0] * moved.size_m <= size_m <= _ALIKE[1] * moved.size_m:
+        if moved is not None and not least * moved.size_m <= size_m <= _ALIKE[1] * moved.size_m:
             return onset
         return Onset(point.stamp_ns, point.earliest_ns, max(point.latest_ns, point.stamp_ns), "hindsight")
+
+    def step_of(self, onset: Onset, moved: Displacement | None) -> Onset | None:
+        """The one change point that nearly all of a drift was; None: it was no step."""
+        found = self.onset(onset, moved, least=_NEARLY_ALL)
+        return None if moved is None or found is onset else found
 
     def unsaid(self, events: Sequence[Event], limits: Limits) -> list[Event]:
         """Steps past the limit that were never an alert: an event for each."""

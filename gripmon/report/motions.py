@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -11,6 +11,7 @@ import numpy as np
 from gripmon.records import AlertKind, Array, Severity
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import Displacement, Event, Moment, Onset
+from gripmon.report.hindsight import Hindsight
 from gripmon.report.lives import Life, Said, explained, probability, worst
 from gripmon.report.onsets import drift_onset, frame_noise, step_onset
 from gripmon.report.track import Track, displacement
@@ -24,9 +25,6 @@ TITLES = {
     AlertKind.CREEP: "The camera crept",
     AlertKind.DRIFT: "The camera drifted",
 }
-
-Refine = Callable[[Onset, Displacement | None], Onset]
-"""A better onset than the one given, for a step of this size; the same if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +43,7 @@ class _Stretch:
         return next((k for k in (AlertKind.STEP, AlertKind.CREEP) if k in kinds), AlertKind.DRIFT)
 
 
-def motions_of(track: Track, lives: Sequence[Life], refine: Refine = lambda onset, _moved: onset) -> list[Event]:
+def motions_of(track: Track, lives: Sequence[Life], hindsight: Hindsight) -> list[Event]:
     """An event for each step, creep or drift, in order of time."""
     stretches = sorted(
         (s for life in lives if life.is_motion for s in _stretches(life, track)), key=lambda s: s.said[0].stamp_ns
@@ -55,7 +53,7 @@ def motions_of(track: Track, lives: Sequence[Life], refine: Refine = lambda onse
     not_before_ns = int(track.stamp_ns[0]) if len(track) else 0
     for i, stretch in enumerate(stretches):
         following = stretches[i + 1] if i + 1 < len(stretches) else None
-        event = _event(track, stretch, following, not_before_ns, noise, refine)
+        event = _event(track, stretch, following, not_before_ns, noise, hindsight)
         if not _is_new(event, events[-1] if events else None):
             events[-1] = msgspec.structs.replace(
                 events[-1], story=(*events[-1].story, *event.story), end_text=event.end_text
@@ -98,7 +96,7 @@ def _is_new(event: Event, before: Event | None) -> bool:
 
 
 def _event(
-    track: Track, stretch: _Stretch, following: _Stretch | None, not_before_ns: int, noise: Array, refine: Refine
+    track: Track, stretch: _Stretch, following: _Stretch | None, not_before_ns: int, noise: Array, hindsight: Hindsight
 ) -> Event:
     kind, noticed_ns = stretch.kind, stretch.said[0].stamp_ns
     onset = _onset(track, stretch, not_before_ns, noise)
@@ -108,8 +106,12 @@ def _event(
         until_ns = until_ns if next_onset is None else next_onset.earliest_ns
     moved, moved_in_s, at_rest_ns = _size(track, onset, until_ns, kind)
     if kind is AlertKind.STEP:
-        onset = refine(onset, moved)
+        onset = hindsight.onset(onset, moved)
         at_rest_ns = onset.stamp_ns
+    elif kind is AlertKind.DRIFT and (at_once := hindsight.step_of(onset, moved)) is not None:
+        # Noticed late, since nothing was certain at the time.
+        onset, kind = at_once, AlertKind.STEP
+        moved, moved_in_s, at_rest_ns = _size(track, onset, until_ns, kind)
     alert = explained(stretch.said)
     assert alert is not None, "a stretch has something said"
     rates = [each.alert.rate_m_per_min for each in stretch.said if each.alert.rate_m_per_min is not None]

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.records import AlertKind, CauseWeight
+from gripmon.records import AlertKind, CauseWeight, Origin
 from gripmon.report import formats
 from gripmon.report.build import Told
 from gripmon.report.content import AffectedRange, Event, Noise, RecordingReport, Report
 from gripmon.report.lives import MOTIONS
-from gripmon.report.pictures import Shown, pair
+from gripmon.report.pictures import Looked, Shown, together
 from gripmon.report.words import CAUSES, cause_words
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all that was said
@@ -46,7 +46,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
 
     from gripmon.report.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
 
-    shown: dict[tuple[int, int], tuple[Shown | None, Shown | None]] = {}
+    shown: dict[tuple[int, int], tuple[Shown | None, ...]] = {}
     figures: dict[str, str] = {}
     if len(told) > 1:
         figures["overview"] = as_json(overview_figure(report.recordings))
@@ -71,7 +71,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
         shown=shown,
         figures=figures,
         stamp=lambda n, seq: _stamp(told[n - 1], seq),
-        has_pictures=lambda n: any(any(both) for (k, _), both in shown.items() if k == n),
+        has_pictures=lambda n: any(any(each) for (k, _), each in shown.items() if k == n),
         most_rows=_MOST_ROWS,
         plotly=get_plotlyjs(),
         style=_file("style.css"),
@@ -100,15 +100,25 @@ def _cards(events: Sequence[Event]) -> list[Event]:
     return worthy[:_MOST_CARDS]
 
 
-def _pictures(told: Told, event: Event) -> tuple[Shown | None, Shown | None]:
-    before, after = (None if seq is None else told.source.picture(seq) for seq in (event.before_seq, event.after_seq))
-    return pair(before, after)
+def _pictures(told: Told, event: Event) -> tuple[Shown | None, ...]:
+    return together([_looked(told, seq) for seq in (event.before_seq, event.at_seq, event.after_seq)])
+
+
+def _looked(told: Told, seq: int | None) -> Looked | None:
+    picture = None if seq is None else told.source.picture(seq)
+    if seq is None or picture is None:
+        return None
+    table = told.source.frames
+    return Looked(picture, bool(table.source[_index(told, seq)] != table.ORIGINS.index(Origin.HELD)))
 
 
 def _stamp(told: Told, seq: int) -> int:
+    return int(told.source.frames.stamp_ns[_index(told, seq)])
+
+
+def _index(told: Told, seq: int) -> int:
     table = told.source.frames
-    i = int(np.searchsorted(table.seq, seq))
-    return int(table.stamp_ns[min(i, len(table) - 1)])
+    return min(int(np.searchsorted(table.seq, seq)), len(table) - 1)
 
 
 def _with_units(text: str) -> str:
@@ -116,8 +126,9 @@ def _with_units(text: str) -> str:
     return re.sub(r"(?<=[\d>]) (?=(?:±|mm|ms|s|min|h|d|%|\d)(?:\W|\d|$))", "\u00a0", re.sub("± ", "±\u00a0", text))
 
 
-def _after_word(event: Event) -> str:
-    return "After" if event.kind in MOTIONS else "During"
+def _labels(event: Event) -> tuple[str, str, str]:
+    """Of its pictures."""
+    return "Before", "As it moved" if event.kind in MOTIONS else "During", "After"
 
 
 def _times_moved(report: RecordingReport) -> str:
@@ -224,7 +235,8 @@ _VOCABULARY: dict[str, Any] = {
     "cause_name": _cause_name,
     "told": _told,
     "around": _around,
-    "after_word": _after_word,
+    "labels": _labels,
+    "zip": zip,
     "affected_name": _affected_name,
     "ended": _ended,
     "meanings": _meanings,

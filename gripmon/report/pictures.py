@@ -1,11 +1,11 @@
-"""Pictures before and after an event, with what was measured in them."""
+"""Pictures before, at and after an event, with what was measured in them."""
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,6 +27,13 @@ CORNER: _BGR = (60, 225, 255)
 BEFORE: _BGR = (255, 255, 255)
 
 
+class Looked(NamedTuple):
+    """A picture, and whether what was measured in it was believed: else none of its points is shown as such."""
+
+    picture: Picture
+    believed: bool
+
+
 @dataclass(frozen=True, slots=True)
 class Shown:
     """A picture as it stands on the page: ``uri`` is a JPEG in a data URI."""
@@ -37,20 +44,18 @@ class Shown:
     height_px: int
 
 
-def pair(before: Picture | None, after: Picture | None) -> tuple[Shown | None, Shown | None]:
-    """Two pictures, either may be None, cut to the same part of the image; into the later one the gripper's place in
-    the earlier one is drawn, too, in white.
+def together(looked: Sequence[Looked | None]) -> tuple[Shown | None, ...]:
+    """Pictures in order of time, any may be None, cut to the same part of the image; into the later ones the gripper's
+    place in the first one is drawn, too, in white.
     """
-    there = [picture for picture in (before, after) if picture is not None]
+    there = [each.picture for each in looked if each is not None]
     if not there:
-        return None, None
+        return tuple(None for _ in looked)
     height, width = there[0].image.shape[:2]
     box = _box([points for picture in there for points in _points(picture)], width, height)
-    outline = () if before is None else tuple(before.predicted_edges)
-    return (
-        None if before is None else _shown(before, box, ()),
-        None if after is None else _shown(after, box, outline),
-    )
+    first = looked[0]
+    outline = () if first is None else tuple(first.picture.predicted_edges)
+    return tuple(None if each is None else _shown(each, box, () if each is first else outline) for each in looked)
 
 
 def _points(picture: Picture) -> list[NDArray[np.float32]]:
@@ -79,8 +84,9 @@ def _box(points: Sequence[NDArray[np.float32]], width: int, height: int) -> tupl
     return int(corner[0]), int(corner[1]), int(corner[0] + size[0]), int(corner[1] + size[1])
 
 
-def _shown(picture: Picture, box: tuple[int, int, int, int], outline: Sequence[NDArray[np.float32]]) -> Shown | None:
+def _shown(looked: Looked, box: tuple[int, int, int, int], outline: Sequence[NDArray[np.float32]]) -> Shown | None:
     left, top, right, bottom = box
+    picture, believed = looked
     crop = _bgr8(picture.image)[top:bottom, left:right]
     if not crop.size:
         return None
@@ -100,9 +106,9 @@ def _shown(picture: Picture, box: tuple[int, int, int, int], outline: Sequence[N
             canvas, [p for p in polylines if len(p) > 1], False, colour, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
         )
     for points, colour, radius in (
-        (picture.edges_used, USED, 2),
+        (picture.edges_used, USED if believed else REFUSED, 2),
         (picture.edges_refused, REFUSED, 2),
-        (_corners(picture), CORNER, 5),
+        (_corners(picture)[: None if believed else 0], CORNER, 5),
     ):
         for x, y in place(points).tolist():
             filled = -1 if radius < 5 else 2

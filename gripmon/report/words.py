@@ -100,9 +100,7 @@ def _at_end(report: RecordingReport, motions: Sequence[Event]) -> str:
     measured = f"when last measured, at {last}"
     if excess(off.size_m, off.rotation_rad or 0.0, report.limits) < 1.0:
         near = millimetres(off.size_m, off.sigma_m)
-        return (
-            f"It is not so any more: {measured}, the camera was where it had been at the beginning, to within {near}."
-        )
+        return f"It is not so any more: {measured}, the camera was back where it began, to within {near}."
     far = f"{millimetres(off.size_m, off.sigma_m)} and {degrees(off.rotation_rad)}"
     text = f"It is still so: {measured}, the TCP was {far} from where the calibration at the beginning has it"
     now = report.at_end_against_reference
@@ -119,10 +117,10 @@ def _affected(report: RecordingReport) -> str:
     old = [a for a in report.affected if a.what == "old_calibration"]
     if not old:
         return ""
-    text = f"Affected is what relied on the calibration from the beginning {_listed(old, report)}"
+    text = f"Work that relied on the initial calibration is affected {_listed(old, report)}"
     stale = [a for a in report.affected if a.what == "stale_reference"]
     if stale:
-        text += f"; what relied on the reference then in force {_listed(stale, report)}"
+        text += f"; work that relied on the reference then in force, {_listed(stale, report)}"
     return text + "."
 
 
@@ -162,7 +160,7 @@ def _lost(report: RecordingReport) -> str:
 def _why_missing(report: RecordingReport) -> str:
     are = "is missing" if report.running.frames_dropped == 1 else "are missing"
     known = ((report.running.monitor_dropped, "the monitor"), (report.running.recording_dropped, "the recorder"))
-    reasons = [f"{who} had no time for {number}" for number, who in known if number]
+    reasons = [f"{who} was too busy for {number}" for number, who in known if number]
     return f"{are} ({_and(reasons)})" if reasons else are
 
 

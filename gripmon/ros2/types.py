@@ -30,7 +30,7 @@ def typestore() -> Typestore:
         import xxhash  # noqa: F401  both come with the same extra: said at the start, not at the first node
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise Ros2Missing(f"needs the package {error.name}; pip install '.[ros2]' in gripmon's checkout") from error
+        raise Ros2Missing(f"needs the package {error.name}; pip install -e '.[ros2]' in gripmon's checkout") from error
     return get_typestore(Stores.ROS2_JAZZY)
 
 

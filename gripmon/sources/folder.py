@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import csv
+import errno
 import itertools
 import math
+import os
 import re
+import stat
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
 from gripmon.records import Frame, Image
 from gripmon.sources.base import SourceError
 
+if TYPE_CHECKING:
+    from _csv import Reader as _Lines
+
 _SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
 IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
 TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 _NS = 1_000_000_000
+
+LARGEST_BYTES = 1 << 30
+"""More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
 
 
 class FolderSettings(
@@ -115,7 +124,7 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
     import numpy as np
 
     try:
-        data = path.read_bytes()
+        data = _regular_bytes(path)
     except FileNotFoundError:
         return None, "the file is missing"
     except OSError as error:
@@ -138,15 +147,34 @@ def read_image(path: Path) -> tuple[Image | None, str | None]:
     return image, None
 
 
+def _regular_bytes(path: Path) -> bytes:
+    """A file's content.  OSError, too, for what is none: a pipe or a device might be waited for without end."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        if status.st_size > LARGEST_BYTES:
+            raise OSError(errno.EFBIG, f"it is larger than {LARGEST_BYTES >> 20} MiB")
+        return file.read(LARGEST_BYTES)
+
+
 def read_table(path: Path) -> dict[str, TableRow]:
     """A table ``file,stamp_ns[,jaw_opening_m]`` by file name.  Raises :class:`SourceError`."""
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = _regular_bytes(path).decode("utf-8-sig")
     except FileNotFoundError:
         raise SourceError(f"timestamps: there is no file {path}; a table {','.join(COLUMNS[:2])}") from None
     except (OSError, UnicodeDecodeError) as error:
-        raise SourceError(f"{path}: can't be read ({error}); a table in UTF-8") from None
+        raise SourceError(f"{path}: can't be read ({getattr(error, 'strerror', error)}); a table in UTF-8") from None
     lines = csv.reader(text.splitlines())
+    try:
+        return _rows(path, lines)
+    except csv.Error as error:
+        raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
+
+
+def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
     header = tuple(cell.strip() for cell in next(lines, []))
     if header not in (COLUMNS[:2], COLUMNS):
         raise SourceError(f"{path}: line 1 is '{','.join(header)}'; file,stamp_ns or file,stamp_ns,jaw_opening_m")

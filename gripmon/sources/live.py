@@ -89,7 +89,7 @@ class _CaptureReader:
     def __init__(self, settings: LiveSettings) -> None:
         self._settings = settings
         self._name = shown_name(settings.device)
-        self._api = _api_of(settings)
+        self._api = backend_number(settings)
         self._backoff = Backoff(settings.retry_first_s, settings.retry_longest_s)
         self._capture: Any = None
         self._stop = threading.Event()
@@ -188,8 +188,10 @@ def shown_name(device: int | str) -> str:
     return re.sub(r"(?<=://)[^/@\s]*@", "", device)
 
 
-def _api_of(settings: LiveSettings) -> int:
-    """OpenCV's number of the backend; SourceError for a device of no known form and for a backend that isn't there."""
+def backend_number(settings: LiveSettings) -> int:
+    """OpenCV's number of the backend that opens the device; SourceError for a device of no known form and
+    for a backend that isn't there.
+    """
     import cv2
 
     apis = {"v4l2": cv2.CAP_V4L2, "ffmpeg": cv2.CAP_FFMPEG, "gstreamer": cv2.CAP_GSTREAMER, "any": cv2.CAP_ANY}

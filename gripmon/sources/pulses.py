@@ -23,6 +23,13 @@ def read_pulses(path: Path) -> list[Told]:
     except (OSError, UnicodeDecodeError) as error:
         raise SourceError(f"{path}: can't be read ({error}); a table in UTF-8") from None
     reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    try:
+        return _of_table(path, reader)
+    except csv.Error as error:
+        raise SourceError(f"{path}: line {reader.line_num}: {error} (an open quote?); {COLUMNS}") from None
+
+
+def _of_table(path: Path, reader: csv.DictReader[str]) -> list[Told]:
     rows, places = [], []
     for row in reader:
         if None in row or None in row.values():

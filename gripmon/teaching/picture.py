@@ -23,6 +23,9 @@ _SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR, _TEXT_BGR = (
     (60, 230, 240),
     (255, 255, 255),
 )
+_TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
+_MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
+_ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # lines above and below its place that a label may stand in
 _SMALLEST_PX = 1200  # pictures are enlarged to at least this width
 _SHIFT = 4  # binary digits of a pixel in OpenCV's drawing
 
@@ -45,13 +48,18 @@ def draw(
         _polyline(picture, uv_px + enlarged * shift_px, zoom, colour)
         middle, shift = uv_px[len(uv_px) // 2], shift_px[len(uv_px) // 2]
         _arrow(picture, middle, middle + enlarged * shift, zoom, colour)
-        _text(picture, f"{gripper.edge_ids[edge]} {np.linalg.norm(shift):.2f}", middle, zoom, colour, 0.4)
+    labels = Labels(picture)
+    labels.title(
+        f"{gripper.name}: sharp model (blue), taught outlines (orange), creases (green)",
+        f"offsets in px, drawn {enlarged} times as large",
+    )
     for name, corner in model.corners.items():
         u, v = (_fixed(x, zoom) for x in corner.uv_px)
         cv2.circle(picture, (u, v), 5 << _SHIFT, _CORNER_BGR, 1, cv2.LINE_AA, _SHIFT)
-        _text(picture, name, np.add(corner.uv_px, (3.0, -4.0)), zoom, _CORNER_BGR, 0.45)
-    legend = f"{gripper.name}: sharp model (blue), taught outlines (orange), creases (green); px; offsets x {enlarged}"
-    _text(picture, legend, np.array([6.0, 12.0]), zoom, _TEXT_BGR, 0.5)
+        labels.put(name, _pixel(corner.uv_px, zoom), _CORNER_BGR)
+    for edge, (uv_px, shift_px) in lines.items():
+        text = f"{gripper.edge_ids[edge]} {np.linalg.norm(shift_px[len(uv_px) // 2]):.2f}"
+        labels.put(text, _pixel(uv_px[len(uv_px) // 2], zoom), _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR)
     return picture
 
 
@@ -91,9 +99,63 @@ def _arrow(picture: Picture, start: Array, end: Array, zoom: int, colour: tuple[
     _polyline(picture, np.array([start, end]), zoom, colour)
 
 
-def _text(picture: Picture, text: str, at_px: Array, zoom: int, colour: tuple[int, int, int], size: float) -> None:
-    """With a shadow; OpenCV's font knows ASCII only."""
-    u, v = round(float(at_px[0]) * zoom) + 6, round(float(at_px[1]) * zoom) - 4
-    plain = text.encode("ascii", "replace").decode()
-    for paint, shift in (((0, 0, 0), 1), (colour, 0)):
-        cv2.putText(picture, plain, (u + shift, v + shift), cv2.FONT_HERSHEY_SIMPLEX, size, paint, 1, cv2.LINE_AA)
+def _pixel(uv_px: Array | tuple[float, float], zoom: int) -> tuple[int, int]:
+    u, v = (round((x + 0.5) * zoom - 0.5) for x in uv_px)
+    return u, v
+
+
+class Labels:
+    """Texts in a picture, none over another and all of them inside; one that had to give way is tied to its place."""
+
+    def __init__(self, picture: Picture) -> None:
+        self._picture = picture
+        self.boxes: list[tuple[int, int, int, int]] = []
+
+    def title(self, *lines: str) -> None:
+        """At the top, as large as fits."""
+        width, top = self._picture.shape[1] - 2 * _MARGIN_PX, _MARGIN_PX
+        for line in lines:
+            scale = min(_TITLE, _TITLE * width / _size(line, _TITLE)[0])
+            across, up = _size(line, scale)
+            self._write(line, (_MARGIN_PX, top + up), _TEXT_BGR, scale)
+            self.boxes.append((_MARGIN_PX, top, _MARGIN_PX + across, top + up + _GAP_PX))
+            top += up + 2 * _GAP_PX
+
+    def put(self, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+        """Beside a place (x, y), as near as there is room; nowhere free: right of it."""
+        across, up = _size(text, _LABEL)
+        height, width = self._picture.shape[:2]
+        step = up + _GAP_PX
+        beside = ((at[0] + _ASIDE_PX, at[1] - _GAP_PX + k * step) for k in _ROWS)
+        before = ((at[0] - _ASIDE_PX - across, at[1] - _GAP_PX + k * step) for k in _ROWS)
+        places = [place for pair in zip(beside, before, strict=True) for place in pair]
+        for x, y in places:
+            box = x - _GAP_PX, y - up - _GAP_PX, x + across + _GAP_PX, y + _GAP_PX
+            inside = box[0] >= 0 and box[1] >= 0 and box[2] <= width and box[3] <= height
+            if inside and not any(_overlap(box, other) for other in self.boxes):
+                break
+        else:
+            (x, y), *_ = places
+            box = x, y - up, x + across, y
+        self.boxes.append(box)
+        if abs(y - at[1]) > step:
+            end = x if x > at[0] else x + across
+            cv2.line(self._picture, at, (end, y - up // 2), colour, 1, cv2.LINE_AA)
+        self._write(text, (x, y), colour, _LABEL)
+
+    def _write(self, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
+        """With a shadow; OpenCV's font knows ASCII only."""
+        plain = text.encode("ascii", "replace").decode()
+        for paint, shift in (((0, 0, 0), 1), (colour, 0)):
+            place = at[0] + shift, at[1] + shift
+            cv2.putText(self._picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, scale, paint, 1, cv2.LINE_AA)
+
+
+def _size(text: str, scale: float) -> tuple[int, int]:
+    """Width and height, px."""
+    (across, up), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    return int(across), int(up)
+
+
+def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]

@@ -53,7 +53,7 @@ REASONS = {
     CornerFault.OUTSIDE: "outside of the image",
     CornerFault.SELF_HIDDEN: "hidden by its own finger",
     CornerFault.FEW_POINTS: "fewer than two edges in view",
-    CornerFault.HIDDEN: "its edges don't show right beside it",
+    CornerFault.HIDDEN: "its edges aren't visible close to it",
     CornerFault.PARALLEL: "its edges are nearly parallel",
     CornerFault.UNCERTAIN: "too uncertain",
     CornerFault.NO_FIT: "no edges found",

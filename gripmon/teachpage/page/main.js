@@ -44,8 +44,8 @@ function tell() {
     const inner = state.corners.filter((name) => name.includes("_inner_")), has = (name) => corners.current.has(name);
     const todo = inner.filter((name) => !has(name)).length;
     const alone = inner.filter((name) => has(name) && !["outer", "end", "rise"].some((other) => has(name.replace("inner", other))));
-    const wants = todo ? `${todo} of the 4 inner corners to go` : alone.length ? `${alone.join(", ")} still without` : "all are there";
-    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${wants}. Nothing snaps without a gripper file.`, todo || alone.length ? "" : "good");
+    const wants = todo ? `${todo} of the 4 inner corners to go` : alone.length ? `${alone.join(", ")} still ${alone.length > 1 ? "need" : "needs"} one` : "all are there";
+    return panel.status(`Drag the inner corners, and for each an outer, end or rise point on its next edge: ${wants}. Without a gripper file corners don't snap to edges.`, todo || alone.length ? "" : "good");
   }
   const missing = state.needed - corners.current.size;
   if (!corners.current.size && missing > 0) {
@@ -122,6 +122,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 
 function key(event) {
   const control = event.ctrlKey || event.metaKey, letter = event.key.toLowerCase();
+  if (event.key === "Escape" && !$("#help").hidden) { help(); event.preventDefault(); return; }
   if (event.target.matches("input, select")) return;
   if (control && (letter === "y" || (letter === "z" && event.shiftKey))) { if (corners.redo()) changed(); }
   else if (control && letter === "z") { if (corners.undo()) changed(); }
@@ -179,6 +180,7 @@ async function take() {
 }
 
 async function save() {
+  if (!$("#help").hidden) help();
   busy = true;
   show();
   let result;

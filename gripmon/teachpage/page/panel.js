@@ -70,7 +70,7 @@ export function corners(list, reply, selected, choose) {
       agree.append(meter, ` ${Math.round(100 * corner.inliers)} %`);
       row.append(element("td", corner.sigma_px.toFixed(3)), agree);
     } else {
-      const text = reply && !reply.refused ? corner?.reason ?? "" : state === "put" ? "put" : "not put yet";
+      const text = reply && !reply.refused ? corner?.reason ?? "" : state === "put" ? "placed" : "not placed yet";
       row.append(element("td", text, { colspan: 2, class: state === "refused" ? "reason" : "quiet" }));
     }
     row.addEventListener("click", () => choose(name));
@@ -85,7 +85,7 @@ export function jaw(reply, given, state) {
   if (given) note.textContent = "";
   else if (reply?.jaw_opening_m != null && !reply.refused) {
     const seen = `${(1e3 * reply.jaw_opening_m).toFixed(2)} ± ${(1e3 * reply.jaw_sigma_m).toFixed(2)} mm`;
-    note.textContent = `The image shows ${seen}; it hardly tells that from the distance: better what the robot says.`;
+    note.textContent = `The image shows ${seen}, but it can hardly separate that from the distance: better use what the robot reports.`;
   } else note.textContent = "Better what the robot says than what the image shows.";
 }
 
@@ -110,8 +110,8 @@ export function expected(reply, state) {
   }));
   $("#promise").textContent = `${values.promise[0].toUpperCase()}${values.promise.slice(1)}.`;
   $("#promise").classList.toggle("warn", !values.reachable);
-  const delays = values.delay_frames.map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `${frames} frames`}`);
-  const notes = [`A step of the TCP by 0.1 mm is noticed after: ${delays.join(", ")}.`];
+  const delays = values.delay_frames.map((frames, k) => `${"xyz"[k]} ${frames === null ? "never" : `within ${frames} frames`}`);
+  const notes = [`A step of the TCP by 0.1 mm is noticed on average: ${delays.join(", ")}.`];
   if (reference?.rival) notes.push("Another pose explains these corners as well: put one outside of their plane.");
   if (reference && !state.reference) notes.push("The reference comes from these corners; a plate (gripmon calibrate plane) tells it more exactly.");
   if (values.recalibration) notes.push(`No new pose from corners later: ${values.recalibration}.`);

@@ -1,0 +1,128 @@
+"""What ``gripmon check`` says first, and that ``gripmon run`` judges a source as it does."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from gripmon.cli import main
+from gripmon.config import builtin_config
+
+DEMO = builtin_config("demo.yaml")
+WXYZ = [0.963637, 0.267184, 0.003984, -0.001105]  # the demo's quaternion in the other order
+
+
+def written(folder: Path, **changes: Any) -> Path:
+    """The demo's configuration with some of its sections changed key by key."""
+    content = yaml.safe_load(DEMO.read_text())
+    content["gripper"] = str(DEMO.parent / content["gripper"])
+    for section, values in changes.items():
+        content[section] = {**content[section], **values} if section != "source" else values
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def checked(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, dict[str, tuple[str, str]]]:
+    """The exit code and, by what they are about, the level and text of the lines; those of --json are the same."""
+    code = main(["check", str(path)])
+    headline, *rows = capsys.readouterr().out.splitlines()
+    assert main(["check", str(path), "--json"]) == code
+    found = json.loads(capsys.readouterr().out)["findings"]
+    levels = [each["level"] for each in found]
+    assert ("sound" in headline) == ("FAIL" not in levels) and ("warning" in headline) == ("WARN" in levels)
+    for row, each in zip(rows, found, strict=True):
+        assert row.startswith(f"{each['level']:<4}  {each['about']}") and row.endswith(f"  {each['text']}")
+    return code, {each["about"]: (each["level"], each["text"]) for each in found}
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        ({"kind": "live", "device": "wrist.avi"}, "source.device: 'wrist.avi' has no known form; an index (0), "),
+        ({"kind": "live", "device": "0"}, "source.device: '0' is text; an index is a number without quotes"),
+        ({"kind": "live", "device": -1}, "source.device: -1 is no index; 0 for the first camera"),
+        ({"kind": "folder", "path": "SEQUENCE"}, "camera.width_px: 768 x 576 px; 0.png is 1 x 1; the calibration that"),
+        ({"kind": "folder", "path": "NOTHING"}, "source.path: no image in "),
+    ],
+)
+def test_check_and_run_refuse_a_source_with_the_same_line(
+    source: dict[str, object], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    (tmp_path / "SEQUENCE").mkdir()
+    (tmp_path / "NOTHING").mkdir()
+    assert cv2.imwrite(str(tmp_path / "SEQUENCE" / "0.png"), np.zeros((1, 1), np.uint8))
+    path = written(tmp_path, source=source, jaw={"source": "fixed"})
+    lines = []
+    for command in (["check", str(path)], ["run", str(path), "--out", str(tmp_path / "out")]):
+        assert main(command) == 2
+        lines.append(capsys.readouterr().err)
+    assert lines[0] == lines[1] and lines[0].startswith(f"{path}: {said}") and lines[0].count("\n") == 1
+    assert not list((tmp_path / "out").glob("*")), "nothing was begun"
+
+
+def test_frames_that_cannot_be_read_are_said_and_none_that_can_is_a_fault(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert main(["simulate", "creep", "--out", str(tmp_path / "s"), "--seconds", "0.3", "--fps", "10"]) == 0
+    config, images = tmp_path / "s" / "config.yaml", sorted((tmp_path / "s").glob("*.png"))
+    images[0].write_bytes(b"")
+    capsys.readouterr()
+    code, found = checked(config, capsys)
+    assert code == 0 and found["source"][0] == "WARN"
+    assert found["source"][1].endswith(f"its first frame can't be read ({images[0].name}: the file is empty)")
+    for image in images[1:]:
+        image.write_bytes(b"")
+    for command in (["check", str(config)], ["run", str(config)]):
+        assert main(command) == 3
+        assert "source.path: no frame of it can be read (" in capsys.readouterr().err
+
+
+def test_a_quaternion_in_the_other_order_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    code, found = checked(DEMO, capsys)
+    assert code == 0 and found["mount"][0] == "OK" and found["mount"][1].endswith("along the fingers at 31°")
+    pose = {"translation_m": [0.0004, 0.0014, 0.1188], "rotation_xyzw": WXYZ}
+    code, found = checked(written(tmp_path, reference={"cam_T_grip": pose}), capsys)
+    assert code == 3 and found["mount"][0] == "FAIL"
+    assert "in front of the fingertips" in found["mount"][1] and "read as w, x, y, z" in found["mount"][1]
+
+
+def test_a_limit_that_is_out_of_reach_or_close_is_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    texts = {}
+    for limit_m in (2e-5, 5e-4, 1e-3):
+        code, found = checked(written(tmp_path, monitor={"policy": {"alert_limit_m": limit_m}}), capsys)
+        assert code == 0
+        texts[limit_m] = found["promise"]
+    assert texts[2e-5][0] == "WARN" and "no transform can be valid" in texts[2e-5][1]
+    assert "valid needs alert_limit_m of at least 0.000" in texts[2e-5][1]
+    assert texts[5e-4][0] == "WARN" and "close to the alert limit" in texts[5e-4][1]
+    assert texts[1e-3][0] == "OK"
+
+
+def test_jaw_travel_beyond_the_limit_is_a_warning_unless_the_jaws_stand(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    assert checked(DEMO, capsys)[1]["jaw travel"] == (
+        "WARN",
+        "of 0 to 60 mm: every transform is suspect at 0.0 mm",
+    )
+    _, found = checked(written(tmp_path, jaw={"source": "fixed"}), capsys)
+    assert found["jaw travel"] == ("OK", "none: the opening is fixed at 34.0 mm")
+
+
+def test_the_columns_stand_however_long_the_names_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    text = (DEMO.parent / "grippers" / "two_box_fingers.yaml").read_text()
+    (tmp_path / "gripper.yaml").write_text(text.replace("L_in_near", "the_left_finger_inner_near"))
+    content = yaml.safe_load(DEMO.read_text()) | {"gripper": "gripper.yaml"}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(content))
+    assert main(["check", str(tmp_path / "config.yaml"), "--verbose"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    rows = [line for line in out if " px  " in line and ")" in line and "mm" in line and line.startswith(" " * 11)]
+    corners = [row for row in rows if row.lstrip().startswith(("L_", "R_", "the_"))]
+    assert len(corners) == 8 and len({row.index(" px  ") for row in corners}) == 1

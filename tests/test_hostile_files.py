@@ -1,0 +1,114 @@
+"""Files that would hang, crash or fill the stack of whoever reads them: one line each."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from gripmon_process import gripmon
+
+from gripmon.cli import main
+from gripmon.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
+from gripmon.sources import FolderSettings, FolderSource, SourceError
+from gripmon.sources.pulses import read_pulses
+
+DEEP = 100_000
+
+
+def folder_with(folder: Path, table: str | None = None) -> Path:
+    assert cv2.imwrite(str(folder / "0.png"), np.zeros((4, 4), np.uint8))
+    if table is not None:
+        (folder / "timestamps.csv").write_text(table)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["pipe", "link to a device", "socketless link"])
+def test_what_is_no_file_among_images_becomes_a_frame_with_a_fault(tmp_path: Path, kind: str):
+    folder_with(tmp_path, "file,stamp_ns\n0.png,0\n1.png,1\n")
+    match kind:
+        case "pipe":
+            os.mkfifo(tmp_path / "1.png")
+        case "link to a device":
+            (tmp_path / "1.png").symlink_to("/dev/zero")
+        case _:
+            (tmp_path / "1.png").symlink_to(tmp_path / "nowhere.png")
+    source = FolderSource(FolderSettings(path="."), tmp_path)
+    frames = [source.read(), source.read()]
+    assert frames[0] is not None and frames[0].fault is None
+    assert frames[1] is not None and frames[1].image is None
+    expected = "the file is missing" if kind == "socketless link" else "the file can't be read: it is no regular file"
+    assert frames[1].fault == expected
+
+
+def test_a_file_that_is_too_large_is_not_read(tmp_path: Path):
+    folder_with(tmp_path)
+    with (tmp_path / "1.png").open("wb") as file:
+        file.truncate(2 << 30)  # without any blocks on the disk
+    source = FolderSource(FolderSettings(path="."), tmp_path)
+    source.read()
+    frame = source.read()
+    assert frame is not None and frame.fault == "the file can't be read: it is larger than 1024 MiB"
+
+
+def test_a_table_that_is_a_pipe_is_refused(tmp_path: Path):
+    folder_with(tmp_path)
+    os.mkfifo(tmp_path / "timestamps.csv")
+    with pytest.raises(SourceError, match=r"timestamps.csv: can't be read \(it is no regular file\); a table in UTF-8"):
+        FolderSource(FolderSettings(path="."), tmp_path)
+
+
+def test_an_open_quote_in_a_table_is_one_line(tmp_path: Path):
+    folder_with(tmp_path, 'file,stamp_ns\n"0.png,0\n' + "x" * 140_000)
+    with pytest.raises(SourceError, match=r"timestamps.csv: line 3: field larger than .*\(an open quote\?\)") as caught:
+        FolderSource(FolderSettings(path="."), tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["a: " + "[" * 20_000, "{a:" * 5_000, "robot: " + "{a: " * 20_000])
+def test_a_configuration_that_is_nested_too_deeply_is_one_line(
+    tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+):
+    path = tmp_path / "deep.yaml"
+    path.write_text(text)
+    assert main(["check", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert said == f"{path}: is nested too deeply; `key: value` lines; see configs/demo.yaml\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.yml", "%YAML:1.0\n---\na: " + "[" * DEEP),
+        ("b.yml", "%YAML:1.0\n---\na:\n  " + "- " * DEEP),
+        ("c.yml", "%YAML:1.0\n---\n" + "a: " * DEEP),
+        ("d.yml", "%YAML:1.0\n---\n" + '"a": ' * DEEP),
+        ("e.yml", '%YAML:1.0\n---\na: "' + "]" * DEEP + '"\nb: ' + "[" * DEEP),
+        ("f.xml", '<?xml version="1.0"?>\n<opencv_storage>' + "<a>" * DEEP),
+        ("g.json", '{"a":' * DEEP),
+    ],
+)
+def test_a_camera_file_that_is_nested_too_deeply_is_one_line(tmp_path: Path, name: str, text: str):
+    (tmp_path / name).write_text(text)
+    done = gripmon("calibrate", "import", tmp_path / name, "--format", "opencv", "--out", tmp_path / "camera.yaml")
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert f"{name}: is nested more than {DEEPEST} levels deep" in done.stderr
+
+
+@pytest.mark.parametrize("suffix", sorted(SYNTAXES))
+def test_what_opencv_writes_is_far_from_too_deep(tmp_path: Path, suffix: str):
+    path = tmp_path / f"camera{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    for k in range(200):
+        storage.write(f"view_{k}", np.random.default_rng(k).normal(size=(30, 3)))
+    storage.write("note", "Mon 12:30: as <we> were [told]")
+    storage.release()
+    assert 1 <= nesting(path.read_bytes()) < DEEPEST // 4
+
+
+def test_an_open_quote_in_a_table_of_pulses_is_one_line(tmp_path: Path):
+    (tmp_path / "pulses.csv").write_text('stamp_ns,until_ns\n"1,2\n' + "x" * 140_000)
+    with pytest.raises(SourceError, match=r"pulses.csv: line \d: field larger than .*\(an open quote\?\)"):
+        read_pulses(tmp_path / "pulses.csv")
