@@ -208,7 +208,10 @@ def test_check_says_when_corners_do_not_give_a_new_pose(
     model.pop("faces")
     text, values = checked(config_with(tmp_path, model), capsys)
     assert f"new pose   NOT from corners in this view: {said}" in text
-    assert values["recalibration"] == {
+    new_pose = values["recalibration"]
+    assert (new_pose.pop("mode"), new_pose.pop("sure_sigma_m")) == ("auto", 5e-5)
+    assert 0.0 < new_pose.pop("sigma_m") < 5e-5
+    assert new_pose == {
         "corners": len(corners), "coplanar": len(corners) == 3, "possible": False, "reason": said,
     }  # fmt: skip
 
