@@ -11,7 +11,7 @@ from daemon_bench import Bench
 from loopback import frame_record, reference_record, wait_until
 from stand_ins import ScriptedMonitor
 
-from gripmon.daemon import StateKeeper
+from gripmon.daemon import StateKeeper, supervised
 from gripmon.records import (
     Alert,
     AlertKind,
@@ -227,7 +227,8 @@ def test_a_command_is_kept_and_published_before_it_is_answered():
     ]
 
 
-def test_one_command_a_frame_also_while_none_comes():
+def test_one_command_a_frame_also_while_none_comes(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(supervised, "_RESTS_FOR", 0.0)  # these frames take no time themselves
     bench = Bench([0, 1, Waiting("silent"), Waiting("silent"), 2])
     asker = Asker([UNDO] * 4)
     bench.run(commands=asker)

@@ -57,9 +57,10 @@ def test_a_silence_and_a_failure_have_one_id_each_from_beginning_to_end():
     assert (watch.state, watch.verdict) == (State.LOST, "unknown")
     [judged] = watch.end_of_frame("", "", 4.2, 42)
     assert (judged.event, judged.alert_id) == ("cleared", failed.alert_id)
-    assert watch.end_of_frame("", "the network: closed", 4.3, 43) == [], "said in the state"
+    [unheard] = watch.end_of_frame("", "the network: closed", 4.3, 43)
+    assert (unheard.kind, unheard.event) == ("output", "raised")
     [again] = watch.no_frame("unplugged", 9.0, 90)
-    assert len({silent.alert_id, failed.alert_id, again.alert_id}) == 3
+    assert len({silent.alert_id, failed.alert_id, unheard.alert_id, again.alert_id}) == 4
 
 
 def test_a_refusal_is_said_once_though_its_figures_change():
