@@ -213,6 +213,12 @@ def test_notices_of_the_start_are_alerts_behind_the_reference():
 # --- commands ---
 
 
+@pytest.fixture(autouse=True)
+def no_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """These frames take no time, of which commands would get a quarter."""
+    monkeypatch.setattr(supervised, "_RESTS_FOR", 0.0)
+
+
 def test_a_command_is_kept_and_published_before_it_is_answered():
     bench = Bench(range(3))
     asker = Asker([UNDO], bench.network.order)
@@ -227,8 +233,7 @@ def test_a_command_is_kept_and_published_before_it_is_answered():
     ]
 
 
-def test_one_command_a_frame_also_while_none_comes(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(supervised, "_RESTS_FOR", 0.0)  # these frames take no time themselves
+def test_one_command_a_frame_also_while_none_comes():
     bench = Bench([0, 1, Waiting("silent"), Waiting("silent"), 2])
     asker = Asker([UNDO] * 4)
     bench.run(commands=asker)
