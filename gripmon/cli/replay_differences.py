@@ -51,7 +51,8 @@ class Differences:
             for what, count in (("verdict", self._verdicts), ("state", self._states))
             if count
         ]
-        judged += [f"alerts differ: {alerts}"] if alerts else []
+        if alerts:
+            judged = [*(judged or ["verdicts and states as recorded"]), f"alerts differ: {alerts}"]
         same = f"verdicts, states and alerts of all {self.frames} frames as recorded"
         numbers = f"numbers differ in {self.frames - self._same}, the TCP by up to {1e3 * self._largest_m:.2g} mm"
         why = " (the images were recorded as JPEG)" if from_jpeg else ""
@@ -81,7 +82,7 @@ class _AlertChanges:
     def against(self, then: _AlertChanges) -> str:
         """What is more, less, or at another frame than then, in words; empty for nothing."""
         texts = []
-        for what in sorted({*self._at, *then._at}, key=lambda w: (self._at.get(w) or then._at[w])[0]):
+        for what in sorted({*self._at, *then._at}, key=lambda w: ((self._at.get(w) or then._at[w])[0], w)):
             now_at, then_at = self._at.get(what, []), then._at.get(what, [])
             if len(now_at) > len(then_at):
                 texts.append(f"{what} at frame {now_at[len(then_at)]}, not recorded")
