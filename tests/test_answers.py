@@ -26,6 +26,7 @@ class StalledQuery:
     def __init__(self) -> None:
         self.begun, self.given_up = threading.Event(), threading.Event()
         self.dropped = False
+        self.parameters: dict[str, str] = {}
         self.payloads: list[bytes] = []
 
     def reply(self, key: str, payload: bytes, **how: object) -> None:

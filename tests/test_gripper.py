@@ -181,7 +181,7 @@ def test_check_says_which_faces_are_skewed(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "gripper.yaml").write_text(yaml.safe_dump(values, sort_keys=False))
     demo = yaml.safe_load(builtin_config("demo.yaml").read_text())
     (tmp_path / "config.yaml").write_text(yaml.safe_dump({**demo, "gripper": "gripper.yaml"}, sort_keys=False))
-    assert main(["check", str(tmp_path / "config.yaml")]) == 0
+    assert main(["check", str(tmp_path / "config.yaml"), "--verbose"]) == 0
     assert " mm off a plane: taken as 2 triangles; if it is flat, one of its points is wrong" in capsys.readouterr().out
 
 

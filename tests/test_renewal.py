@@ -40,7 +40,7 @@ class Cell:
         self.policy = Policy(MonitorSettings().policy)
         reference = reference_of(nominal_cam_T_grip())
         self.renewal = Renewal(
-            MonitorSettings(), box_gripper(sharp=False), np.zeros((6, 6)), reference, self.policy, None
+            MonitorSettings(), box_gripper(sharp=False), np.zeros((6, 6)), reference, self.policy, None, lambda _: ""
         )
         self.asks: str | None = None
         self.refusal: Refusal | None = None

@@ -96,7 +96,7 @@ def test_a_router_that_comes_later_hears_what_was_missed(tmp_path: Path, endpoin
         while "no Zenoh session yet, trying again" not in (line := process.stderr.readline()):
             assert line, "it goes on without a router"
             said.append(line)
-        while "state " not in process.stderr.readline():
+        while "state tracking" not in process.stderr.readline():  # frames have come, and gone nowhere
             assert process.poll() is None
         with plain_session(listen=endpoint, mode="router") as router:
             states: list[dict] = []  # type: ignore[type-arg]

@@ -15,6 +15,7 @@ from published import Published
 from router_process import plain_config
 from router_process import running as router_running
 from test_run_on_the_network import configured, running
+from timely import TimelyInbox
 
 from gripmon.cli import main
 from gripmon.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, Policy, TransformClient, Unusable
@@ -70,7 +71,7 @@ def take(inbox: Inbox, who: Start, now_s: float) -> None:
 
 
 def test_two_tokens_are_several_until_one_is_gone_and_the_other_has_sent():
-    inbox = Inbox()
+    inbox = TimelyInbox()
     inbox.appeared(WRIST)
     inbox.started(FIRST)
     take(inbox, FIRST, 10.0)
@@ -89,7 +90,7 @@ def test_two_tokens_are_several_until_one_is_gone_and_the_other_has_sent():
 
 @pytest.mark.parametrize("id_first", [False, True])
 def test_a_single_monitor_that_ends_is_gone_whichever_token_goes_first(id_first: bool):
-    inbox = Inbox()
+    inbox = TimelyInbox()
     inbox.appeared(WRIST)
     inbox.started(FIRST)
     take(inbox, FIRST, 10.0)
@@ -99,7 +100,7 @@ def test_a_single_monitor_that_ends_is_gone_whichever_token_goes_first(id_first:
 
 
 def test_where_rules_hide_the_tokens_the_transforms_tell():
-    inbox = Inbox()
+    inbox = TimelyInbox()
     inbox.appeared(WRIST)
     for step, who in enumerate((FIRST, SECOND, FIRST)):
         take(inbox, who, 10.0 + 0.1 * step)
@@ -111,7 +112,7 @@ def test_where_rules_hide_the_tokens_the_transforms_tell():
 def test_readings_of_two_starts_are_never_of_one_revision():
     readings = []
     for who in (FIRST, SECOND, FIRST):
-        inbox = Inbox()
+        inbox = TimelyInbox()
         take(inbox, who, 10.0)
         readings.append(judge(inbox.heard, inbox.heard.entry, PATIENT, 10.0, 0, lambda: ""))
     assert readings[0].same_revision_as(readings[2]) and not readings[0].same_revision_as(readings[1])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 if TYPE_CHECKING:
     from gripmon.records import Alert, FrameRecord
@@ -36,8 +35,9 @@ class Differences:
         self._verdicts += then.verdict is not now.verdict
         self._states += then.state is not now.state
         if then.cam_T_grip is not None and now.cam_T_grip is not None:
-            apart_m = np.subtract(now.cam_T_grip.translation_m, then.cam_T_grip.translation_m)
-            self._largest_m = max(self._largest_m, float(np.linalg.norm(apart_m)))
+            self._largest_m = max(
+                self._largest_m, math.dist(now.cam_T_grip.translation_m, then.cam_T_grip.translation_m)
+            )
         self._alerts_then.add(then.seq, then.alerts)
         self._alerts_now.add(now.seq, now.alerts)
 

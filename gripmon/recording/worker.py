@@ -39,12 +39,14 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
     code = 0
+    loop = RecordingLoop(status_descriptor, memory_descriptor)  # by this name until the end: see below
     try:
-        RecordingLoop(status_descriptor, memory_descriptor).run()
+        loop.run()
     except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
         sys.stderr.write(f"recording process: {type(error).__name__}: {error}\n")
         code = 1
-    os._exit(code)  # all is written, or can't be; rerun would wait for a viewer, or for a writer that has died
+    # All is written, or can't be; a stream that is let go waits for a viewer, or for ever for a writer that has died.
+    os._exit(code)
 
 
 class RecordingLoop:
