@@ -10,6 +10,7 @@ import pytest
 
 from gripmon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
 from gripmon.gripper import load_gripper
+from gripmon.outlook import expect
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"
@@ -55,3 +56,16 @@ def test_scenarios_load_and_refuse(tmp_path: Path):
     path.write_text("name: mine\nmount:\n  - {kind: bmp}\n")
     with pytest.raises(ConfigError, match=r"mount\[0\].kind: is 'bmp', did you mean 'bump'"):
         load_scenario(path)
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
+def test_a_shipped_view_keeps_its_alert_limits(name: str):
+    """Else none of its transforms would ever be valid."""
+    path = builtin_config(name)
+    if is_second(path):
+        return
+    config = load_config(path, check_source=False, with_taught=False)
+    monitor = config.settings.monitor
+    outlook = expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
+    assert outlook.protection.position_m <= monitor.policy.alert_limit_m
+    assert outlook.protection.rotation_rad <= monitor.policy.alert_limit_rad
