@@ -39,14 +39,15 @@ def main(status_descriptor: int, memory_descriptor: int) -> None:
     os.nice(_NICENESS)
     cv2.setNumThreads(1)
     code = 0
-    loop = RecordingLoop(status_descriptor, memory_descriptor)  # by this name until the end: see below
+    loop = RecordingLoop(status_descriptor, memory_descriptor)
     try:
         loop.run()
     except Exception as error:  # noqa: BLE001 - one line, and the daemon starts another process
         sys.stderr.write(f"recording process: {type(error).__name__}: {error}\n")
         code = 1
-    # All is written, or can't be; a stream that is let go waits for a viewer, or for ever for a writer that has died.
-    os._exit(code)
+    if not loop.hangs:
+        del loop  # a stream that is let go waits until its file is whole, or for ever if its writer has died
+    os._exit(code)  # all is written, or can't be
 
 
 class RecordingLoop:
@@ -75,7 +76,7 @@ class RecordingLoop:
     def run(self) -> None:
         next_flush = next_report = time.monotonic() + self._flush_period_s
         ended = False
-        while not ended and not (self._scene is not None and self._files.hangs):
+        while not ended and not self.hangs:
             next_turn = min(next_flush, next_report)
             readable, _, _ = select.select((_STDIN,), (), (), max(next_turn - time.monotonic(), 0.0))
             if readable:
@@ -100,6 +101,11 @@ class RecordingLoop:
             if self._live is not None:
                 self._live.close()
             self._report()
+
+    @property
+    def hangs(self) -> bool:
+        """Whether rerun waits for ever for a writer that has died."""
+        return self._scene is not None and self._files.hangs
 
     def _take(self, payload: bytes) -> None:
         if self._scene is None:
