@@ -69,5 +69,6 @@ def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0, corners=()), lambda: empty)
     writer.close(10.0)
+    assert writer.failure is None and writer.dropped == 0
     (path,) = tmp_path.glob("*.rrd")
     assert Recorded(path).by_seq("quality/edge_points", "scalars") == {0: [0.0, 0.0]}

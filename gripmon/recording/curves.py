@@ -75,12 +75,12 @@ class CurveWriter:
             send.curve("image/sharpness", shown, [p.sharpness for p in pictures])
         traced = [r for r in shown if r.trace is not None]
         sides = [_edge_residuals_px(r.trace) for r in traced if r.trace is not None]
-        if sides:
-            used, refused = ([side[i] for side in sides] for i in (0, 1))
-            columns = [
-                *rr.AnyValues.columns(used_px=np.concatenate(used)).partition([len(each) for each in used]),
-                *rr.AnyValues.columns(refused_px=np.concatenate(refused)).partition([len(each) for each in refused]),
-            ]
+        columns: list[rr.ComponentColumn] = []
+        for i, name in enumerate(("used_px", "refused_px")):
+            each = [side[i] for side in sides]
+            if any(len(residuals) for residuals in each):  # rerun makes no column of nothing
+                columns += rr.AnyValues.columns(True, **{name: np.concatenate(each)}).partition([len(one) for one in each])
+        if columns:
             send.frames("residual/edge_points", traced, rr.ComponentColumnList(columns))
 
     def _drift(self, rows: Sequence[Row]) -> None:
