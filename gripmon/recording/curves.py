@@ -79,7 +79,9 @@ class CurveWriter:
         for i, name in enumerate(("used_px", "refused_px")):
             each = [side[i] for side in sides]
             if any(len(residuals) for residuals in each):  # rerun makes no column of nothing
-                columns += rr.AnyValues.columns(True, **{name: np.concatenate(each)}).partition([len(one) for one in each])
+                columns += rr.AnyValues.columns(True, **{name: np.concatenate(each)}).partition(
+                    [len(one) for one in each]
+                )
         if columns:
             send.frames("residual/edge_points", traced, rr.ComponentColumnList(columns))
 
