@@ -10,7 +10,8 @@ import pytest
 
 from gripmon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
 from gripmon.gripper import load_gripper
-from gripmon.outlook import expect
+from gripmon.monitor import MonitorSettings
+from gripmon.outlook import Outlook, expect
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"
@@ -58,14 +59,27 @@ def test_scenarios_load_and_refuse(tmp_path: Path):
         load_scenario(path)
 
 
-@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
-def test_a_shipped_view_keeps_its_alert_limits(name: str):
-    """Else none of its transforms would ever be valid."""
-    path = builtin_config(name)
-    if is_second(path):
-        return
-    config = load_config(path, check_source=False, with_taught=False)
+WRIST = sorted(path.name for path in (ROOT / "configs").glob("*.yaml") if not is_second(path))
+
+
+@pytest.fixture(params=WRIST)
+def shipped(request: pytest.FixtureRequest) -> tuple[MonitorSettings, Outlook]:
+    """A shipped configuration's settings and what one frame of its view is expected to show."""
+    config = load_config(builtin_config(request.param), check_source=False, with_taught=False)
     monitor = config.settings.monitor
-    outlook = expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
+    return monitor, expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
+
+
+def test_a_shipped_view_keeps_its_alert_limits(shipped: tuple[MonitorSettings, Outlook]):
+    """Else none of its transforms would ever be valid."""
+    monitor, outlook = shipped
     assert outlook.protection.position_m <= monitor.policy.alert_limit_m
     assert outlook.protection.rotation_rad <= monitor.policy.alert_limit_rad
+
+
+def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(shipped: tuple[MonitorSettings, Outlook]):
+    """By what one frame of it is certain to; the mean of frames whose errors last is hardly more."""
+    monitor, outlook = shipped
+    if monitor.recalibration.mode == "off":
+        return
+    assert outlook.enough and max(outlook.sigma[:3]) <= monitor.recalibration.sure_sigma_m

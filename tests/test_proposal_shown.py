@@ -13,8 +13,6 @@ from stand_ins import ScriptedMonitor
 
 from gripmon.cli import fleet_table
 from gripmon.client import MonitorName, MonitorStatus
-from gripmon.config import builtin_config, is_second, load_config
-from gripmon.outlook import expect
 from gripmon.records import AlertKind, MonitorState, Severity, StandingAlert
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,17 +56,3 @@ def test_watch_begins_with_the_command_and_explains_its_marks():
     assert shown.splitlines()[-1] == fleet_table.LEGEND
     assert f"waits: {COMMAND}" in fleet_table.line(status())
     assert fleet_table.LEGEND not in fleet_table.plain([status()], "")
-
-
-@pytest.mark.parametrize("name", sorted(path.name for path in (ROOT / "configs").glob("*.yaml")))
-def test_a_shipped_view_is_certain_enough_to_recalibrate_by_itself(name: str):
-    """By what one frame of it is certain to; the mean of frames whose errors last is hardly more."""
-    path = builtin_config(name)
-    if is_second(path):
-        return
-    config = load_config(path, check_source=False, with_taught=False)
-    monitor = config.settings.monitor
-    if monitor.recalibration.mode == "off":
-        return
-    outlook = expect(config.camera, config.gripper, monitor, config.reference, config.jaw_opening_m, None)
-    assert outlook.enough and max(outlook.sigma[:3]) <= monitor.recalibration.sure_sigma_m

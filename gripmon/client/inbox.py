@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import weakref
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
@@ -118,11 +119,7 @@ class Inbox:
     def vanished(self, monitor: MonitorName) -> None:
         """Its liveliness token is gone: it ended, was killed, or the way to it is cut."""
         with self._lock:
-            entry = self.heard.entry
-            cut = self.heard.cut or (entry is not None and entry.monitor == monitor)
-            senders = tuple(sender for sender in self.heard.senders if sender[0].monitor != monitor)
-            self._set(present=self.heard.present - {monitor}, cut=cut, senders=senders)
-            self._wake()
+            self._cut_off(lambda start: start.monitor == monitor, present=self.heard.present - {monitor})
 
     def started(self, start: Start) -> None:
         """The token of this start is there."""
@@ -134,11 +131,7 @@ class Inbox:
     def ended(self, start: Start) -> None:
         """It is gone; another process may speak under the same name."""
         with self._lock:
-            entry = self.heard.entry
-            cut = self.heard.cut or (entry is not None and entry.start == start)
-            senders = tuple(sender for sender in self.heard.senders if sender[0] != start)
-            self._set(starts=self.heard.starts - {start}, cut=cut, senders=senders)
-            self._wake()
+            self._cut_off(lambda one: one == start, starts=self.heard.starts - {start})
 
     def found(self, monitor: MonitorName) -> None:
         """It is on the network, whether it is the one that is meant or not."""
@@ -187,6 +180,14 @@ class Inbox:
         self.heard = before._replace(**changes)  # type: ignore[arg-type]
         if len(self.heard.present) > 1 >= len(before.present) or len(self.heard.starts) > 1 >= len(before.starts):
             _log.error("%s", several(self.heard, 0.0))
+
+    def _cut_off(self, gone: Callable[[Start], bool], **changes: object) -> None:
+        """These starts are gone, with what else that changes."""
+        entry = self.heard.entry
+        cut = self.heard.cut or (entry is not None and gone(entry.start))
+        senders = tuple(sender for sender in self.heard.senders if not gone(sender[0]))
+        self._set(cut=cut, senders=senders, **changes)
+        self._wake()
 
     def _wake(self) -> None:
         for waiter in self._waiters:

@@ -91,7 +91,7 @@ class Refits:
     def _off(fits: Separation, pulls: Array) -> Array:
         return np.einsum("hij,hfj->hfi", fits.inverse, pulls)[:, :, :6]
 
-    def anchored(self, anchor_T: Array, covariance: Array, of_model: Array | float = 0.0) -> Anchored:
+    def anchored(self, anchor_T: Array, covariance: Array, of_model: Array) -> Anchored:
         """The fits with the gripper known to be at ``anchor_T`` (4, 4) but for ``covariance`` (6, 6), and off by the
         model by ``of_model`` (f, 6).
         """
@@ -106,7 +106,7 @@ class Refits:
         both = INFLATION**2 * self.free.covariance[:, :6, :6] + covariance + self._floor
         surprise = np.einsum("hi,hi->h", way, np.linalg.solve(both, way[:, :, None])[:, :, 0])
         pulls = self._pulls.copy()
-        pulls[:, :, :6] += of_model @ information if isinstance(of_model, np.ndarray) else 0.0
+        pulls[:, :, :6] += of_model @ information
         return Anchored(fits, surprise, self._off(fits, pulls))
 
     @property

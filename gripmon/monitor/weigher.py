@@ -79,7 +79,7 @@ class Weigher:
         self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
         every = np.arange(len(gripper.edge_ids))
-        self._lasting = Lasting.of(_about(every, gripper, tracker, self._may_open))
+        self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
         self._kept: dict[bytes, tuple[Hypotheses, NDArray[np.intp]]] = {}
         self._newest: tuple[Measurement, float, Refits, Anchored] | None = None
         self.swing: Array = np.zeros(6)
@@ -228,7 +228,7 @@ class Weigher:
         if self._newest is None or self._newest[0] is not measurement or self._newest[1] != now_s:
             fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model)
             expected_T, covariance = self.expected
-            of_model = 0.0 if self.anchor is None else self.anchor.of_model
+            of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
             anchored = fits.anchored(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
             self._newest = measurement, now_s, fits, anchored
         return self._newest[2:]
@@ -239,7 +239,7 @@ class Weigher:
         if key not in self._kept:
             if len(self._kept) >= MOST_KEPT:
                 self._kept.clear()
-            hypotheses = _about(edges, self._gripper, self._tracker, self._may_open)
+            hypotheses = _hypotheses_about(edges, self._gripper, self._tracker, self._may_open)
             self._kept[key] = hypotheses, self._lasting.rows(hypotheses, edges)
         return self._kept[key]
 
@@ -254,7 +254,7 @@ def _proven(ends: FingerEndsSeen | None, displaced: bool, again: bool) -> bool:
     return ends.sure or expected or (again and ends.at_each)
 
 
-def _about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
+def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracker, may_open: bool) -> Hypotheses:
     names = tuple(gripper.edge_ids[edge] for edge in edges)
     return hypotheses_of(names, gripper.edge_finger[edges], gripper.finger_ids, tracker.along[edges], may_open)
 
@@ -270,7 +270,9 @@ def foresee_protection(
     """The bound of a frame by itself that shows all that a measurement does, the fingers' ends as such."""
     if not len(measurement.normal.edge):
         return Protection(UNBOUNDED_M, UNBOUNDED_RAD, settings.policy.integrity_risk, "no edge is seen")
-    hypotheses = _about(measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0)
+    hypotheses = _hypotheses_about(
+        measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
+    )
     model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
     doubts = Refits(measurement, hypotheses, _floor(settings), model).doubts(measurement.cam_T_grip, hypotheses.prior)
     return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)

@@ -175,7 +175,7 @@ class FileSeries:
 
     def close(self) -> None:
         """Complete the file: its footer lets readers load it without a scan."""
-        self._complete()
+        self._end()
         self._lose()
 
     def _flush(self, stream: rr.RecordingStream, file: _File) -> bool:
@@ -243,11 +243,9 @@ class FileSeries:
         return ""
 
     def _end(self) -> None:
-        """Complete the file before the next one; what waits stays for that."""
-        self._complete()
-
-    def _complete(self) -> None:
-        """Write the footer and end the file; not where its disk has failed, for which rerun would wait for ever."""
+        """Write the footer and end the file; not where its disk has failed, for which rerun would wait for ever.  What
+        waits stays for the next one.
+        """
         stream, file = self._stream, self._file
         if stream is not None and self._writer is not None and file is not None:
             self._writer.finish()
