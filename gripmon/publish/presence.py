@@ -84,14 +84,10 @@ class Presence:
         session = self._session
         if session is None:
             return ()
-        found: set[str] = set()
-        for leaf in ("alive/*", "alive"):
-            for reply in session.liveliness().get(self._keys[leaf], timeout=_CONNECTED_WITHIN_S):
-                if reply.ok is not None:
-                    found.add(_id_in(reply.ok.key_expr))
-            if found:
-                break  # who has an id shows the token without one, too
-        return tuple(sorted(found))
+        replies = session.liveliness().get(self._keys["alive/**"], timeout=_CONNECTED_WITHIN_S)
+        found = {_id_in(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        # a monitor with an id shows the token without one, too: "" counts only alone
+        return tuple(sorted(found - {""} or found))
 
     def _attach(self, session: zenoh.Session) -> None:
         take = zenoh.handlers.Callback(self._take, indirect=False)

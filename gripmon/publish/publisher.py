@@ -243,7 +243,8 @@ class _Wire:
 
     def __init__(self, session: zenoh.Session, keys: Keys, monitor_id: str) -> None:
         self._session, self._keys = session, keys
-        self._tokens = [keys["alive"], *([keys[f"alive/{monitor_id}"]] if monitor_id else [])]
+        # the id first: whoever sees the token without one finds the id, too
+        self._tokens = [*([keys[f"alive/{monitor_id}"]] if monitor_id else []), keys["alive"]]
         self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
@@ -281,6 +282,6 @@ class _Wire:
         self.puts[leaf] = self.values[leaf].put
 
     def close(self) -> None:
-        for token in self._alive:
+        for token in reversed(self._alive):
             token.undeclare()
         self._answers.close()
