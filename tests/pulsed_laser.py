@@ -8,13 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from laser_scenes import paper_setup, sampled
 
-from gripmon.calibration.laser.calibrating import Spots, calibrate
-from gripmon.calibration.laser.document import LaserCalibration, document
-from gripmon.calibration.laser.setup import LaserSetup
+from gripmon.laser.pointer.calibrating import Spots, calibrate
+from gripmon.laser.pointer.document import LaserCalibration, document
+from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.geometry import invert, perturb
 from gripmon.provenance import provenance_of
-from gripmon.spotwatch import SpotSeen, plain_spot
-from gripmon.spotwatch.world import Calibrated, World, calibrated, foresee
+from gripmon.laser.watch import SpotSeen, plain_spot
+from gripmon.laser.watch.world import Calibrated, World, calibrated, foresee
 
 NOISE_PX = 0.3
 AXES = np.eye(13)

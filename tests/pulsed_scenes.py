@@ -19,7 +19,7 @@ from laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibration.documents import CameraCalibration, CameraResiduals
-from gripmon.calibration.laser.setup import LaserSetup, spots_on_plane
+from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
 from gripmon.geometry import perturb

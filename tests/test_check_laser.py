@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
-from gripmon.spotwatch.world import calibrated, foresee
+from gripmon.laser.watch.world import calibrated, foresee
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 

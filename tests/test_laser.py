@@ -7,10 +7,10 @@ import pytest
 from laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.laser import closed_form, common_plane
-from gripmon.calibration.laser.planar_start import planar_start
-from gripmon.calibration.laser.refinement import refine
-from gripmon.calibration.laser.setup import (
+from gripmon.laser.pointer import closed_form, common_plane
+from gripmon.laser.pointer.planar_start import planar_start
+from gripmon.laser.pointer.refinement import refine
+from gripmon.laser.pointer.setup import (
     LaserSetup,
     basis,
     laser_lines,
@@ -20,7 +20,7 @@ from gripmon.calibration.laser.setup import (
     spots_on_plane,
     spots_on_rays,
 )
-from gripmon.calibration.laser.spot_problem import SpotProblem
+from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import invert, make_transform, perturb
 

@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibration.documents import CameraCalibration, CameraResiduals
-from gripmon.calibration.laser.document import NAMES, pose_jacobian
+from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
 from gripmon.geometry import invert, perturb, perturbation_between

@@ -7,15 +7,15 @@ import pytest
 from laser_scenes import PAPER_LENS, assert_same, numeric, scene
 from scipy.stats import f as fisher_f
 
-from gripmon.calibration.laser import common_plane, refinement
-from gripmon.calibration.laser.calibrating import Spots, calibrate, contradictions
-from gripmon.calibration.laser.held_lens import with_held_lens
-from gripmon.calibration.laser.refinement import FALSE_OUTLIERS, refine
-from gripmon.calibration.laser.setup import (
+from gripmon.laser.pointer import common_plane, refinement
+from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions
+from gripmon.laser.pointer.held_lens import with_held_lens
+from gripmon.laser.pointer.refinement import FALSE_OUTLIERS, refine
+from gripmon.laser.pointer.setup import (
     PARAMETERS,
     LaserSetup,
 )
-from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise, SpotProblem
+from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import perturb, perturbation_between

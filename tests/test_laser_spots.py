@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from laser_images import cluttered, spot_image
 
-from gripmon.calibration.laser.spots import find_spots
+from gripmon.laser.pointer.spots import find_spots
 from gripmon.calibration.sighting import NotFound
 
 

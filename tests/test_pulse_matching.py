@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.pulses.matching import Matcher, Shown, mean_image
-from gripmon.pulses.settings import PulseSettings
-from gripmon.pulses.told import Told
+from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
+from gripmon.laser.pulses.settings import PulseSettings
+from gripmon.laser.pulses.told import Told
 from gripmon.records import Frame, PulseFault
 
 POSE = np.eye(4)

@@ -16,9 +16,9 @@ from stand_ins import Listener, ScriptedSource
 
 from gripmon.config.second import read_laser
 from gripmon.daemon import DaemonSettings, run_second
-from gripmon.pulses.settings import PulseSettings
-from gripmon.pulses.told import LONGEST_S, Told, of_message
-from gripmon.pulses.watching import PulsedWatch
+from gripmon.laser.pulses.settings import PulseSettings
+from gripmon.laser.pulses.told import LONGEST_S, Told, of_message
+from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.records import (
     AlertEvent,
     AlertKind,
@@ -34,7 +34,7 @@ from gripmon.records import (
     from_json,
 )
 from gripmon.sources import Waiting
-from gripmon.spotwatch import SpotWatchSettings
+from gripmon.laser.watch import SpotWatchSettings
 
 START_NS, PERIOD_NS = 1_000_000_000_000, 400_000_000
 NEVER = 1000.0  # seconds that no test takes

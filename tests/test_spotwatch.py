@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
-from gripmon.calibration.laser.spots import Spot
+from gripmon.laser.pointer.spots import Spot
 from gripmon.calibration.sighting import NotFound
 from gripmon.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
-from gripmon.spotwatch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
-from gripmon.spotwatch.foresight import foresight
-from gripmon.spotwatch.world import calibrated, foresee
+from gripmon.laser.watch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
+from gripmon.laser.watch.foresight import foresight
+from gripmon.laser.watch.world import calibrated, foresee
 
 
 @pytest.fixture(scope="module")

@@ -12,11 +12,11 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.calibration.documents import CameraCalibration
-    from gripmon.calibration.laser.calibrating import LaserResult, Spots
-    from gripmon.calibration.laser.document import LaserCalibration
-    from gripmon.calibration.laser.planning import Plan
-    from gripmon.calibration.laser.samples import Samples
-    from gripmon.calibration.laser.spot_problem import LensPrior, PoseNoise
+    from gripmon.laser.pointer.calibrating import LaserResult, Spots
+    from gripmon.laser.pointer.document import LaserCalibration
+    from gripmon.laser.pointer.planning import Plan
+    from gripmon.laser.pointer.samples import Samples
+    from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise
     from gripmon.records import Array
 
 LONGEST_ARM_M = 20.0
@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
     written = _document(result, samples, notes, inputs, arguments)
     planned = _planned(result, arguments)
     if arguments.picture is not None:
-        from gripmon.calibration.laser.picture import draw
+        from gripmon.laser.pointer.picture import draw
 
         files.write_picture(draw(result, samples.base_T_ee, written), Path(arguments.picture))
     if arguments.recording is not None:
@@ -133,7 +133,7 @@ def _data(
     arguments: argparse.Namespace, calibration: CameraCalibration
 ) -> tuple[Samples, Spots, list[Path], tuple[str, ...]]:
     """Samples that have a spot, their spots, all input files, and what is to be noted."""
-    from gripmon.calibration.laser.samples import picked
+    from gripmon.laser.pointer.samples import picked
     from gripmon.cli import laser_tables
 
     paths = [Path(name) for name in arguments.data]
@@ -155,7 +155,7 @@ def _calibrated(
     spots: Spots,
     arguments: argparse.Namespace,
 ) -> LaserResult:
-    from gripmon.calibration.laser.calibrating import calibrate
+    from gripmon.laser.pointer.calibrating import calibrate
     from gripmon.calibration.sighting import CalibrationError
     from gripmon.camera import make_camera
 
@@ -178,7 +178,7 @@ def _calibrated(
 
 
 def _noise(given: tuple[float, float] | None) -> PoseNoise | None:
-    from gripmon.calibration.laser.spot_problem import PoseNoise
+    from gripmon.laser.pointer.spot_problem import PoseNoise
 
     return None if given is None else PoseNoise(*given)
 
@@ -188,7 +188,7 @@ def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> Len
     import numpy as np
 
     from gripmon.calibration.intrinsics import lens_vector, model_of
-    from gripmon.calibration.laser.spot_problem import LensPrior
+    from gripmon.laser.pointer.spot_problem import LensPrior
     from gripmon.calibration.lens_models import LensModel, parameter_names
 
     camera = calibration.camera
@@ -212,9 +212,9 @@ def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> Len
 def _document(
     result: LaserResult, samples: Samples, notes: tuple[str, ...], inputs: list[Path], arguments: argparse.Namespace
 ) -> LaserCalibration:
-    from gripmon.calibration.laser.calibrating import groups_of
-    from gripmon.calibration.laser.document import document
-    from gripmon.calibration.laser.planar_start import SEED
+    from gripmon.laser.pointer.calibrating import groups_of
+    from gripmon.laser.pointer.document import document
+    from gripmon.laser.pointer.planar_start import SEED
     from gripmon.provenance import provenance_of
 
     noise = None if arguments.arm_noise is None else ":".join(f"{value:g}" for value in arguments.arm_noise)
@@ -242,7 +242,7 @@ def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
 
 
 def _planned(result: LaserResult, arguments: argparse.Namespace) -> Plan | None:
-    from gripmon.calibration.laser.planning import Arm, plan
+    from gripmon.laser.pointer.planning import Arm, plan
     from gripmon.calibration.sighting import CalibrationError
 
     if arguments.plan is None:

@@ -11,7 +11,7 @@ from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.laser.samples import Row
+    from gripmon.laser.pointer.samples import Row
     from gripmon.calibration.robot_world import RobotWorld
     from gripmon.calibration.robot_world_document import RobotWorldCalibration
     from gripmon.records import Array
@@ -84,7 +84,7 @@ class _Poses:
 def _poses(arguments: argparse.Namespace) -> _Poses:
     import numpy as np
 
-    from gripmon.calibration.laser.samples import check_scale, pose_of
+    from gripmon.laser.pointer.samples import check_scale, pose_of
     from gripmon.calibration.robot_world_doubts import check_target_scale
     from gripmon.cli.laser_tables import rows_of
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.laser.document import LaserCalibration
+    from gripmon.laser.pointer.document import LaserCalibration
     from gripmon.records import Array
-    from gripmon.spotwatch import CameraMotion, SpotJudgement, SpotWatch, SpotWatchSettings
-    from gripmon.spotwatch.foresight import Foresight
+    from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatch, SpotWatchSettings
+    from gripmon.laser.watch.foresight import Foresight
 
 _OPTIONS = ("arm_noise", "false_alarms", "wrong_spots")
 _AXES = ("x", "y", "z")
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> SpotWatchSettings:
-    from gripmon.spotwatch import SpotWatchSettings
+    from gripmon.laser.watch import SpotWatchSettings
 
     given: dict[str, Any] = {}
     if arguments.arm_noise is not None:
@@ -109,8 +109,8 @@ def _calibration(path: Path) -> LaserCalibration:
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
     """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
     from gripmon.calibration.sighting import CalibrationError
-    from gripmon.spotwatch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
-    from gripmon.spotwatch.world import calibrated
+    from gripmon.laser.watch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
+    from gripmon.laser.watch.world import calibrated
 
     known = calibrated(calibration)
     try:
@@ -189,7 +189,7 @@ def _header_lines(report: dict[str, Any]) -> list[str]:
 
 def _judged(name: str, calibration: LaserCalibration, settings: SpotWatchSettings, paths: list[Path]) -> dict[str, Any]:
     from gripmon.cli import laser_tables
-    from gripmon.spotwatch import SpotSeen, SpotWatch
+    from gripmon.laser.watch import SpotSeen, SpotWatch
 
     samples, origins = laser_tables.read_tables(paths)
     size_px = (calibration.camera.width_px, calibration.camera.height_px)

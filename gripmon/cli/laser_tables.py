@@ -11,10 +11,10 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     import csv
 
-    from gripmon.calibration.laser.calibrating import Spots
-    from gripmon.calibration.laser.planning import Plan
-    from gripmon.calibration.laser.samples import Samples
-    from gripmon.calibration.laser.spots import Spot
+    from gripmon.laser.pointer.calibrating import Spots
+    from gripmon.laser.pointer.planning import Plan
+    from gripmon.laser.pointer.samples import Samples
+    from gripmon.laser.pointer.spots import Spot
     from gripmon.calibration.sighting import NotFound
 
 _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
@@ -24,7 +24,7 @@ def read_tables(paths: list[Path]) -> tuple[Samples, list[Path]]:
     """All samples, and the file that each comes from; what is wrong ends the command with exit code 2.  Of several
     tables each sample's name says which.
     """
-    from gripmon.calibration.laser.samples import from_rows, joined
+    from gripmon.laser.pointer.samples import from_rows, joined
 
     parts, origins = [], []
     for path in paths:
@@ -156,7 +156,7 @@ def write_plan(planned: Plan, path: Path) -> None:
     import io
 
     from gripmon.atomic import write_atomically
-    from gripmon.calibration.laser.samples import POSITION, QUATERNION
+    from gripmon.laser.pointer.samples import POSITION, QUATERNION
     from gripmon.geometry import quaternion_xyzw
 
     text = io.StringIO()
@@ -190,8 +190,8 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
     """
     import numpy as np
 
-    from gripmon.calibration.laser.calibrating import Spots
-    from gripmon.calibration.laser.spots import find_spots as in_image
+    from gripmon.laser.pointer.calibrating import Spots
+    from gripmon.laser.pointer.spots import find_spots as in_image
     from gripmon.calibration.sighting import NotFound
 
     unseen = set(_unseen(samples))
@@ -225,8 +225,8 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
 
 def candidates(samples: Samples, origins: list[Path], size_px: tuple[int, int]) -> list[list[Spot] | NotFound]:
     """Of every sample: what may be its spot, or why there is none."""
-    from gripmon.calibration.laser.spots import find_spots as in_image
-    from gripmon.spotwatch import plain_spot
+    from gripmon.laser.pointer.spots import find_spots as in_image
+    from gripmon.laser.watch import plain_spot
 
     unseen = set(_unseen(samples))
     out: list[list[Spot] | NotFound] = []

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from gripmon.calibration.laser.document import LaserCalibration
+from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.camera import Camera, make_camera
 from gripmon.config.calibrated import wrong_schema
@@ -21,13 +21,13 @@ from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.daemon import DaemonSettings
 from gripmon.metrics import MetricsSettings
-from gripmon.pulses.settings import PulseSettings
-from gripmon.pulses.told import Told
-from gripmon.pulses.watching import PulsedWatch
+from gripmon.laser.pulses.settings import PulseSettings
+from gripmon.laser.pulses.told import Told
+from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.recording import RecordingSettings, ViewSettings
 from gripmon.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
 from gripmon.sources.pulses import read_pulses
-from gripmon.spotwatch import SpotWatchSettings
+from gripmon.laser.watch import SpotWatchSettings
 from gripmon.wire import Joining, PublishSettings
 
 SECTION = "laser"

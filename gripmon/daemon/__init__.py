@@ -28,8 +28,8 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.publish import Publisher, SpotPublisher, StatePublisher
-from gripmon.pulses.told import Told
-from gripmon.pulses.watching import PulsedWatch
+from gripmon.laser.pulses.told import Told
+from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.recording import EventRecorder, Recorder, SpotRecorder
 from gripmon.records import Alert
 from gripmon.sources import Source

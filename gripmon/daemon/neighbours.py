@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gripmon.pulses.told import Told
+from gripmon.laser.pulses.told import Told
 from gripmon.records import (
     Command,
     CommandError,

@@ -17,9 +17,9 @@ from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest,
 from gripmon.daemon.watch import Judged
 from gripmon.policy import AlertBook
 from gripmon.publish import SpotPublisher
-from gripmon.pulses.matching import Shown
-from gripmon.pulses.told import Told
-from gripmon.pulses.watching import Outcome, PulsedWatch
+from gripmon.laser.pulses.matching import Shown
+from gripmon.laser.pulses.told import Told
+from gripmon.laser.pulses.watching import Outcome, PulsedWatch
 from gripmon.recording import SpotRecorder
 from gripmon.records import (
     Alert,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.calibration.laser.document import LaserCalibration
+from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.feed import ProcessRecorder, Truth

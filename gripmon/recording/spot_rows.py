@@ -23,8 +23,8 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from gripmon.calibration.laser.document import LaserCalibration, setup_of
-from gripmon.calibration.laser.setup import laser_lines, spots_on_plane
+from gripmon.laser.pointer.document import LaserCalibration, setup_of
+from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
 from gripmon.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.recording import palette
 from gripmon.recording.columns import Sender, SpotRow

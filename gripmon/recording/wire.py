@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.laser.document import LaserCalibration
+from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.camera import Camera
 from gripmon.gripper import Gripper
 from gripmon.recording.settings import RecordingSettings

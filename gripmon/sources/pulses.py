@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gripmon.pulses.told import Told, of_rows
+from gripmon.laser.pulses.told import Told, of_rows
 from gripmon.sources.base import SourceError
 
 COLUMNS = "stamp_ns,until_ns,tx_m,ty_m,tz_m,qx,qy,qz,qw"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.laser.setup import LaserSetup, spots_on_plane
+from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
 from gripmon.camera import BrownConradyLens, Camera, make_camera
 from gripmon.geometry import invert, make_transform
 from gripmon.records import Array

@@ -13,11 +13,11 @@ from scipy.stats import f as fisher_f
 
 from benchmarks.laser_scenes import PAPER_LENS, REAL_LENS, LaserData, paper_setup, real_setup, sampled
 from gripmon.calibration import robot_world
-from gripmon.calibration.laser import closed_form, common_plane
-from gripmon.calibration.laser.document import pose_jacobian
-from gripmon.calibration.laser.refinement import refine
-from gripmon.calibration.laser.setup import LaserSetup
-from gripmon.calibration.laser.spot_problem import SpotProblem
+from gripmon.laser.pointer import closed_form, common_plane
+from gripmon.laser.pointer.document import pose_jacobian
+from gripmon.laser.pointer.refinement import refine
+from gripmon.laser.pointer.setup import LaserSetup
+from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.geometry import invert, make_transform, perturbation_between
 

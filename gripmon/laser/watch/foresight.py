@@ -1,0 +1,134 @@
+"""What the watch will notice, before there is any pulse: how surely spots are foreseen, and which motions of the camera
+are told after how many pulses.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gripmon.calibration.sighting import CalibrationError
+from gripmon.geometry import make_transform
+from gripmon.records import Array
+from gripmon.laser.watch.motion import UNIT
+from gripmon.laser.watch.motions import KINDS, SCALES, assumed
+from gripmon.laser.watch.moving import on_plane
+from gripmon.laser.watch.sequential import LEAST_PULSES
+from gripmon.laser.watch.settings import SpotWatchSettings
+from gripmon.laser.watch.single import spread_px, visible
+from gripmon.laser.watch.world import CAMERA, COUNT, Calibrated, Foreseen, foresee, larger
+
+PULSES = (LEAST_PULSES, 10, 30, 100)
+POSES, ASSUMED_TILT_RAD, ASSUMED_DISTANCE_M = 9, math.radians(30.0), 0.3
+"""Where no poses are given: spots on a grid over the image, the beam tilted so to the plane's normal, each time in
+another direction, the laser so far from its spot.
+"""
+_BORDER = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Foresight:
+    """``sigma_px`` and ``sigma_m`` (k,): standard deviation of each pose's foreseen spot in its worst direction, in the
+    image and on the plane.  ``sizes`` (n, 6): motions of ``base_T_cam`` along its position's and rotation's axes (base;
+    m, rad) that are told on average ``pulses`` (n,) after they happened.  ``weakest`` (6,): the direction that is told
+    the least, its size as it is told after the most pulses, m and rad.
+    """
+
+    sigma_px: Array
+    sigma_m: Array
+    pulses: tuple[int, ...]
+    sizes: Array
+    weakest: Array
+
+
+def foresight(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequence[Array]) -> Foresight:
+    """With pulses from these poses (4, 4) in turn, those only from which a spot is seen.  Raises
+    :class:`CalibrationError` if there is none.
+    """
+    arm = settings.arm_covariance
+    seen = [foresee(calibrated.world, calibrated.camera, pose) for pose in poses]
+    seen = [found for found in seen if visible(calibrated, found, arm) is None and _inside(calibrated, found)]
+    if not seen:
+        raise CalibrationError("from none of the poses does the camera see the spot; poses of this set-up")
+    noise = calibrated.sigma_px**2 * np.eye(2)
+    spreads = [spread_px(calibrated, found, arm) + noise for found in seen]
+    sigma_px = np.array([math.sqrt(float(np.linalg.eigvalsh(spread)[-1])) for spread in spreads])
+    sigma_m = np.array([_metres(calibrated, found, spread) for found, spread in zip(seen, spreads, strict=True)])
+    gains = [_Gain(calibrated, settings, seen, pulses) for pulses in PULSES]
+    sizes = np.array([[gain.size(np.eye(6)[axis]) for axis in range(6)] for gain in gains])
+    _, axes = np.linalg.eigh(gains[-1].information * np.outer(UNIT, UNIT))
+    weakest = axes[:, 0] * UNIT
+    return Foresight(sigma_px, sigma_m, PULSES, sizes, weakest * gains[-1].size(weakest))
+
+
+def assumed_poses(calibrated: Calibrated) -> tuple[Array, ...]:
+    """(:data:`POSES`) ``base_T_ee``, whose spots lie on a grid over the image."""
+    camera, world = calibrated.camera, calibrated.world
+    grid = np.linspace(_BORDER, 1.0 - _BORDER, 3)
+    towards = world.lit.normal_cam if world.lit.normal_cam @ world.base_T_cam[:3, 2] > 0.0 else -world.lit.normal_cam
+    upright = Rotation.align_vectors([towards], [[0.0, 0.0, 1.0]])[0]
+    to_axis = Rotation.align_vectors([[0.0, 0.0, 1.0]], [world.lit.direction_ee])[0]
+    out = []
+    for k, (row, column) in enumerate((row, column) for row in grid for column in grid):
+        spot = on_plane(world, calibrated, np.array([column * camera.width_px, row * camera.height_px]))
+        if not np.isfinite(spot).all():
+            continue
+        around = 2.0 * math.pi * k / 9.0
+        lean = Rotation.from_rotvec(ASSUMED_TILT_RAD * np.array([math.cos(around), math.sin(around), 0.0]))
+        turn = (upright * lean * to_axis).as_matrix()
+        laser = spot - ASSUMED_DISTANCE_M * (turn @ world.lit.direction_ee)
+        out.append(make_transform(turn, laser - turn @ world.lit.point_ee_m))
+    return tuple(out)
+
+
+def _inside(calibrated: Calibrated, found: Foreseen) -> bool:
+    size = np.array([calibrated.camera.width_px, calibrated.camera.height_px])
+    return bool((found.uv_px >= -0.5).all() and (found.uv_px <= size - 0.5).all())
+
+
+def _metres(calibrated: Calibrated, found: Foreseen, spread: Array) -> float:
+    values, axes = np.linalg.eigh(spread)
+    largest = 0.0
+    for value, axis in zip(values, axes.T, strict=True):
+        step = on_plane(calibrated.world, calibrated, found.uv_px + axis) - found.spot_base_m
+        largest = max(largest, math.sqrt(value) * float(np.linalg.norm(step)))
+    return largest
+
+
+class _Gain:
+    """How far so many pulses move the logarithm of a motion's likelihood ratio, on average.
+
+    Off-sets r of all pulses are normal with covariance V (noise, calibration, what is off at each pose) if nothing
+    moved, and with V + M if a motion of the assumed size did: the ratio's logarithm is (rᵀ (V⁻¹ - (V+M)⁻¹) r - ln|V+M|
+    + ln|V|) / 2.
+    """
+
+    def __init__(self, calibrated: Calibrated, settings: SpotWatchSettings, seen: Sequence[Foreseen], pulses: int):
+        index = np.arange(pulses) % len(seen)
+        rows = np.stack([found.rows for found in seen])[index].reshape(-1, COUNT)
+        common = rows @ calibrated.covariance @ rows.T
+        noise = calibrated.sigma_px**2 * np.eye(2)
+        for place in np.unique(index):
+            by_arm = seen[place].arm_rows @ settings.arm_covariance @ seen[place].arm_rows.T
+            same = np.repeat(index == place, 2)
+            common += np.kron(np.ones((pulses, pulses)), larger(by_arm, noise)) * np.outer(same, same)
+        common += np.kron(np.eye(pulses), noise)
+        moved = rows[:, CAMERA]
+        still = np.linalg.inv(common)
+        limit = math.log(1000.0 / settings.false_alarms_per_1000_pulses)
+        self._terms = []
+        for scale in range(len(SCALES)):
+            total = common + moved @ assumed(0, scale)[CAMERA, CAMERA] @ moved.T
+            difference = still - np.linalg.inv(total)
+            grown = float(np.linalg.slogdet(total)[1] - np.linalg.slogdet(common)[1])
+            needed = 2.0 * (limit - math.log(KINDS[0][2] / len(SCALES))) + grown - float((difference * common).sum())
+            self._terms.append((max(needed, 0.0), moved.T @ difference @ moved))
+        self.information = moved.T @ still @ moved
+
+    def size(self, direction: Array) -> float:
+        """Times a direction (6,) that a motion must have to be told."""
+        return min(math.sqrt(needed / max(float(direction @ w @ direction), 1e-300)) for needed, w in self._terms)
