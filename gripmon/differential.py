@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import block_diag
 
-from gripmon.geometry import exp_rotation, log_rotation, skew
-from gripmon.gripper import on_a_line
-from gripmon.records import Array
+from gripmon.model.geometry import exp_rotation, log_rotation, skew
+from gripmon.model.gripper import on_a_line
+from gripmon.model.records import Array
 
 SMALLEST_EIGENVALUE = 1e-12
 """Of the normal matrix scaled to a unit diagonal; below, rounding decides."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.camera import Camera
-from gripmon.gripper import Gripper
-from gripmon.records import Frame, Refusal
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Frame, Refusal
 
 _DARK, _BRIGHT, _FLAT = 0.02, 0.98, 0.01
 """Parts of the full scale: nothing brighter is black, nothing darker is white, no more spread is flat."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 CONTRADICTION = 5.0
 """Standard deviations between what is known and what an image shows past which the jaw has moved without a report."""

@@ -15,8 +15,8 @@ from collections.abc import Callable, Sequence
 import msgspec
 import numpy as np
 
-from gripmon.geometry import to_record
-from gripmon.records import Array, Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform, to_json
+from gripmon.model.geometry import to_record
+from gripmon.model.records import Array, Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform, to_json
 
 KEPT = 1000
 """References that are kept: the configured one and the newest.  One takes 1 to 2 kB; older ones can't be undone to."""

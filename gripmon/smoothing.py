@@ -23,8 +23,8 @@ import numpy as np
 from msgspec import Meta
 from scipy.linalg.lapack import dposv
 
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array
 
 GATE = 37.7
 """Squared normalised innovation that six normal errors exceed once in a million frames (chi-square, 6 degrees of

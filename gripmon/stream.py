@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.records import Cause, Frame, Image
+from gripmon.model.records import Cause, Frame, Image
 
 _NS = 1_000_000_000
 

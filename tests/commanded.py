@@ -9,7 +9,7 @@ from collections.abc import Callable
 import zenoh
 
 from gripmon.publish.commands import ZenohCommands
-from gripmon.records import Command, CommandReply
+from gripmon.model.records import Command, CommandReply
 
 CMD = "gripmon/arm/wrist/cmd"
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from stand_ins import Listener, ScriptedMonitor, ScriptedSource
 
 from gripmon.daemon import DaemonSettings, run
-from gripmon.records import (
+from gripmon.model.records import (
     AlertKind,
     Cause,
     State,

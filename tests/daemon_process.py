@@ -12,7 +12,7 @@ from published import Published
 from stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
-from gripmon.geometry import make_transform, to_record
+from gripmon.model.geometry import make_transform, to_record
 from gripmon.wire import PublishSettings
 
 # A third of a turn about (1, 1, 1) after a turn about x: no component of its quaternion is like another.

@@ -16,9 +16,9 @@ import yaml
 from meters import moved
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.gripper import Gripper, gripper_from_dict
-from gripmon.records import Image
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.records import Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, Cover, Defocus, FingerLook, JawScript, Light, Sensor
 

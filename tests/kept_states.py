@@ -9,8 +9,8 @@ import numpy as np
 import yaml
 
 from gripmon.config import builtin_config, load_config
-from gripmon.geometry import from_record
-from gripmon.records import MonitorState
+from gripmon.model.geometry import from_record
+from gripmon.model.records import MonitorState
 from gripmon.references import ReferenceBook
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.statefile import StateFile

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 
 def spot_image(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.geometry import invert
+from gripmon.model.geometry import invert
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 import zenoh
 
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     AlertRecord,

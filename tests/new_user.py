@@ -13,10 +13,10 @@ from plates import Look, pose, render
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibration.targets import CircleGrid
-from gripmon.camera import make_camera
-from gripmon.geometry import exp_rotation, make_transform
-from gripmon.gripper import load_gripper
-from gripmon.records import Array
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.gripper import load_gripper
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario, Simulator, write_sequence
 from gripmon.simulator.scenario import Background, Bump, JawScript, Sensor
 

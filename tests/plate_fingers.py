@@ -12,9 +12,9 @@ from plates import Look, render
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibration.targets import Charuco, Chequerboard, CircleGrid, Target
-from gripmon.camera import LensSettings, make_camera
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Image
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Image
 
 CHEQUERBOARD = Chequerboard(14, 12, 0.006)
 CHARUCO = Charuco(14, 12, 0.006, 0.0044, "DICT_4X4_250")

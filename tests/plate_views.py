@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.calibration.plane import Coincidence, FingerCorners, GivenCamera, KnownCorners, calibrate_plane
 from gripmon.calibration.sighting import Sighting
-from gripmon.camera import PaperLens
+from gripmon.model.camera import PaperLens
 
 LENS = PaperLens(width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7)
 NAMES = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far", "left_outer", "right_outer")

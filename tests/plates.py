@@ -1,4 +1,4 @@
-"""Images of calibration plates, by ray casting through :mod:`gripmon.camera`: nothing of the detection is in here."""
+"""Images of calibration plates, by ray casting through :mod:`gripmon.model.camera`: nothing of the detection is in here."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from gripmon.calibration.targets import Charuco, Chequerboard, CircleGrid, Target
-from gripmon.camera import LensSettings, make_camera
-from gripmon.geometry import exp_rotation
-from gripmon.records import Array, Image
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import exp_rotation
+from gripmon.model.records import Array, Image
 
 Cover = tuple[Array, float]
 """A polygon (k, 2) in the image (px) and its grey value: something in front of the plate."""

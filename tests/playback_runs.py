@@ -24,7 +24,7 @@ from recorded import (
 )
 
 from gripmon.recording import ProcessRecorder, open_recorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

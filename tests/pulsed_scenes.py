@@ -22,9 +22,9 @@ from gripmon.calibration.documents import CameraCalibration, CameraResiduals
 from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
-from gripmon.geometry import perturb
-from gripmon.provenance import provenance_of
-from gripmon.records import Array, Image
+from gripmon.model.geometry import perturb
+from gripmon.model.provenance import provenance_of
+from gripmon.model.records import Array, Image
 
 PREFIX = "gripmon/cell/second"
 MOVED = np.array([0.004, -0.003, 0.002, 0.004, 0.006, -0.003])

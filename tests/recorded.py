@@ -12,11 +12,11 @@ import cv2
 import msgspec
 import numpy as np
 
-from gripmon.camera import PaperLens, make_camera
-from gripmon.geometry import exp_rotation, make_transform, to_record
-from gripmon.gripper import load_gripper
+from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, to_record
+from gripmon.model.gripper import load_gripper
 from gripmon.recording import ProcessRecorder, RecordingSettings, open_recorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     CornerFault,
     CornerRecord,

@@ -20,7 +20,7 @@ from published import Published
 from stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
-from gripmon.records import FrameRecord
+from gripmon.model.records import FrameRecord
 from gripmon.wire import PublishSettings
 
 _HERE = Path(__file__).resolve().parent

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import recorded
 
-from gripmon.geometry import exp_rotation, from_record, make_transform, rotation_angle, to_record
+from gripmon.model.geometry import exp_rotation, from_record, make_transform, rotation_angle, to_record
 from gripmon.playback import FrameTable, Picture
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

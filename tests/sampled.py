@@ -8,14 +8,14 @@ import numpy as np
 from meters import box_gripper, difference
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.corners import FingertipMeter, MeasurementSettings
 from gripmon.corners.consensus import Consensus, ConsensusSettings, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.uncertainty import Uncertainty
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.outlook import EDGE_POINT_SIGMA_PX, ForeseeingMeter
-from gripmon.records import Image
+from gripmon.model.records import Image
 
 # Floors out of the way: edge points have the assumed standard deviation and nothing beside.
 INDEPENDENT = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))

@@ -12,10 +12,10 @@ from box_models import two_fingers_model
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.camera import Camera, LensSettings, make_camera
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.causes import CauseJudge, CauseSettings
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Cause, EdgeEvidence
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Cause, EdgeEvidence
 
 OPENING_M = 0.034
 REFERENCE_SIGMA = np.array([1e-4] * 3 + [1e-3] * 3)

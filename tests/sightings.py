@@ -8,9 +8,9 @@ import numpy as np
 
 from gripmon.calibration.discs import centre_offsets_px
 from gripmon.calibration.sighting import Sighting
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.geometry import exp_rotation
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation
+from gripmon.model.records import Array
 
 SIZE = {"width_px": 768, "height_px": 576}
 CAMERAS: dict[str, LensSettings] = {

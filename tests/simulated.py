@@ -8,8 +8,8 @@ import msgspec
 import numpy as np
 import yaml
 
-from gripmon.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
-from gripmon.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
+from gripmon.model.gripper import Gripper, GripperModel, load_gripper
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, Sensor
 

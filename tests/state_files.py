@@ -6,7 +6,7 @@ from pathlib import Path
 
 from test_references import book_of, configured, propose
 
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Cause,

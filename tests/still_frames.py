@@ -7,10 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from simulated import nominal_cam_T_grip, sharp_gripper
 
-from gripmon.geometry import perturb, skew, to_record
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import perturb, skew, to_record
+from gripmon.model.gripper import Gripper
 from gripmon.recalibrate import StillFrame
-from gripmon.records import EdgeSums, ReferenceRecord
+from gripmon.model.records import EdgeSums, ReferenceRecord
 
 FOCAL_PX = 962.0
 REFERENCE_T = nominal_cam_T_grip()

@@ -11,12 +11,12 @@ import numpy as np
 import yaml
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 
-from gripmon.camera import Camera, LensSettings, make_camera
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
-from gripmon.geometry import to_record
-from gripmon.gripper import Gripper, load_gripper
-from gripmon.records import Image
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.records import Image
 from gripmon.sources.folder import read_image
 
 SCENARIO = {

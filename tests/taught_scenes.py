@@ -10,11 +10,11 @@ import yaml
 from meters import JAW_SIGMA_M, NARROW, USUAL_SHARE, box_gripper, difference
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
-from gripmon.geometry import to_record
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Image, ReferenceRecord
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Image, ReferenceRecord
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, JawScript
 from gripmon.teaching import Taught, TeachingImage, teach

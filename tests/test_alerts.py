@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
 from gripmon.policy import AlertBook
-from gripmon.records import Alert, AlertEvent, AlertKind, Cause, OpenAlert, Severity
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, OpenAlert, Severity
 
 UPDATE_S, CLEAR_S = 2.0, 1.0
 TOPICS = ("motion", "view", "stream:clock")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from gripmon.geometry import perturb, perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.integrity import hypotheses_of
 from gripmon.monitor.anchor import CONFIRMED, Anchor, Lasting
 

@@ -14,7 +14,7 @@ from published import Published
 
 from gripmon.publish.answers import _WAITING_MOST, Answers
 from gripmon.publish.commands import PendingCommand
-from gripmon.records import Command, CommandName, CommandReply
+from gripmon.model.records import Command, CommandName, CommandReply
 from gripmon.wire import PublishSettings
 
 

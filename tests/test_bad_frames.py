@@ -13,10 +13,10 @@ from box_models import cube_model
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, reference_of, replaced
 
-from gripmon.camera import make_camera
-from gripmon.gripper import gripper_from_dict
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.records import (
+from gripmon.model.records import (
     AlertEvent,
     AlertKind,
     CornerFault,

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gripmon.geometry import exp_rotation, make_transform, perturb, to_record
-from gripmon.records import Frame, FrameRecord, Origin, ReferenceRecord, State, Verdict, unmeasured_record
+from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
+from gripmon.model.records import Frame, FrameRecord, Origin, ReferenceRecord, State, Verdict, unmeasured_record
 
 TRUTH = make_transform(exp_rotation(np.array([0.5, 0.1, -0.2])), np.array([0.001, -0.002, 0.11]))
 FRAME = Frame(3, 0, np.zeros((4, 4), np.uint8), 0.03)

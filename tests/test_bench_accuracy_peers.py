@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.simulator import Simulator
 
 pytestmark = pytest.mark.usefixtures("tools_importable")

@@ -14,8 +14,8 @@ from benchmarks import causes
 from benchmarks.causes_runs import Told
 from benchmarks.causes_trials import ROWS, make_trial, scaled
 
-from gripmon.camera import PaperLens, make_camera
-from gripmon.records import Cause
+from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.records import Cause
 
 MACHINE = {"commit": "0", "date": "today", "cpu": "one", "cpus": 1, "system": "some"}
 

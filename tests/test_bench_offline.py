@@ -12,7 +12,7 @@ def test_discs_lie_where_they_are_projected_to():
     """Centroids of what is dark against the disc's outline, sent point by point through the camera."""
     from benchmarks.offline_images import DISCS, PAPER_LENS, Plate, Setting
 
-    from gripmon.camera import make_camera
+    from gripmon.model.camera import make_camera
 
     setting = Setting.random(np.random.default_rng(2), print_m=5e-5)
     assert setting.errors_m is not None

@@ -40,7 +40,7 @@ def test_the_ways_are_those_of_the_simulator():
     from benchmarks import smoothing
     from benchmarks.scene import config_for
 
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
     from gripmon.simulator.scenario import Scenario
 
     ways = smoothing._ways()

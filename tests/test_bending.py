@@ -9,7 +9,7 @@ from simulated import PAPER_LENS, STRONG_LENS
 
 from gripmon.calibration.bending import FEWEST, bends
 from gripmon.calibration.targets import Chequerboard
-from gripmon.camera import FisheyeLens, LensSettings
+from gripmon.model.camera import FisheyeLens, LensSettings
 
 BOARD = Chequerboard(9, 7, 0.01)
 FISHEYE = FisheyeLens(

@@ -18,7 +18,7 @@ from plates import Look, fingers, pose, render
 from gripmon.calibration.documents import CameraCalibration
 from gripmon.calibration.intrinsics import lens_vector
 from gripmon.calibration.targets import parse_target
-from gripmon.camera import BrownConradyLens, PaperLens
+from gripmon.model.camera import BrownConradyLens, PaperLens
 from gripmon.cli import main
 from gripmon.cli.calibration_files import target_of
 from gripmon.cli.common import CommandFailedError
@@ -205,7 +205,7 @@ def test_a_file_that_cannot_be_written_leaves_nothing(
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gripmon.atomic.os.fsync", full)
+    monkeypatch.setattr("gripmon.model.atomic.os.fsync", full)
     assert calibrate(*images(folder), "--target", TEXT, "--out", str(out), "--force") == 2
     assert capsys.readouterr().err == f"--out {out}: can't be written (No space left on device); a file\n"
     assert out.read_text() == "mine\n" and [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]

@@ -23,16 +23,16 @@ from gripmon.calibration.documents import (
     HandEyeCalibration,
     HandEyeResiduals,
 )
-from gripmon.camera import BrownConradyLens, LensSettings
+from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.cli import main
 from gripmon.config import load_config
 from gripmon.config.calibrated import read_camera
 from gripmon.config.yaml_file import as_yaml
 from gripmon.corners.taught import gripper_digest
-from gripmon.geometry import perturb, to_record
-from gripmon.gripper import contents_of
-from gripmon.provenance import provenance_of, sha256_of
-from gripmon.records import Cause, MonitorState, ReferenceRecord, to_json
+from gripmon.model.geometry import perturb, to_record
+from gripmon.model.gripper import contents_of
+from gripmon.model.provenance import provenance_of, sha256_of
+from gripmon.model.records import Cause, MonitorState, ReferenceRecord, to_json
 from gripmon.simulator.scenario import Sensor
 from gripmon.statefile import Calibration, Owner, pack
 

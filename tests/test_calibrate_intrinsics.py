@@ -19,8 +19,8 @@ from gripmon.calibration.intrinsics import (
 )
 from gripmon.calibration.lens_models import MODELS
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import PaperLens
-from gripmon.geometry import exp_rotation, log_rotation
+from gripmon.model.camera import PaperLens
+from gripmon.model.geometry import exp_rotation, log_rotation
 
 BROWN = CAMERAS["brown_conrady"]
 

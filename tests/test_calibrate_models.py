@@ -10,8 +10,8 @@ from sightings import CAMERAS, poses, seen
 
 from gripmon.calibration.intrinsics import calibrate, lens_vector, plate_pose
 from gripmon.calibration.lens_models import MODELS, LensModel, ModelName, parameter_names
-from gripmon.camera import LensSettings, make_camera
-from gripmon.geometry import log_rotation
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import log_rotation
 
 
 def model_of(name: str) -> LensModel:

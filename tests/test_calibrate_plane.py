@@ -21,9 +21,9 @@ from gripmon.config.recorded import from_recorded, to_recorded
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
-from gripmon.geometry import from_record, perturbation_between
-from gripmon.gripper import contents_of
-from gripmon.provenance import provenance_of, sha256_of
+from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.model.gripper import contents_of
+from gripmon.model.provenance import provenance_of, sha256_of
 
 TRUE = nominal_cam_T_grip()
 TARGET = "circles:12x10:0.008:0.004"

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.records import Array
 
 PINHOLE = {"width_px": 768, "height_px": 576, "fx_px": 962.0, "fy_px": 955.0, "cx_px": 380.3, "cy_px": 290.8}
 WIDE = PINHOLE | {"fx_px": 420.0, "fy_px": 424.0}

@@ -13,10 +13,10 @@ from box_models import cube_model
 from shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_seen, knocked, told, two_fingers
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
-from gripmon.camera import LensSettings, PaperLens, make_camera
+from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.causes import CauseSettings
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Cause
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Cause
 
 
 def zoomed(factor: float) -> PaperLens:

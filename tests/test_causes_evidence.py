@@ -12,12 +12,12 @@ from scipy.stats import norm
 from shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.causes.pooling import pool
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
 from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
-from gripmon.geometry import perturb
-from gripmon.records import Cause
+from gripmon.model.geometry import perturb
+from gripmon.model.records import Cause
 
 
 @pytest.mark.parametrize(

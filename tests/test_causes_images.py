@@ -13,11 +13,11 @@ from shown_edges import OPENING_M, REFERENCE_SIGMA
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import new_monitor
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.causes import CauseJudge, CauseSettings
 from gripmon.corners import FingertipMeter
 from gripmon.monitor import MonitorSettings
-from gripmon.records import Cause, EdgeEvidence, Explanation, Image
+from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, BentFinger, Cover, Defocus, ObjectLook, Prop, Tilt
 

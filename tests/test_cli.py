@@ -21,7 +21,7 @@ from gripmon_process import GRIPMON, ROOT, gripmon, start
 
 from gripmon.cli import main
 from gripmon.config import builtin_config, load_config
-from gripmon.records import FrameRecord
+from gripmon.model.records import FrameRecord
 
 COMMANDS = (
     "demo",

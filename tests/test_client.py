@@ -10,7 +10,7 @@ from loopback import frame_record, free_endpoint, plain_session, reference_recor
 from published import Published
 
 from gripmon.client import Client, MonitorName, TransformClient
-from gripmon.records import FrameRecord, MessageRefused
+from gripmon.model.records import FrameRecord, MessageRefused
 from gripmon.wire import PublishError, PublishSettings
 
 

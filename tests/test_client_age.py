@@ -14,7 +14,7 @@ from gripmon.client import MonitorName, Policy, Reading, Unusable
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
 from gripmon.client.inbox import HELD_BACK_S, Entry, Inbox
 from gripmon.client.judging import judge
-from gripmon.records import ClockReading, to_json
+from gripmon.model.records import ClockReading, to_json
 from gripmon.wire import MOST_DRIFT
 
 WRIST = MonitorName("arm", "wrist")

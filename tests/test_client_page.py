@@ -13,7 +13,7 @@ from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from remote_monitor import remote_monitor
 
 from gripmon.client import Policy, Unusable
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 
 TEXT = (Path(__file__).resolve().parent.parent / "docs" / "client.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)

@@ -15,7 +15,7 @@ from loopback import ask, frame_record, free_endpoint, plain_session, wait_until
 from remote_monitor import remote_monitor, router
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
-from gripmon.records import Verdict, to_json
+from gripmon.model.records import Verdict, to_json
 
 PATIENT = Policy(max_age_s=3600.0)
 """Nothing grows too old on a slow machine."""

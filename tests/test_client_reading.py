@@ -18,7 +18,7 @@ from timely import TimelyInbox as Inbox
 from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
 from gripmon.client.inbox import MOST_PRESENT
 from gripmon.client.judging import judge
-from gripmon.records import FrameRecord, Transform, Verdict, to_json
+from gripmon.model.records import FrameRecord, Transform, Verdict, to_json
 
 WRIST, ELBOW = MonitorName("arm", "wrist"), MonitorName("arm", "elbow")
 VARIANCES_M2 = (1e-10, 4e-8, 9e-10)

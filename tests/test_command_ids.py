@@ -17,7 +17,7 @@ from published import Published
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.publish.commands import ZenohCommands
-from gripmon.records import Command, CommandFault, CommandName, CommandReply
+from gripmon.model.records import Command, CommandFault, CommandName, CommandReply
 from gripmon.wire import Keys, Link, PublishSettings
 
 

@@ -16,9 +16,9 @@ from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, 
 from gripmon.config import ConfigError, load_config
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
-from gripmon.geometry import to_record
-from gripmon.gripper import load_gripper
-from gripmon.provenance import provenance_of
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import load_gripper
+from gripmon.model.provenance import provenance_of
 from gripmon.statefile import calibration_of
 
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"

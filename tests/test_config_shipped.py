@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gripmon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
-from gripmon.gripper import load_gripper
+from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import Outlook, expect
 

@@ -7,7 +7,7 @@ import pytest
 from meters import JAW_SIGMA_M, box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.corners.consensus import (
     Consensus,
     ConsensusSettings,

@@ -11,12 +11,12 @@ from meters import FISHEYE_LENS, NARROW, box_gripper, corners_px, difference, me
 from scipy.spatial.transform import Rotation
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.corners import Measurement, MeasurementSettings, agreeing_fingers, trace_of
 from gripmon.corners.consensus import ConsensusSettings
 from gripmon.corners.lines import CornerSettings
-from gripmon.gripper import Gripper, gripper_from_dict
-from gripmon.records import CornerFault
+from gripmon.model.gripper import Gripper, gripper_from_dict
+from gripmon.model.records import CornerFault
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import BentFinger, JawScript
 

@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gripmon.cli import main
-from gripmon.records import Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict, to_json
+from gripmon.model.records import Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict, to_json
 
 PERIOD_NS = 16_666_667
 START_NS = 1_700_000_000_000_000_000

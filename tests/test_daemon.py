@@ -19,7 +19,7 @@ from loopback import frame_record, reference_record
 from stand_ins import REFUSED, ScriptedMonitor
 
 from gripmon.daemon import EstimatesFile, Reports, log_to_stderr
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

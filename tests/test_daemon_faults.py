@@ -9,7 +9,7 @@ import pytest
 from daemon_bench import Bench
 from stand_ins import Listener, ScriptedMonitor
 
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

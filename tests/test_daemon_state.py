@@ -12,7 +12,7 @@ from loopback import frame_record, reference_record, wait_until
 from stand_ins import ScriptedMonitor
 
 from gripmon.daemon import StateKeeper, supervised
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Cause,

@@ -16,8 +16,8 @@ from gripmon_process import gripmon
 
 from gripmon.cli import demo
 from gripmon.cli.comparison import compare
-from gripmon.geometry import from_record, make_transform, to_record
-from gripmon.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
+from gripmon.model.geometry import from_record, make_transform, to_record
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
 from gripmon.simulator import FrameTruth
 
 

@@ -15,8 +15,8 @@ from gripmon.calibration.chequers import _Turns
 from gripmon.calibration.detection import detect
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import Chequerboard, parse_target
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings
-from gripmon.records import Array, Image
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
+from gripmon.model.records import Array, Image
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,

@@ -12,8 +12,8 @@ from gripmon.calibration.detection import detect
 from gripmon.calibration.discs import centre_offsets_px
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import Charuco, CircleGrid, Target, name_of, parse_target
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
+from gripmon.model.records import Array
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,

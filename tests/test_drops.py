@@ -9,7 +9,7 @@ from stand_ins import ScriptedSource
 from gripmon.daemon.drops import OVER_S, Drops
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.watch import Watch
-from gripmon.records import AlertEvent, AlertKind, Cause, Severity
+from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity
 
 
 def after(drops: Drops, seconds: int, handled_per_s: int, dropped_per_s: int, since_s: int = 0) -> list[str]:

@@ -24,7 +24,7 @@ from loopback import frame_record, reference_record, state_record
 from gripmon.export import SCHEMAS, Exporter
 from gripmon.export.export import ROWS_A_GROUP
 from gripmon.playback import FrameTable
-from gripmon.records import (
+from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
     Cause,
@@ -35,7 +35,7 @@ from gripmon.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.records.recorded import Meta, RecordedCommand
+from gripmon.model.records.recorded import Meta, RecordedCommand
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
 DUCKDB, POLARS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -314,7 +314,7 @@ def test_a_fault_leaves_the_file_that_was_there(tmp_path: Path, monkeypatch: pyt
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("gripmon.atomic.os.fsync", full)
+        patch.setattr("gripmon.model.atomic.os.fsync", full)
         with pytest.raises(OSError, match="No space left"):
             export(tmp_path, Run(moving(50)))
     assert name.read_bytes() == before and len(files(tmp_path)) == 1

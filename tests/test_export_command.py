@@ -17,7 +17,7 @@ from recorded import INTERVAL_NS, frame, record, recorder, trace, wait_until
 
 from gripmon.cli import main
 from gripmon.playback import open_recordings
-from gripmon.records import Alert, AlertKind, Cause, FrameRecord, Severity, State, to_json
+from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, Severity, State, to_json
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 400

@@ -13,7 +13,7 @@ import pytest
 from loopback import free_endpoint, wait_until
 
 from gripmon.cli import main
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources import NetworkCamera, NetworkSettings
 from gripmon.wire import Link, PublishSettings
 

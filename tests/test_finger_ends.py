@@ -11,10 +11,10 @@ from box_models import cube_model, two_fingers_model
 from meters import NARROW, box_gripper, measure, meter, picture
 from simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.corners import FingerEndsSeen, Measurement
 from gripmon.corners.ends import along_fingers
-from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.simulator import Scenario, Simulator, make_scenario
 from gripmon.simulator.scenario import Background, FingerMark, ObjectLook, Prop
 

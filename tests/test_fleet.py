@@ -14,7 +14,7 @@ from router_process import ROOT, RouterProcess, running
 
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
-from gripmon.records import CommandName
+from gripmon.model.records import CommandName
 from gripmon.wire import PublishSettings
 from gripmon.wire.files import load_file, said
 

@@ -110,7 +110,7 @@ def test_every_import_points_downward():
 @pytest.mark.parametrize(
     ("room", "source", "expected"),
     [
-        ("geometry", "from gripmon.records import Array", 0),
+        ("geometry", "from gripmon.model.records import Array", 0),
         ("geometry", "from gripmon import monitor", 1),
         ("corners", "import gripmon.policy", 1),
         ("corners", "def f():\n    from gripmon.daemon import run", 1),

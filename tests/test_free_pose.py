@@ -17,8 +17,8 @@ from gripmon.calibration.detection import detect
 from gripmon.calibration.free_pose import FreePose, off_plate
 from gripmon.calibration.plane import GivenCamera
 from gripmon.calibration.sighting import Sighting
-from gripmon.camera import make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.onboarding import KnownGripper
 
 POINTS_M = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.008, 0.008) for z in (0.0, -0.03)])

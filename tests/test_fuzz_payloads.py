@@ -17,7 +17,7 @@ from rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, ima
 
 from gripmon.publish.commands import _name, _request
 from gripmon.publish.jaw import JawError, opening_of_joints, opening_of_json
-from gripmon.records import CommandError, CommandFault, CommandRequest
+from gripmon.model.records import CommandError, CommandFault, CommandRequest
 from gripmon.ros2 import JointOpening
 from gripmon.ros2.types import typestore
 from gripmon.sources.network import PayloadDecoder

@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import RigidTransform, Rotation
 
 from gripmon import geometry
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 ANGLES_RAD = [0.0, 1e-300, 1e-17, 1e-12, 9e-9, 1.1e-8, 1e-6, 1e-3, 0.5, 2.0, 3.0]
 NEAR_PI_RAD = [np.pi - gap for gap in (0.0, 1e-15, 1e-12, 1e-9, 1e-7, 1e-4, 1e-2)]

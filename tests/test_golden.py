@@ -11,7 +11,7 @@ import pytest
 from golden_images import FOLDER, SCENES, load, simulator
 from meters import EVERYWHERE, USUAL_SHARE, difference
 
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings
 
 NAMES = sorted(SCENES)

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from box_models import Model, cube_model, two_fingers_model
 
-from gripmon.gripper import GripperError, gripper_from_dict, load_gripper
+from gripmon.model.gripper import GripperError, gripper_from_dict, load_gripper
 
 
 def _without_corners(model: Model, *kept: str) -> None:

@@ -7,11 +7,11 @@ import pytest
 from box_models import cube_model
 from simulated import PAPER_LENS, sharp_gripper
 
-from gripmon.camera import make_camera
-from gripmon.gripper import gripper_from_dict
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import gripper_from_dict
 from gripmon.inspection import inspect
-from gripmon.pixels import in_full_scale
-from gripmon.records import Frame, Refusal
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Frame, Refusal
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), sharp_gripper()
 HEIGHT, WIDTH = PAPER_LENS.height_px, PAPER_LENS.width_px

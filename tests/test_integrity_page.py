@@ -15,7 +15,7 @@ from gripmon.cli import main
 from gripmon.client import Policy, TransformClient
 from gripmon.config import builtin_config
 from gripmon.policy import PolicySettings
-from gripmon.records import Protection
+from gripmon.model.records import Protection
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "integrity.md"
 TEXT = PAGE.read_text(encoding="utf-8")

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.interchange.cameras import FORMATS, ReadOptions, format_of, read_camera, write_camera
 from gripmon.interchange.fault import InterchangeError
 from gripmon.interchange.fitting import fit_brown_conrady

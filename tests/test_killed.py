@@ -18,7 +18,7 @@ import zenoh
 from kept_states import configuration, keep, make_pictures
 from loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.records import CommandReply, FrameRecord, MonitorState, ReferenceRecord
+from gripmon.model.records import CommandReply, FrameRecord, MonitorState, ReferenceRecord
 from gripmon.references import state_fault
 from gripmon.statefile import unpack
 

@@ -22,7 +22,7 @@ from gripmon.laser.pointer.setup import (
 )
 from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import invert, make_transform, perturb
+from gripmon.model.geometry import invert, make_transform, perturb
 
 
 def ideal(data):

@@ -19,8 +19,8 @@ from gripmon.calibration.documents import CameraCalibration, CameraResiduals
 from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
-from gripmon.geometry import invert, perturb, perturbation_between
-from gripmon.provenance import provenance_of
+from gripmon.model.geometry import invert, perturb, perturbation_between
+from gripmon.model.provenance import provenance_of
 
 
 @pytest.fixture

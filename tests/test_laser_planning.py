@@ -14,7 +14,7 @@ from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.setup import spots_on_plane
 from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import perturbation_between
+from gripmon.model.geometry import perturbation_between
 
 
 def calibrated(seed, orientations=4):

@@ -18,7 +18,7 @@ from gripmon.laser.pointer.setup import (
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import perturb, perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 
 
 def noisy(seed, sigma_px=0.5, **options):

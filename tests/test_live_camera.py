@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
 from gripmon.sources.live import Backoff, shown_name
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, simulator
 
-from gripmon.camera import make_camera
-from gripmon.gripper import Gripper, load_gripper
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.look import GripperLook, LookAgreement, LookRefused
 from gripmon.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
-from gripmon.records import LookRecord
+from gripmon.model.records import LookRecord
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import (
     Background,

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from simulated import nominal_cam_T_grip
 from watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, watch, watched
 
-from gripmon.geometry import invert
+from gripmon.model.geometry import invert
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.policy import PolicySettings
 from gripmon.recalibrate import RecalibrationSettings
-from gripmon.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
+from gripmon.model.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
 
 MICROMETRES = 1e-6
 

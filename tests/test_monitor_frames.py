@@ -11,7 +11,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, replaced
 
 from gripmon.causes import CauseJudge
-from gripmon.records import AlertKind, Cause, Verdict, to_json
+from gripmon.model.records import AlertKind, Cause, Verdict, to_json
 
 
 def test_rotations_are_x_y_z_w_and_take_gripper_coordinates_to_the_camera():

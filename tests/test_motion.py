@@ -9,7 +9,7 @@ import pytest
 from drift_noise import COVARIANCE, SIGMA, autocorrelated, white
 
 from gripmon.drift import DriftSettings, MotionWatch
-from gripmon.records import AlertKind, Motion
+from gripmon.model.records import AlertKind, Motion
 
 FPS = 60.0
 

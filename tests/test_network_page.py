@@ -15,8 +15,8 @@ from loopback import WAIT_S, free_endpoint, wait_until
 from gripmon.config import builtin_config, load_config
 from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
-from gripmon.pixels import ENCODINGS
-from gripmon.records import Frame, FrameNote, from_json
+from gripmon.model.pixels import ENCODINGS
+from gripmon.model.records import Frame, FrameNote, from_json
 from gripmon.sources import NetworkCamera, NetworkSettings, SourceSettings
 from gripmon.sources.payload import raw_image
 from gripmon.wire import DEFAULT_ENDPOINT, Link, PublishSettings

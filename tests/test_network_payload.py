@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
-from gripmon.pixels import ENCODINGS
+from gripmon.model.pixels import ENCODINGS
 from gripmon.sources.network import PayloadDecoder
 from gripmon.sources.payload import PayloadError
 

@@ -17,7 +17,7 @@ from loopback import WAIT_S, free_endpoint, plain_session, wait_until
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.publish.frames import FramePublisher, raw_encoding
-from gripmon.records import Frame, Refusal
+from gripmon.model.records import Frame, Refusal
 from gripmon.sources import (
     READ_TIMEOUT_S,
     LiveSettings,

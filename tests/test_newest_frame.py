@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources import (
     READ_TIMEOUT_S,
     NewestFrame,

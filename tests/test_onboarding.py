@@ -28,12 +28,12 @@ from gripmon.calibration.plane import Coincidence, GivenCamera
 from gripmon.calibration.plane_average import average
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.calibration.targets import CircleGrid, Target
-from gripmon.camera import LensSettings, make_camera
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper, contents_of, load_gripper
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.gripper import Gripper, contents_of, load_gripper
 from gripmon.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of
 from gripmon.onboarding.outlines import inferred_model, points_in_gripper
-from gripmon.records import Image
+from gripmon.model.records import Image
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.background import _TILE_PX
 

@@ -15,8 +15,8 @@ from gripmon.calibration.plane import GivenCamera
 from gripmon.calibration.plate_pose import plate_pose
 from gripmon.calibration.sighting import Sighting
 from gripmon.calibration.targets import Target
-from gripmon.camera import make_camera
-from gripmon.geometry import perturbation_between
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import perturbation_between
 from gripmon.onboarding import UnknownGripper
 from gripmon.onboarding.plate_print import plate_print
 

@@ -14,11 +14,11 @@ from sampled import INDEPENDENT, OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
 from watched import reference_of, watched
 
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.corners import MeasurementSettings
-from gripmon.gripper import gripper_from_dict
+from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import Outlook, expect, weakest_direction
 

@@ -14,8 +14,8 @@ from gripmon.calibration.plane import FingerCorners, GivenCamera, corners_of, le
 from gripmon.calibration.plane_equations import back_project, coincide_linear, infer_rectangle, stand
 from gripmon.calibration.plate_pose import plate_pose
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import make_camera
-from gripmon.geometry import perturbation_between
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import perturbation_between
 
 TRIALS = 100
 

@@ -12,7 +12,7 @@ from scipy.stats import chi2, kstest
 from gripmon.calibration.plane import Coincidence, FingerCorners, GivenCamera
 from gripmon.calibration.plane_average import PlaneCalibration, against, average
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import perturb, perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 
 TRUE = transform([np.radians(32.0), 0.0, 0.0], [0.0004, 0.0013, 0.115])
 TRIALS = 40

@@ -24,7 +24,7 @@ from playback_runs import (
 from recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
 
 from gripmon.playback import Collection, FrameTable, Recording, open_recordings
-from gripmon.records import FrameRecord, State, Verdict, to_json
+from gripmon.model.records import FrameRecord, State, Verdict, to_json
 
 
 @pytest.fixture(scope="module")

@@ -10,9 +10,9 @@ import pytest
 from playback_runs import lines, records_of_a_run
 from recorded import record
 
-from gripmon.geometry import from_record
+from gripmon.model.geometry import from_record
 from gripmon.playback import FrameTable
-from gripmon.records import FrameRecord, Origin, State, Verdict, to_json
+from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
 
 
 @pytest.fixture(scope="module")

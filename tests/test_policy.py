@@ -29,7 +29,7 @@ from policy_runs import (
 )
 
 from gripmon.policy import Evidence
-from gripmon.records import AlertEvent, AlertKind, Cause, State, Verdict, Vibration
+from gripmon.model.records import AlertEvent, AlertKind, Cause, State, Verdict, Vibration
 
 K = AlertKind
 Told = list[tuple[AlertKind, AlertEvent]]

@@ -19,7 +19,7 @@ from policy_runs import (
     settled,
 )
 
-from gripmon.records import AlertKind, Cause, Vibration
+from gripmon.model.records import AlertKind, Cause, Vibration
 
 K = AlertKind
 

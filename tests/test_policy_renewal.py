@@ -19,7 +19,7 @@ from policy_runs import (
     told,
 )
 
-from gripmon.records import AlertKind, Cause
+from gripmon.model.records import AlertKind, Cause
 
 K = AlertKind
 

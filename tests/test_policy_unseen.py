@@ -25,7 +25,7 @@ from policy_runs import (
 )
 
 from gripmon.policy import Policy, PolicySettings
-from gripmon.records import AlertKind, Cause, Protection, Verdict
+from gripmon.model.records import AlertKind, Cause, Protection, Verdict
 
 K = AlertKind
 

@@ -13,7 +13,7 @@ from stand_ins import ScriptedMonitor
 
 from gripmon.cli import fleet_table
 from gripmon.client import MonitorName, MonitorStatus
-from gripmon.records import AlertKind, MonitorState, Severity, StandingAlert
+from gripmon.model.records import AlertKind, MonitorState, Severity, StandingAlert
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = "gripmon send accept recalibration-4-1f0c9a2b --robot arm --camera wrist"

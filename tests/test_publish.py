@@ -23,7 +23,7 @@ from loopback import (
 from published import Published
 
 from gripmon.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 from gripmon.wire import Keys, PublishError, PublishSettings
 
 PREFIX = "gripmon/arm/wrist"

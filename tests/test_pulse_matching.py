@@ -8,7 +8,7 @@ import pytest
 from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
-from gripmon.records import Frame, PulseFault
+from gripmon.model.records import Frame, PulseFault
 
 POSE = np.eye(4)
 SETTINGS = PulseSettings(margin_s=0.05, history_s=2.0, most_frames=3, wait_s=1.0)

@@ -10,8 +10,8 @@ import pytest
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 from still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.gripper import load_gripper
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import load_gripper
 from gripmon.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.recalibrate.edges import fingers_disagree, leave_one_out, pool
 from gripmon.recalibrate.recalibrator import UNLIKELY

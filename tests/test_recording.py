@@ -29,9 +29,9 @@ from recorded import (
     wait_until,
 )
 
-from gripmon.geometry import rotation_from_xyzw
+from gripmon.model.geometry import rotation_from_xyzw
 from gripmon.recording import NullRecorder, RecordingSettings, open_recorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     AlertRecord,

@@ -23,7 +23,7 @@ from recorded import (
 )
 
 from gripmon import __version__
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

@@ -22,7 +22,7 @@ from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
 from gripmon.recording import ProcessRecorder
 from gripmon.recording.health import SILENT_AFTER_S, Health
-from gripmon.records import AlertEvent, AlertKind, Severity
+from gripmon.model.records import AlertEvent, AlertKind, Severity
 
 LONG_S = 60.0
 

@@ -33,12 +33,12 @@ from recorded import (
     wait_until,
 )
 
-from gripmon.geometry import make_transform, to_record
+from gripmon.model.geometry import make_transform, to_record
 from gripmon.recording import ProcessRecorder
 from gripmon.recording.files import FileSeries
 from gripmon.recording.rows import Row
 from gripmon.recording.wire import make_scene
-from gripmon.records import ReferenceRecord
+from gripmon.model.records import ReferenceRecord
 
 HERE = Path(__file__).parent
 

@@ -20,7 +20,7 @@ from recorded import (
     trace,
 )
 
-from gripmon.records import (
+from gripmon.model.records import (
     MeasurementTrace,
     Origin,
     State,

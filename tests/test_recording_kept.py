@@ -35,7 +35,7 @@ from gripmon.recording.files import FileSeries
 from gripmon.recording.pins import Pinned, is_pinned, pin_path, pinned_by
 from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.wire import make_scene
-from gripmon.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
+from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
 
 BUMP = Alert(
     AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved by 4.5 mm", AlertEvent.RAISED, "1-abc", since_ns=1

@@ -18,7 +18,7 @@ from recorded import Recorded, frame, image, record, recorder, trace, wait_until
 from gripmon.config import builtin_config
 from gripmon.playback import open_recordings
 from gripmon.recording import ProcessRecorder
-from gripmon.records import Alert, AlertKind, Cause, Severity
+from gripmon.model.records import Alert, AlertKind, Cause, Severity
 
 DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
 PICTURE = image(0)

@@ -13,7 +13,7 @@ from gripmon.recording import palette
 from gripmon.recording.overlay import _label_places
 from gripmon.recording.wire import ImageRing, Unframer, framed
 from gripmon.recording.worker import to_8_bit
-from gripmon.records import State, Verdict
+from gripmon.model.records import State, Verdict
 
 
 @given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))

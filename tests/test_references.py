@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gripmon.records import Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform
+from gripmon.model.records import Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform
 from gripmon.references import KEPT, CommandRefused, ReferenceBook, chain_fault, state_fault
 
 COVARIANCE = np.diag([1e-10, 2e-10, 9e-10, 1e-8, 2e-8, 3e-8])

@@ -14,7 +14,7 @@ from gripmon.monitor.renewal import Renewal
 from gripmon.policy import Policy
 from gripmon.recalibrate import Proposal, Refusal
 from gripmon.recalibrate.recalibrator import RefusalReason
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

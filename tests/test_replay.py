@@ -21,7 +21,7 @@ from loopback import frame_record
 from gripmon.cli import main
 from gripmon.cli.replay import _Counts
 from gripmon.monitor import Monitor
-from gripmon.records import Frame, FrameRecord, Origin, Refusal
+from gripmon.model.records import Frame, FrameRecord, Origin, Refusal
 
 ROOT = Path(__file__).resolve().parent.parent
 CONTRACT = {

@@ -26,7 +26,7 @@ from gripmon.cli.replaying import replay
 from gripmon.config import load_config
 from gripmon.config.recorded import to_recorded
 from gripmon.recording import open_recorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

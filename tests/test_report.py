@@ -15,7 +15,7 @@ from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records,
 
 from gripmon.hindsight import correct
 from gripmon.playback import Picture
-from gripmon.records import (
+from gripmon.model.records import (
     AlertEvent,
     AlertKind,
     Cause,
@@ -25,7 +25,7 @@ from gripmon.records import (
     Verdict,
     to_json,
 )
-from gripmon.records.recorded import RecordedFile
+from gripmon.model.records.recorded import RecordedFile
 from gripmon.report import Report, build
 from gripmon.report.page import page
 from gripmon.report.pictures import Looked, together

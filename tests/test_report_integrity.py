@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from reported import Run, records, stepped
 
-from gripmon.records import Protection, RecordedConfiguration, Verdict
-from gripmon.records.recorded import RecordedFile
+from gripmon.model.records import Protection, RecordedConfiguration, Verdict
+from gripmon.model.records.recorded import RecordedFile
 from gripmon.report import build
 from gripmon.report.page import page
 

@@ -13,7 +13,7 @@ from scipy.stats import f
 from gripmon.calibration import robot_world
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.cli import main
-from gripmon.geometry import invert, make_transform, perturb, perturbation_between
+from gripmon.model.geometry import invert, make_transform, perturb, perturbation_between
 
 
 def transform(rng, reach_m=0.5):

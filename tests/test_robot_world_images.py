@@ -18,11 +18,11 @@ from gripmon.calibration.intrinsics import plate_pose
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import parse_target
 from gripmon.calibration.upright import upright
-from gripmon.camera import BrownConradyLens
+from gripmon.model.camera import BrownConradyLens
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml
-from gripmon.geometry import invert
-from gripmon.provenance import provenance_of
+from gripmon.model.geometry import invert
+from gripmon.model.provenance import provenance_of
 
 LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)
 TARGET = "charuco:8x6:0.03:0.022:DICT_4X4_250"

@@ -9,7 +9,7 @@ import ros2_idl as idl
 from loopback import frame_record, state_record
 from scipy.spatial.transform import Rotation
 
-from gripmon.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
+from gripmon.model.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
 from gripmon.ros2.messages import ERROR, OK, STALE, WARN, Messages, inverse
 from gripmon.ros2.types import DIAGNOSTICS, POSE, TF, typestore
 

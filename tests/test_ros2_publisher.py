@@ -19,7 +19,7 @@ from loopback import (
 )
 from ros2_graph import ON, layout, tokens
 
-from gripmon.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
+from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 from gripmon.ros2 import (
     HeardTopic,
     Listeners,

@@ -16,7 +16,7 @@ from loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
 
 from gripmon.cli import main
 from gripmon.config import builtin_config
-from gripmon.records import CommandReply, FrameRecord, from_json
+from gripmon.model.records import CommandReply, FrameRecord, from_json
 
 ROOT = Path(__file__).resolve().parent.parent
 PREFIX = "gripmon/demo/wrist"

@@ -10,11 +10,11 @@ from meters import FISHEYE_LENS, JAW_SIGMA_M, difference
 from sampled import OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.corners import Measurement
 from gripmon.differential import differential_update
-from gripmon.geometry import perturb
-from gripmon.gripper import Gripper, load_gripper
+from gripmon.model.geometry import perturb
+from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.recalibrate import recalibrate
 
 SAMPLES = 200

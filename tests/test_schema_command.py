@@ -24,7 +24,7 @@ from test_schemas import ONE_OF_EACH
 
 from gripmon.cli import main
 from gripmon.cli.schema import _NAMES
-from gripmon.records import (
+from gripmon.model.records import (
     MESSAGES,
     Command,
     CommandName,

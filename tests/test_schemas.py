@@ -9,7 +9,7 @@ import pytest
 from loopback import alert_record, frame_record, reference_record, state_record
 from sample_messages import SAMPLES
 
-from gripmon.records import (
+from gripmon.model.records import (
     MESSAGES,
     AlertKind,
     ClockReading,

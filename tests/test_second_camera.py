@@ -20,8 +20,8 @@ from rerun.chunk import RrdReader
 
 from gripmon.cli import main
 from gripmon.client import Fleet
-from gripmon.geometry import invert, perturb
-from gripmon.records import AlertEvent, AlertKind, AlertRecord, SpotRecord, State, from_json
+from gripmon.model.geometry import invert, perturb
+from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, SpotRecord, State, from_json
 
 HERE = Path(__file__).resolve().parent
 PULSES, MOVED_FROM = 14, 6

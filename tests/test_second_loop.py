@@ -19,7 +19,7 @@ from gripmon.daemon import DaemonSettings, run_second
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import LONGEST_S, Told, of_message
 from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.records import (
+from gripmon.model.records import (
     AlertEvent,
     AlertKind,
     Cause,

@@ -24,7 +24,7 @@ from sample_messages import SAMPLES, payload
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.publish import ZenohPulses, ZenohSpotPublisher
-from gripmon.records import CommandName, CommandReply
+from gripmon.model.records import CommandName, CommandReply
 from gripmon.wire import Link, PublishSettings
 from gripmon.wire.files import load_file
 

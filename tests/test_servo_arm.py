@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from gripmon.geometry import invert, make_transform, perturbation_between, skew
+from gripmon.model.geometry import invert, make_transform, perturbation_between, skew
 
 pytest.importorskip("pinocchio")
 TOOLS = Path(__file__).resolve().parent.parent / "tools"
@@ -117,7 +117,7 @@ def scene():
     from servoing.eye import Eye, object_points_m
 
     from gripmon.config import load_config
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
     from gripmon.simulator.scenario import GraspedObject
 
     config = load_config(TOOLS.parent / "configs" / "demo.yaml", check_source=False)
@@ -145,7 +145,7 @@ def test_the_eye_is_as_noisy_as_its_pixels_make_it():
     """Scatter of the pose against the bound by the projection's differences: least squares reach it."""
     from servoing.eye import SIGMA_PX
 
-    from gripmon.geometry import perturb
+    from gripmon.model.geometry import perturb
 
     eye, cam_T_object, camera, points_m = scene()
     noise = np.random.default_rng(6)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gripmon.client import Policy, Reading
-from gripmon.geometry import exp_rotation, from_record, invert, make_transform
-from gripmon.records import Smoothed, Transform, Verdict
+from gripmon.model.geometry import exp_rotation, from_record, invert, make_transform
+from gripmon.model.records import Smoothed, Transform, Verdict
 
 pytest.importorskip("pinocchio")
 FPS = 30.0

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 
 NAN = float("nan")
 

@@ -17,10 +17,10 @@ import numpy as np
 import psutil
 import pytest
 
-from gripmon.camera import PaperLens, make_camera
-from gripmon.geometry import exp_rotation, make_transform
-from gripmon.gripper import load_gripper
-from gripmon.records import Frame
+from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.gripper import load_gripper
+from gripmon.model.records import Frame
 from gripmon.simulator import make_scenario
 from gripmon.sources import (
     SimulatedScene,

@@ -18,7 +18,7 @@ from simulated import (
     simulator,
 )
 
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.config import builtin_config, load_config
 from gripmon.simulator import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulator.background import _smear_kernel

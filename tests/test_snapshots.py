@@ -23,7 +23,7 @@ import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.daemon import DaemonSettings, Reports, run
-from gripmon.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
+from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
 from gripmon.sources import FolderSettings, FolderSource, Waiting
 from gripmon.wire import PublishSettings
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources import (
     FolderSettings,
     FolderSource,

@@ -10,7 +10,7 @@ from pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_wor
 
 from gripmon.laser.pointer.spots import Spot
 from gripmon.calibration.sighting import NotFound
-from gripmon.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
+from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 from gripmon.laser.watch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
 from gripmon.laser.watch.foresight import foresight
 from gripmon.laser.watch.world import calibrated, foresee

@@ -18,9 +18,9 @@ from simulated import BOX_FINGERS
 from state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
 from test_references import adopt, broken, configured
 
-from gripmon.camera import PaperLens
-from gripmon.gripper import GripperModel
-from gripmon.records import (
+from gripmon.model.camera import PaperLens
+from gripmon.model.gripper import GripperModel
+from gripmon.model.records import (
     MonitorState,
     Transform,
 )

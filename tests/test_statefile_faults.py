@@ -69,7 +69,7 @@ def test_a_full_disk_leaves_the_last_state_and_is_over_when_it_is_over(path: Pat
         def full(_: int) -> None:
             raise OSError(errno.ENOSPC, "No space left on device")
 
-        patched.setattr("gripmon.atomic.os.fsync", full)
+        patched.setattr("gripmon.model.atomic.os.fsync", full)
         assert not file.write(state_of("a"))
         assert file.failure == f"state not kept: {path} can't be written: No space left on device"
         assert unpack(path.read_bytes()).state == STATE and beside(path) == ["arm.json"]
@@ -120,7 +120,7 @@ def test_file_and_folder_are_on_the_disk_before_writing_ends(path: Path, monkeyp
         )
         real(descriptor)
 
-    monkeypatch.setattr("gripmon.atomic.os.fsync", noted)
+    monkeypatch.setattr("gripmon.model.atomic.os.fsync", noted)
     assert file.write(STATE)
     assert synced == [(True, False, False), (False, True, True)]
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.records import Cause, Frame
+from gripmon.model.records import Cause, Frame
 from gripmon.stream import StreamFault, StreamSettings, StreamWatch
 
 FPS = 30.0

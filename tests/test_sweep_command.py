@@ -15,11 +15,11 @@ import yaml
 from simulated import STRONG_LENS
 
 from gripmon.calibration.documents import CameraCalibration, CameraResiduals
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.config.yaml_file import as_yaml
-from gripmon.provenance import provenance_of
+from gripmon.model.provenance import provenance_of
 
 DEMO = builtin_config("demo.yaml")
 

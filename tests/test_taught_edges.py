@@ -11,7 +11,7 @@ from taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measure
 from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
 from gripmon.corners.profiles import profile_offsets_px
 from gripmon.corners.taught import TaughtEdge, TaughtEdges, sight_axes
-from gripmon.geometry import invert
+from gripmon.model.geometry import invert
 from gripmon.simulator.solids import finger_solids
 from gripmon.teaching.lines import EdgePoints, find_line, settle_line
 from gripmon.teaching.pooling import pool

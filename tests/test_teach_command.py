@@ -19,15 +19,15 @@ from meters import moved
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 from taught_scenes import OPENING_M, image_of, scene
 
-from gripmon.atomic import write_atomically
+from gripmon.model.atomic import write_atomically
 from gripmon.cli import main
 from gripmon.config import ConfigError, builtin_config, load_config
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.corners import TaughtModel
 from gripmon.corners.taught import TaughtEdge, gripper_digest
-from gripmon.geometry import to_record
-from gripmon.gripper import load_gripper
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import load_gripper
 from gripmon.teaching.document import to_yaml
 from gripmon.teaching.picture import Labels
 
@@ -392,7 +392,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path: Path, monkeypatch: pyt
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gripmon.atomic.os.fsync", full)
+    monkeypatch.setattr("gripmon.model.atomic.os.fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]

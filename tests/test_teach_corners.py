@@ -15,18 +15,18 @@ from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenar
 from taught_by_hand import Rig, make_rig
 
 from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import Settings, builtin_config, load_config
 from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.corners.taught import gripper_digest
-from gripmon.geometry import from_record, perturb, perturbation_between, to_record
-from gripmon.gripper import load_gripper
+from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
+from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import expect
-from gripmon.provenance import Provenance
+from gripmon.model.provenance import Provenance
 from gripmon.simulator import Simulator
 from gripmon.simulator.scenario import JawScript, Sensor
 from gripmon.teaching import TeachingImage

@@ -21,7 +21,7 @@ from test_live_camera import MjpegServer
 
 from gripmon.cli import main
 from gripmon.config import load_config
-from gripmon.geometry import from_record, perturbation_between
+from gripmon.model.geometry import from_record, perturbation_between
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 SNAPPED_PX = 0.2
@@ -42,7 +42,7 @@ def driver() -> Iterator[Any]:
 def truth_of(rig: Rig) -> np.ndarray:
     transform = rig.truth["cam_T_grip"]
     if isinstance(transform, dict):
-        from gripmon.records import Transform
+        from gripmon.model.records import Transform
 
         return from_record(Transform(tuple(transform["translation_m"]), tuple(transform["rotation_xyzw"])))
     return np.reshape(transform, (4, 4))

@@ -23,7 +23,7 @@ from taught_scenes import (
 )
 
 from gripmon.corners.taught import sight_axes
-from gripmon.geometry import invert
+from gripmon.model.geometry import invert
 from gripmon.simulator.solids import finger_solids
 from gripmon.teaching import TeachingRefused
 

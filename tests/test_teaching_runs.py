@@ -18,7 +18,7 @@ from gripmon.corners import MeasurementSettings, TaughtEdges
 from gripmon.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.recalibrate import RecalibrationSettings
-from gripmon.records import AlertKind, Frame
+from gripmon.model.records import AlertKind, Frame
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import FingerLook, Scenario, Sensor
 from gripmon.teaching import TeachingImage, teach

@@ -16,15 +16,15 @@ from meters import box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import Watched, new_monitor, reference_of, watch
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.corners import FingerEndsSeen, Measurement
-from gripmon.geometry import perturb
+from gripmon.model.geometry import perturb
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import Trust
 from gripmon.policy import PolicySettings
 from gripmon.recalibrate import RecalibrationSettings
-from gripmon.records import Frame, Protection, State, Verdict, to_json
+from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.simulator import FrameTruth, Scenario, Simulator
 from gripmon.simulator.scenario import BentFinger, Bump, ObjectLook, Prop
 

@@ -24,7 +24,7 @@ from gripmon.client.judging import judge
 from gripmon.client.names import MonitorName, Start
 from gripmon.daemon import Reports
 from gripmon.publish.presence import Presence, new_monitor_id
-from gripmon.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json
+from gripmon.model.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json
 from gripmon.wire import Keys, Link, PublishSettings
 
 PATIENT = Policy(max_age_s=3600.0)

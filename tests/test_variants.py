@@ -12,9 +12,9 @@ from simulated import BOX_FINGERS
 from watched import Watched, frames_of, new_monitor, watch
 
 from gripmon.config import ConfigError, builtin_config, load_config
-from gripmon.gripper import Gripper, gripper_from_dict, load_gripper
+from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.records import AlertKind, CornerFault, FrameRecord
+from gripmon.model.records import AlertKind, CornerFault, FrameRecord
 
 ADAPTIVE_FINGERS = BOX_FINGERS.parent / "adaptive_arc_fingers.yaml"
 

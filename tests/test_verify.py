@@ -16,8 +16,8 @@ from gripmon.calibration.verify import (
     compare_hand_eye,
     mean_of_one_scene,
 )
-from gripmon.camera import FisheyeLens, PaperLens, make_camera
-from gripmon.geometry import perturb
+from gripmon.model.camera import FisheyeLens, PaperLens, make_camera
+from gripmon.model.geometry import perturb
 from gripmon.interchange.fitting import fit_brown_conrady
 
 NOMINAL = np.eye(4)

@@ -7,7 +7,7 @@ import pytest
 from drift_noise import COVARIANCE, SIGMA
 
 from gripmon.drift.vibration import VibrationWatch
-from gripmon.records import Vibration
+from gripmon.model.records import Vibration
 
 FPS = 60.0
 FACTOR = np.linalg.cholesky(COVARIANCE)

@@ -13,12 +13,12 @@ from meters import FISHEYE_LENS, box_gripper, moved
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.corners.prediction import CORNER_MARGIN_PX, lay_out
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import FEWEST_CORNERS, Rig, behind_another_finger, border, freedom, moved_camera, over_jaw, see
 

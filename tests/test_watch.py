@@ -9,7 +9,7 @@ from stand_ins import REFUSED
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
-from gripmon.records import Alert, AlertKind, Cause, OpenAlert, Severity, State, Verdict
+from gripmon.model.records import Alert, AlertKind, Cause, OpenAlert, Severity, State, Verdict
 
 RAISED, CLEARED = "source raised", "source cleared"
 GOOD, BAD, NONE = "good", "bad", "none"

@@ -26,9 +26,9 @@ from gripmon.cli import main
 from gripmon.config import load_config
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import read_yaml
-from gripmon.geometry import from_record, perturbation_between
-from gripmon.gripper import load_gripper
-from gripmon.records import Transform
+from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.model.gripper import load_gripper
+from gripmon.model.records import Transform
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
 PORT = 7447

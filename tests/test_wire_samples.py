@@ -22,7 +22,7 @@ from loopback import (
 from published import Published
 from sample_messages import FOLDER, SAMPLES, kept, payload
 
-from gripmon.records import MESSAGES, FrameRecord, from_json, schema_name
+from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
 from gripmon.wire import PublishSettings
 
 PAGE = wire_page.PAGE.read_text(encoding="utf-8")
@@ -171,7 +171,7 @@ def test_the_page_says_how_each_key_is_sent(heard: dict[str, zenoh.Sample], leaf
 
 
 def test_the_sizes_on_the_page_are_those_of_the_code():
-    from gripmon.records import (
+    from gripmon.model.records import (
         ClockReading,
         CommandReply,
         CommandRequest,

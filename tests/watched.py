@@ -11,10 +11,10 @@ from meters import box_gripper, difference
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.camera import make_camera
+from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.recalibrate import RecalibrationSettings
-from gripmon.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
+from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.simulator import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulator.scenario import Background, Cover, Creep
 

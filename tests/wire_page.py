@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from gripmon.records import MESSAGES, json_schema
+from gripmon.model.records import MESSAGES, json_schema
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "wire.md"
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 FEWEST = 9
 """Points that determine how a plane looks, with some to spare."""

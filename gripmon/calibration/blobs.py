@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gripmon.calibration.lattice import Index, find_lattice, trimmed
 from gripmon.calibration.pictures import Grey, to_bytes
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 SMALLEST_PX = 4.0
 """Diameter."""

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gripmon.calibration.discs import centre_offsets_px
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.geometry import perturb
-from gripmon.records import Array
+from gripmon.model.geometry import perturb
+from gripmon.model.records import Array
 
 LARGEST_ITERATIONS = 200
 CONVERGED = 1e-10

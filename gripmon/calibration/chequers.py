@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from gripmon.calibration.lattice import Index, find_lattice, trimmed
 from gripmon.calibration.pictures import Grey
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)
 """Standard deviations (px) of the smoothing at which corners are looked for."""

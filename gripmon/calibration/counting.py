@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibration.pictures import Grey
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 BARE = 0.3
 """Of the contrast: so much what lies beyond may differ from the plate's own ground."""

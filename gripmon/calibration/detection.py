@@ -16,7 +16,7 @@ from gripmon.calibration.lattice import Index
 from gripmon.calibration.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.camera import Camera
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
 
 RIM_POINTS = 24
 

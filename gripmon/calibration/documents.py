@@ -7,10 +7,10 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.camera import LensSettings
-from gripmon.provenance import Digest, Provenance
-from gripmon.records import Transform
-from gripmon.records.values import Covariance
+from gripmon.model.camera import LensSettings
+from gripmon.model.provenance import Digest, Provenance
+from gripmon.model.records import Transform
+from gripmon.model.records.values import Covariance
 
 _Length = Annotated[float, Meta(ge=0.0)]
 

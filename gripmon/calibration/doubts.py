@@ -11,7 +11,7 @@ import numpy as np
 from gripmon.calibration.bundle import DEGENERATE, Bundle
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 if TYPE_CHECKING:
     from gripmon.calibration.intrinsics import IntrinsicsResult

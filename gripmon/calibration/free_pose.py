@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.camera import Camera
-from gripmon.geometry import perturb, skew
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturb, skew
+from gripmon.model.records import Array
 
 _ITERATIONS = 3
 

@@ -21,9 +21,9 @@ from gripmon.calibration.doubts import USELESS_FOCAL, check_fit, doubts_of
 from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
 from gripmon.calibration.plate_pose import lens_vector, merit, model_of, plate_pose, plate_pose_start
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.camera import LensSettings, make_camera
-from gripmon.geometry import log_rotation
-from gripmon.records import Array
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import log_rotation
+from gripmon.model.records import Array
 
 __all__ = [
     "IntrinsicsResult",

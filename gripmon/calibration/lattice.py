@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 NEAR = 0.35
 """A point is the one that was predicted if it lies within this part of the step; a fisheye's steps change that much."""

@@ -1,6 +1,6 @@
 """Camera models as functions of their parameters: what a calibration estimates, with derivatives.
 
-The maps themselves are those of :mod:`gripmon.camera`, so that what is calibrated is what is later used; here they get
+The maps themselves are those of :mod:`gripmon.model.camera`, so that what is calibrated is what is later used; here they get
 derivatives by their parameters.
 """
 
@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from gripmon.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens
-from gripmon.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens
+from gripmon.model.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
+from gripmon.model.records import Array
 
 ModelName = Literal["paper", "brown_conrady", "brown_conrady_5", "fisheye"]
 MODELS: tuple[ModelName, ...] = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
@@ -54,7 +54,7 @@ class LensModel:
         return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
 
     def camera(self, parameters: Array) -> Camera:
-        """The same, ready to project; unlike :func:`gripmon.camera.make_camera` it refuses nothing, as an estimate on
+        """The same, ready to project; unlike :func:`gripmon.model.camera.make_camera` it refuses nothing, as an estimate on
         its way may pass through absurd values.  Points outside the lens's domain project to NaN.
         """
         return _camera(self, tuple(parameters.tolist()))

@@ -11,7 +11,7 @@ import numpy as np
 
 from gripmon.calibration.intrinsics import IntrinsicsResult
 from gripmon.calibration.sighting import Sighting
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 _MAP_PX = 900
 _SIDE_PX = 380

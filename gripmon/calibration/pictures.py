@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 Grey = NDArray[np.float32]
 _TOP = 200.0

@@ -20,9 +20,9 @@ from gripmon.calibration.intrinsics import lens_vector, model_of, plate_pose
 from gripmon.calibration.lens_models import LensModel, parameter_names
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, INFERRED_FROM, Standing, stand
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.camera import Camera, LensSettings, make_camera
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array
 
 DOUBTED = 1e-3
 """Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""

@@ -12,8 +12,8 @@ from scipy.stats import chi2
 from gripmon.calibration.plane import DOUBTED, Coincidence, corners_of, lengths_of
 from gripmon.calibration.plane_equations import FEWEST_CORNERS
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array
 
 BESIDE_STEPS = 2.0
 """Steps of the pattern beyond the points that were seen from which a corner is said to be off the plate."""

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
-from gripmon.geometry import perturb, perturbation_between, skew
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturb, perturbation_between, skew
+from gripmon.model.records import Array
 
 FEWEST_CORNERS = 2
 INFERRED_FROM = 4

@@ -8,8 +8,8 @@ import numpy as np
 from gripmon.calibration.bundle import Bundle, BundleProblem
 from gripmon.calibration.lens_models import LensModel, ModelName
 from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.camera import LensSettings
-from gripmon.records import Array
+from gripmon.model.camera import LensSettings
+from gripmon.model.records import Array
 
 
 def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:

@@ -17,8 +17,8 @@ from scipy.stats import chi2
 
 from gripmon.calibration.robot_world_noise import arm_sigmas, arm_slopes, with_arm
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import invert, make_transform, perturb, skew
-from gripmon.records import Array
+from gripmon.model.geometry import invert, make_transform, perturb, skew
+from gripmon.model.records import Array
 
 FEWEST_POSES = 3
 LEAST_TURN_RAD = 5e-3

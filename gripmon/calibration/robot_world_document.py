@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.provenance import Provenance
-from gripmon.records import Transform
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Transform
 
 _Length = Annotated[float, Meta(ge=0.0)]
 

@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.calibration import robot_world
 from gripmon.calibration.robot_world import FEWEST_POSES, RobotWorld
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 FARTHEST_M = 20.0
 """No camera measures a target's pose beyond: such numbers are millimetres."""

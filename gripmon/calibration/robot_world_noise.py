@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import minimize
 
-from gripmon.geometry import skew
-from gripmon.records import Array
+from gripmon.model.geometry import skew
+from gripmon.model.records import Array
 
 _LEAST_M, _LEAST_RAD = 1e-7, 1e-7
 _MOST_M, _MOST_RAD = 0.1, 0.5

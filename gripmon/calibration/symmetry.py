@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates, spline_filter
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 Grey = NDArray[np.float32]
 LARGEST_RADIUS_PX = 12.0

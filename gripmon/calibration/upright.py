@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.calibration.pictures import to_grey
 from gripmon.calibration.sighting import NotFound, Sighting
 from gripmon.calibration.targets import Chequerboard
-from gripmon.records import Image
+from gripmon.model.records import Image
 
 LEAST_CONTRAST = 0.2
 """Between dark and light squares, over the range of the squares' grey levels: what is less may be light and shadow."""

@@ -16,9 +16,9 @@ from scipy.stats import chi2
 from gripmon.calibration.intrinsics import lens_vector, model_of
 from gripmon.calibration.lens_models import LensModel, parameter_names
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera, LensSettings, make_camera
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array
 
 CHANCE = 1e-3
 """Of two measurements of one pose being called different ones."""

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from gripmon.causes.pooling import PIECES, Pooled
 from gripmon.causes.state import JAW, POSE, State
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.causes.baseline import Baseline
 from gripmon.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
 from gripmon.causes.pooling import Pooled
 from gripmon.causes.state import EdgeView, State
 from gripmon.causes.weighing import Errors, Weighed, weigh
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Cause
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Cause
 
 Key = tuple[Cause | None, int | None]
 """A cause and the finger that it is about; None for the cause: nothing moved."""

@@ -12,13 +12,13 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.causes.baseline import Baseline
 from gripmon.causes.comparing import Comparison, Key, Report, compare
 from gripmon.causes.pooling import Pooled, pool
 from gripmon.causes.words import sentence
-from gripmon.gripper import Gripper
-from gripmon.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
 
 FEWEST_PIECES = 4
 """Pieces of edges without which nothing is told about motions."""

@@ -8,8 +8,8 @@ import numpy as np
 
 from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, finger_lever_m, finger_slice
 from gripmon.causes.weighing import Model
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Cause
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Cause
 
 MOUNT_SIZES_M = np.geomspace(5e-5, 1e-2, 8)
 FINGER_SIZES_M = np.geomspace(5e-5, 3e-3, 6)

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.causes.state import EdgeView, State, edge_places
-from gripmon.gripper import Gripper
-from gripmon.records import Array, EdgeEvidence
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, EdgeEvidence
 
 PIECES = 5
 """Pieces that an edge is divided into."""

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.geometry import exp_rotation, perturb, perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.records import Array, EdgeEvidence
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import exp_rotation, perturb, perturbation_between
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, EdgeEvidence
 
 POSE, JAW, FOCAL, FINGERS = slice(0, 6), 6, 7, 8
 """Places of the unknowns; finger f has the six from ``FINGERS + 6 f`` on: translation, then rotation about the middle

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LEARNT, NEWEST = 20, 5
 """Frames from which the usual value is learnt, and newest ones that are held against it."""

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.causes.state import EdgeView, State
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 FREEDOM = 3.0
 """Degrees of freedom of Student's distribution of the errors."""

@@ -10,8 +10,8 @@ import numpy as np
 from gripmon.causes.comparing import Comparison, Key
 from gripmon.causes.state import FOCAL, JAW, POSE, finger_slice
 from gripmon.causes.weighing import Weighed
-from gripmon.gripper import Gripper
-from gripmon.records import Cause
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Cause
 
 
 def sentence(

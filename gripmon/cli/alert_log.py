@@ -15,7 +15,7 @@ from gripmon.cli.fleet_table import clock, printable
 
 if TYPE_CHECKING:
     from gripmon.client import MonitorName, MonitorStatus
-    from gripmon.records import AlertRecord
+    from gripmon.model.records import AlertRecord
 
 _WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost
 _LOOK_BACK_BYTES = 16 << 20

@@ -104,7 +104,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 
 def _notes(source: Calibrated, arguments: argparse.Namespace) -> tuple[str, ...]:
-    from gripmon.provenance import provenance_of
+    from gripmon.model.provenance import provenance_of
 
     options = {"--format": arguments.format, "--name": arguments.name, "--fit": arguments.fit}
     options |= {option: getattr(arguments, key) for key, (option, _) in _FRAMES.items()}

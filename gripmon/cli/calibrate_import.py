@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.cli.calibration_sources import read_bytes
     from gripmon.interchange.cameras import ReadOptions, format_of, read_camera
     from gripmon.interchange.fault import InterchangeError
-    from gripmon.provenance import provenance_of
+    from gripmon.model.provenance import provenance_of
 
     out, path = Path(arguments.out), Path(arguments.file)
     files.check_output(out, force=arguments.force)

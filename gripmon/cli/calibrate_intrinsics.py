@@ -228,7 +228,7 @@ def _document(
 ) -> Any:
     from gripmon.calibration.documents import CameraCalibration, CameraResiduals
     from gripmon.calibration.targets import name_of
-    from gripmon.provenance import provenance_of
+    from gripmon.model.provenance import provenance_of
 
     options = {"--target": arguments.target, "--model": arguments.model, "--fix": arguments.fix}
     options |= {"--out": arguments.out, "--picture": arguments.picture, "--force": arguments.force}

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gripmon.laser.pointer.planning import Plan
     from gripmon.laser.pointer.samples import Samples
     from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise
-    from gripmon.records import Array
+    from gripmon.model.records import Array
 
 LONGEST_ARM_M = 20.0
 _DESCRIPTION = """\
@@ -157,7 +157,7 @@ def _calibrated(
 ) -> LaserResult:
     from gripmon.laser.pointer.calibrating import calibrate
     from gripmon.calibration.sighting import CalibrationError
-    from gripmon.camera import make_camera
+    from gripmon.model.camera import make_camera
 
     try:
         camera = make_camera(calibration.camera)
@@ -215,7 +215,7 @@ def _document(
     from gripmon.laser.pointer.calibrating import groups_of
     from gripmon.laser.pointer.document import document
     from gripmon.laser.pointer.planar_start import SEED
-    from gripmon.provenance import provenance_of
+    from gripmon.model.provenance import provenance_of
 
     noise = None if arguments.arm_noise is None else ":".join(f"{value:g}" for value in arguments.arm_noise)
     options = {

@@ -12,7 +12,7 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.cli.plane_inputs import Inputs, Rough
     from gripmon.onboarding import KnownGripper, Look, UnknownGripper
-    from gripmon.records import Image
+    from gripmon.model.records import Image
 
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the

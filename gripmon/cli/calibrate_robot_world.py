@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gripmon.laser.pointer.samples import Row
     from gripmon.calibration.robot_world import RobotWorld
     from gripmon.calibration.robot_world_document import RobotWorldCalibration
-    from gripmon.records import Array
+    from gripmon.model.records import Array
 
 _DESCRIPTION = """\
 Calibrate a fixed camera against an arm that holds a target, or with --eye-in-hand a camera on the arm
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     from gripmon.calibration import robot_world
     from gripmon.calibration.robot_world_doubts import check_reading
     from gripmon.calibration.sighting import CalibrationError
-    from gripmon.geometry import invert
+    from gripmon.model.geometry import invert
 
     out = Path(arguments.out)
     files.check_output(out, force=arguments.force)
@@ -216,8 +216,8 @@ def _document(found: RobotWorld, poses: _Poses, arguments: argparse.Namespace) -
     import numpy as np
 
     from gripmon.calibration.robot_world_document import RobotWorldCalibration, RobotWorldResiduals
-    from gripmon.geometry import invert, to_record
-    from gripmon.provenance import provenance_of
+    from gripmon.model.geometry import invert, to_record
+    from gripmon.model.provenance import provenance_of
 
     first, second, inverse = (
         ("cam_T_ee", "base_T_target", "ee_T_cam") if arguments.eye_in_hand else

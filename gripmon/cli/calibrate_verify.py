@@ -145,7 +145,7 @@ def _hand_eyes(
     import numpy as np
 
     from gripmon.calibration.verify import compare_hand_eye
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
 
     if arguments.tolerance_px is not None:
         raise common.CommandFailedError("--tolerance-px: is for two cameras; leave it out", common.EXIT_USAGE)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import msgspec
 
     from gripmon.calibration.targets import Target
-    from gripmon.records import Image
+    from gripmon.model.records import Image
 
 
 def image_paths(texts: Sequence[str]) -> list[Path]:
@@ -178,7 +178,7 @@ def command_line(method: str, positional: Sequence[str], options: dict[str, Any]
 
 
 def _write(path: Path, data: bytes, option: str) -> None:
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
 
     try:
         write_atomically(path, data)

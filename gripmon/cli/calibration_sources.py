@@ -14,9 +14,9 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.calibration.documents import CalibratedGripper
-    from gripmon.camera import LensSettings
-    from gripmon.provenance import Provenance
-    from gripmon.records import Transform
+    from gripmon.model.camera import LensSettings
+    from gripmon.model.provenance import Provenance
+    from gripmon.model.records import Transform
 
 _RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its estimates (JSON lines)"
 _LARGEST_BYTES = 1 << 30
@@ -169,7 +169,7 @@ def _estimates(path: Path, data: bytes) -> Calibrated:
     """The last line with a valid transform."""
     import msgspec
 
-    from gripmon.records import FrameRecord
+    from gripmon.model.records import FrameRecord
 
     decoder = msgspec.json.Decoder(FrameRecord)
     lines = data.splitlines()

@@ -9,7 +9,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
     from gripmon.sources import Source
     from gripmon.wire import Link
 
@@ -73,7 +73,7 @@ def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
 
 def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:
     """The first frame with an image, and why those before it have none."""
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
 
     unreadable: list[str] = []
     while isinstance(frame := source.read(), Frame):

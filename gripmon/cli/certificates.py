@@ -121,7 +121,7 @@ def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
 
 def _add_rules(path: Path, robots: list[str]) -> None:
     """Put rules for the robots into a router's file."""
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.wire.rules import with_robot
 
     try:

@@ -154,7 +154,7 @@ def _camera_values(config: Config) -> dict[str, Any]:
 def _reference_values(config: Config) -> dict[str, Any]:
     import numpy as np
 
-    from gripmon.geometry import invert, rotation_angle
+    from gripmon.model.geometry import invert, rotation_angle
     from gripmon.outlook import Mount
 
     reference, cam_T_grip = config.reference, config.cam_T_grip
@@ -175,7 +175,7 @@ def _sound_as_wxyz(config: Config) -> bool:
     """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips and in
     view of them.
     """
-    from gripmon.geometry import invert, make_transform, rotation_from_xyzw
+    from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
     from gripmon.outlook import see
 
     w, x, y, z = config.reference.cam_T_grip.rotation_xyzw

@@ -12,7 +12,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.records import Array
+    from gripmon.model.records import Array
     from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatch, SpotWatchSettings
     from gripmon.laser.watch.foresight import Foresight
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
 from gripmon.simulator import FrameTruth
 
 EVENT_NAMES = {

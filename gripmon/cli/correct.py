@@ -162,7 +162,7 @@ def correct_table(frames: Any, step: Any) -> Correction:
     import numpy as np
 
     from gripmon.hindsight import correct
-    from gripmon.records import Origin
+    from gripmon.model.records import Origin
 
     count = len(frames)
     held = frames.ORIGINS.index(Origin.HELD.value)

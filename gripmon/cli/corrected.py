@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
 from gripmon.hindsight import SOURCES, ChangePoint, changes, correction, sample, smoother
-from gripmon.records import Transform
+from gripmon.model.records import Transform
 
 if TYPE_CHECKING:
     from gripmon.cli.correct import CorrectedRun

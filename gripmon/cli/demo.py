@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
     from gripmon.client import Client
     from gripmon.config import Config
-    from gripmon.records import Array, FrameRecord
+    from gripmon.model.records import Array, FrameRecord
     from gripmon.simulator import Simulator
 
 _DESCRIPTION = """\
@@ -189,7 +189,7 @@ def _summarise(out: Path, simulator: Simulator, received: int) -> None:
     import numpy as np
 
     from gripmon.cli.comparison import compare
-    from gripmon.records import FrameRecord
+    from gripmon.model.records import FrameRecord
 
     estimates = out / "estimates.jsonl"
     decode = msgspec.json.Decoder(FrameRecord).decode

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.outlook import JawOutlook, Outlook
-    from gripmon.records import Array
+    from gripmon.model.records import Array
 
 _DIRECTIONS = (
     "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",

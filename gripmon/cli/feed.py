@@ -14,7 +14,7 @@ from gripmon.cli import common, joining
 
 if TYPE_CHECKING:
     from gripmon.publish.frames import FramePublisher
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
     from gripmon.sources import Source
     from gripmon.wire import Link
 
@@ -135,7 +135,7 @@ class _Feeder:
 
 def _paced(arguments: argparse.Namespace, source: Source) -> Iterator[tuple[Frame, float]]:
     """Frames, and when each is due (monotonic s): by the input's stamps, or at ``--fps``; a camera's at once."""
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
 
     start_s, passed_s = time.monotonic(), 0.0
     while True:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from gripmon.client import MonitorStatus
-    from gripmon.records import StateRecord
+    from gripmon.model.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
 _SPARED, _WIDE = "sigma mm", 100  # the column that a terminal of fewer characters a line has no room for
@@ -170,7 +170,7 @@ def _alerts(status: MonitorStatus) -> str:
 
 def _waits(status: MonitorStatus) -> str:
     """The command to type where a new reference waits for an operator; empty if none does."""
-    from gripmon.records import accepting
+    from gripmon.model.records import accepting
 
     if status.state is None or not status.state.proposal_id or status.gone_since_ns is not None:
         return ""

@@ -155,9 +155,9 @@ def write_plan(planned: Plan, path: Path) -> None:
     import csv
     import io
 
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.laser.pointer.samples import POSITION, QUATERNION
-    from gripmon.geometry import quaternion_xyzw
+    from gripmon.model.geometry import quaternion_xyzw
 
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

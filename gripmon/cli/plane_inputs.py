@@ -19,9 +19,9 @@ from gripmon.config import Config, ConfigError, read_gripper
 from gripmon.config.calibrated import read_camera
 from gripmon.config.typed import SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
-from gripmon.records import Image
+from gripmon.model.records import Image
 
 Rough = Mapping[str, tuple[float, float]]
 
@@ -100,7 +100,7 @@ def _camera(arguments: argparse.Namespace, config: Config | None) -> GivenCamera
     if path is None:
         assert config is not None, "check_options asks for a camera"
         return GivenCamera(config.settings.camera)
-    from gripmon.camera import make_camera
+    from gripmon.model.camera import make_camera
 
     try:
         found = read_camera(path)

@@ -19,10 +19,10 @@ from gripmon.calibration.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
 from gripmon.corners.taught import gripper_digest
-from gripmon.geometry import to_record
-from gripmon.gripper import Gripper, GripperError, GripperModel
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import Gripper, GripperError, GripperModel
 from gripmon.onboarding import KnownGripper, Look, UnknownGripper
-from gripmon.provenance import Provenance, provenance_of
+from gripmon.model.provenance import Provenance, provenance_of
 
 
 def inferred_gripper(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.playback.replayed import RecordedFrames
     from gripmon.recording.compared import ComparedRecorder
-    from gripmon.records import FrameRecord, Limits
+    from gripmon.model.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
 
@@ -193,7 +193,7 @@ def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
 
 def _limits(config: Config | None) -> Limits | None:
     """Those that a configuration sets; what a monitor learns of a stream is not among them."""
-    from gripmon.records import Limits
+    from gripmon.model.records import Limits
 
     if config is None:
         return None

@@ -22,7 +22,7 @@ from gripmon.cli.replaying import NOTHING_BEFORE, replay
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
     from gripmon.recording import Recorder
-    from gripmon.records import FrameRecord
+    from gripmon.model.records import FrameRecord
     from gripmon.sources import Source
 
 _DESCRIPTION = """\
@@ -192,7 +192,7 @@ class _Counts:
         self._latencies: Counter[int] = Counter()  # logarithmic bins
 
     def add(self, record: FrameRecord) -> None:
-        from gripmon.records import Origin
+        from gripmon.model.records import Origin
 
         self.frames += 1
         self.usable += record.source is not Origin.HELD

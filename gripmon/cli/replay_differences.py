@@ -7,7 +7,7 @@ from collections import defaultdict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from gripmon.records import Alert, FrameRecord
+    from gripmon.model.records import Alert, FrameRecord
 
 _MOST_SHOWN = 3
 

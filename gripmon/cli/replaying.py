@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
-    from gripmon.records import FrameRecord, MonitorState, RecordedCommand
+    from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
     from gripmon.sources import Source
 
 
@@ -36,7 +36,7 @@ def replay(
     import msgspec
 
     from gripmon.monitor import Monitor
-    from gripmon.records import Frame, to_json, unmeasured_record
+    from gripmon.model.records import Frame, to_json, unmeasured_record
 
     monitor = Monitor(
         config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, past.state
@@ -70,7 +70,7 @@ def _told(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
     """Give the monitor a command as it was given then, at the same time; what became of it now."""
     import msgspec
 
-    from gripmon.records import Command
+    from gripmon.model.records import Command
 
     try:
         answer = monitor.command(Command(then.name, then.argument), then.stamp_ns)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
-    from gripmon.records import Alert, MonitorState
+    from gripmon.model.records import Alert, MonitorState
     from gripmon.statefile import StateFile
 
 _log = logging.getLogger(__name__)
@@ -199,7 +199,7 @@ def run_daemon(
 
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     """The file for what survives a restart; None without one."""
-    from gripmon.records import MonitorState
+    from gripmon.model.records import MonitorState
     from gripmon.statefile import StateFile, StateFileError
 
     path = config.state_path
@@ -217,7 +217,7 @@ def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
 
 def _notices(kept: StateFile | None) -> list[Alert]:
     """What was found at the start, as alerts."""
-    from gripmon.records import Alert, AlertKind, Cause, Severity
+    from gripmon.model.records import Alert, AlertKind, Cause, Severity
 
     texts = () if kept is None else kept.notices
     return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]

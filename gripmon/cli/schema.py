@@ -38,7 +38,7 @@ def add_parser(commands: Any) -> None:
 
 def schema(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon schema``."""
-    from gripmon.records import MESSAGES, json_schema, schema_name, summary
+    from gripmon.model.records import MESSAGES, json_schema, schema_name, summary
 
     if arguments.list and arguments.message:
         raise common.CommandFailedError(

@@ -11,13 +11,13 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
-    from gripmon.records import SpotRecord
+    from gripmon.model.records import SpotRecord
     from gripmon.sources import Source
 
 
 def run(config: SecondConfig, source: Source, write: Callable[[bytes], None], step: Callable[[], None]) -> int:
     """Judge the table's pulses on recorded frames; the same input gives the same bytes.  Returns the exit code."""
-    from gripmon.records import to_json
+    from gripmon.model.records import to_json
 
     faults: Counter[str] = Counter()
     count = used = 0
@@ -34,7 +34,7 @@ def run(config: SecondConfig, source: Source, write: Callable[[bytes], None], st
 
 
 def _records(config: SecondConfig, source: Source, step: Callable[[], None]) -> Iterator[SpotRecord]:
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
 
     pulsed = config.pulsed_watch()
     pulsed.load(config.pulses)

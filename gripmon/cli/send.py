@@ -12,7 +12,7 @@ from gripmon.cli import common, joining, snapshots
 from gripmon.cli.fleet_table import printable
 
 if TYPE_CHECKING:
-    from gripmon.records import CommandReply, MonitorState, ReferenceRecord
+    from gripmon.model.records import CommandReply, MonitorState, ReferenceRecord
 
 _DESCRIPTION = """\
 Tell a running monitor something, and print its answer.
@@ -76,7 +76,7 @@ def send(arguments: argparse.Namespace) -> int:
     reply, image = _ask(arguments)
     written = snapshots.write(reply, image, out) if out is not None and reply.done else []
     if arguments.json:
-        from gripmon.records import to_json
+        from gripmon.model.records import to_json
 
         print(to_json(reply).decode())
     elif not reply.done:
@@ -107,7 +107,7 @@ def _misuse(arguments: argparse.Namespace) -> str:
 def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
     from gripmon.client import Ambiguous, Client, NotCarriedOut
-    from gripmon.records import CommandFault, CommandName
+    from gripmon.model.records import CommandFault, CommandName
     from gripmon.wire import PublishError
 
     try:

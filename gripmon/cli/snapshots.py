@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.records import CommandReply
+    from gripmon.model.records import CommandReply
 
 _SUFFIXES = {"png": ".png", "jpeg": ".jpg"}  # a name from outside makes no path
 _NUMBERED = re.compile(r"snapshot-([0-9]{1,9})\.(json|png|jpg)")
@@ -40,8 +40,8 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     """``snapshot-<n>.png``, ``snapshot-<n>.json`` and a row in ``timestamps.csv``, as a source of kind ``folder`` and
     ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.
     """
-    from gripmon.atomic import write_atomically
-    from gripmon.records import to_json
+    from gripmon.model.atomic import write_atomically
+    from gripmon.model.records import to_json
     from gripmon.sources.folder import TIMESTAMPS_NAME
 
     number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)

@@ -15,7 +15,7 @@ from gripmon.cli.margins import rig_of
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from gripmon.camera import Camera
+    from gripmon.model.camera import Camera
     from gripmon.config import Config
     from gripmon.outlook import Grid
 
@@ -117,7 +117,7 @@ def _check_picture(path: Path) -> None:
 
 def _write(path: Path, picture: Image) -> None:
     """Whole or not at all."""
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.outlook.picture import encoded
 
     try:
@@ -205,7 +205,7 @@ def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
 
 def _calibrated(path: Path) -> Camera:
     """The camera in a file; a fault ends the command with exit code 2."""
-    from gripmon.camera import make_camera
+    from gripmon.model.camera import make_camera
     from gripmon.config import ConfigError
     from gripmon.config.calibrated import read_camera
 

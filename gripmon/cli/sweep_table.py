@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gripmon.camera import Camera
+    from gripmon.model.camera import Camera
     from gripmon.config import Config
     from gripmon.outlook import Grid, Trial
 
@@ -31,7 +31,7 @@ def as_json(
 
 
 def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
-    from gripmon.geometry import to_record
+    from gripmon.model.geometry import to_record
     from gripmon.outlook import field_of_view_rad, weakest_direction
 
     transform, covariance = to_record(trial.cam_T_grip), trial.covariance
@@ -172,7 +172,7 @@ def _failing(ranked: list[Trial]) -> list[str]:
 
 
 def _to_copy(best: Trial) -> list[str]:
-    from gripmon.geometry import to_record
+    from gripmon.model.geometry import to_record
 
     transform = to_record(best.cam_T_grip)
     return [

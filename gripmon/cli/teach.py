@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.corners import TaughtModel
     from gripmon.corners.taught import TaughtEdge
-    from gripmon.records import Image
+    from gripmon.model.records import Image
     from gripmon.teaching import Taught
 
 _DESCRIPTION = """\
@@ -163,7 +163,7 @@ def _named_in(config: Config, out: Path) -> Config:
     """The configuration with the line that names the file, if it hadn't."""
     import os
 
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.cli.teach_config import with_taught
 
     if config.taught_path is None:
@@ -291,7 +291,7 @@ def _command(arguments: argparse.Namespace) -> str:
 
 
 def _write(model: TaughtModel, out: Path) -> None:
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.teaching.document import to_yaml
 
     try:
@@ -303,7 +303,7 @@ def _write(model: TaughtModel, out: Path) -> None:
 def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
     import cv2
 
-    from gripmon.atomic import write_atomically
+    from gripmon.model.atomic import write_atomically
     from gripmon.corners import TaughtEdges
     from gripmon.teaching.picture import draw
 

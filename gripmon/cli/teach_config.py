@@ -11,7 +11,7 @@ from gripmon.cli.commented import lines_of, yaml_value
 
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
-    from gripmon.records import ReferenceRecord
+    from gripmon.model.records import ReferenceRecord
     from gripmon.teaching.corner_pose import CornerPose
 
 _UNITS = """\

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.camera import Camera, LensSettings
+    from gripmon.model.camera import Camera, LensSettings
     from gripmon.config import Config
-    from gripmon.gripper import Gripper
-    from gripmon.records import Image, ReferenceRecord
+    from gripmon.model.gripper import Gripper
+    from gripmon.model.records import Image, ReferenceRecord
     from gripmon.sources import FolderSettings, LiveSettings
     from gripmon.teaching.bench import Bench
     from gripmon.teaching.corner_pose import CameraError
@@ -118,7 +118,7 @@ def _calibrations(
     arguments: argparse.Namespace, gripper: Gripper
 ) -> tuple[Camera, CameraError | None, ReferenceRecord | None]:
     """Camera and reference from their files; a reference's file holds its camera, too."""
-    from gripmon.camera import make_camera
+    from gripmon.model.camera import make_camera
 
     lens, error = (None, None) if arguments.camera is None else read_lens(Path(arguments.camera))
     reference = None
@@ -150,7 +150,7 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
     import numpy as np
 
-    from gripmon.camera import LensSettings
+    from gripmon.model.camera import LensSettings
     from gripmon.config.calibrated import read_camera
     from gripmon.config.typed import to_settings
     from gripmon.teaching.corner_pose import CameraError
@@ -172,7 +172,7 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
     import hashlib
 
     from gripmon.config.calibrated import mismatch, read_hand_eye
-    from gripmon.records import ReferenceRecord, to_json
+    from gripmon.model.records import ReferenceRecord, to_json
 
     with _faults_of(path):
         made = read_hand_eye(path)
@@ -229,8 +229,8 @@ def _faults_of(path: Path) -> Iterator[None]:
 def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: int) -> Image:
     """An image that fits the camera, in full scale; anything else ends the command with exit code 2."""
     from gripmon.inspection import inspect
-    from gripmon.pixels import in_full_scale
-    from gripmon.records import Frame
+    from gripmon.model.pixels import in_full_scale
+    from gripmon.model.records import Frame
     from gripmon.sources.folder import read_image
 
     if path.is_dir():

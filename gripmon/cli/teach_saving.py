@@ -14,7 +14,7 @@ from gripmon import __version__
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
     from gripmon.corners import TaughtModel
-    from gripmon.records import ReferenceRecord
+    from gripmon.model.records import ReferenceRecord
     from gripmon.teaching import Taught
     from gripmon.teaching.bench import Found
     from gripmon.teachpage import Picture, Saved, SaveOrder
@@ -164,7 +164,7 @@ class FileSaving:
 
         from gripmon.corners import TaughtModel
         from gripmon.corners.taught import Provenance, TaughtImage, identity
-        from gripmon.geometry import from_record
+        from gripmon.model.geometry import from_record
 
         bench, names = self._inputs.bench, iter(files)
         images = []
@@ -268,7 +268,7 @@ class FileSaving:
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Each whole or not at all; the configuration last, since it names the others."""
-        from gripmon.atomic import write_atomically
+        from gripmon.model.atomic import write_atomically
         from gripmon.teachpage import SavingRefused
 
         words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}

@@ -12,14 +12,14 @@ from gripmon.cli.calibration_sources import Calibrated
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.records import Array, Image
+    from gripmon.model.records import Array, Image
 
 
 def measured(first: Calibrated, arguments: argparse.Namespace, warnings: list[str]) -> Calibrated:
     """What the images show, on the plate if there is a ``--target``; what can't be measured ends the command with
     exit code 3.  What is doubtful about it is added to ``warnings``.
     """
-    from gripmon.geometry import to_record
+    from gripmon.model.geometry import to_record
 
     config = _config(first, arguments)
     opening_m = _opening(first, config, arguments)
@@ -100,7 +100,7 @@ def _on_plate(
     from gripmon.calibration.plane import GivenCamera
     from gripmon.calibration.plane_average import average
     from gripmon.calibration.sighting import CalibrationError, NotFound
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
     from gripmon.onboarding import KnownGripper
 
     target = files.target_of(target_text)
@@ -133,7 +133,7 @@ def _tracked(
     import numpy as np
 
     from gripmon.calibration.verify import agreeing, mean_of_one_scene
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
 
     assert first.cam_T_grip is not None
     expected, covariance = from_record(first.cam_T_grip), np.reshape(first.covariance, (6, 6))
@@ -168,9 +168,9 @@ def _each_measured(
     """``cam_T_grip`` and covariance of every image that shows the gripper about where it is ``expected``; why not."""
     import numpy as np
 
-    from gripmon.geometry import from_record, to_record
+    from gripmon.model.geometry import from_record, to_record
     from gripmon.monitor import Monitor
-    from gripmon.records import Frame, Origin, ReferenceRecord
+    from gripmon.model.records import Frame, Origin, ReferenceRecord
 
     flat = tuple(covariance.ravel().tolist())
     reference = ReferenceRecord("verify", 0, 0, "configuration", to_record(expected), flat)

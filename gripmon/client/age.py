@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from gripmon.records import ClockReading
+from gripmon.model.records import ClockReading
 from gripmon.wire import MOST_DRIFT
 
 _MOST_CLOCKS = 16

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from gripmon.records import ClockReading, MessageRefused, from_json
+from gripmon.model.records import ClockReading, MessageRefused, from_json
 from gripmon.wire import CLOCK_PARAMETER, steady_ns
 
 ASK_EVERY_S = 1.0

@@ -17,7 +17,7 @@ import zenoh.ext
 from gripmon.client.names import MonitorName, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.status import MonitorStatus
-from gripmon.records import AlertRecord, MessageRefused, StateRecord, from_json
+from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link
 
 _T = TypeVar("_T", bound=msgspec.Struct)

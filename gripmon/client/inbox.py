@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
 from gripmon.client.message import transform_message
 from gripmon.client.names import MonitorName, Start
-from gripmon.records import ClockReading, FrameRecord, MessageRefused
+from gripmon.model.records import ClockReading, FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ from typing import Protocol, Self
 
 from gripmon.client.inbox import Entry
 from gripmon.client.reading import Policy, Reading
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 
 _LATE_S = 1e-3  # to be past the end of a time and not just before it
 

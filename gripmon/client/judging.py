@@ -8,7 +8,7 @@ from collections.abc import Callable
 from gripmon.client.age import waited_s
 from gripmon.client.inbox import Entry, Heard, several
 from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
-from gripmon.records import FrameRecord, Verdict
+from gripmon.model.records import FrameRecord, Verdict
 
 _Refusal = tuple[Unusable, str]
 

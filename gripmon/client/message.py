@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-from gripmon.records import FrameRecord, MessageRefused, Protection, Smoothed, Transform, Verdict, from_json
+from gripmon.model.records import FrameRecord, MessageRefused, Protection, Smoothed, Transform, Verdict, from_json
 
 _UNIT_TOLERANCE = 1e-3
 _LARGEST_NUMBER = 2**63 - 1
 
 
 def transform_message(payload: bytes) -> FrameRecord:
-    """Raises :class:`gripmon.records.MessageRefused` for anything that is no message or no pose, whoever sent it."""
+    """Raises :class:`gripmon.model.records.MessageRefused` for anything that is no message or no pose, whoever sent it."""
     record = from_json(payload, FrameRecord)
     for pose in (record.cam_T_grip, record.smoothed):
         if pose is not None and not _is_pose(pose):

@@ -13,7 +13,7 @@ import zenoh
 
 from gripmon.client.names import MonitorName, Start, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
-from gripmon.records import (
+from gripmon.model.records import (
     CommandError,
     CommandFault,
     CommandName,
@@ -92,7 +92,7 @@ class Client:
     def latest(self) -> FrameRecord | None:
         """The newest record, at once; the same one again while no newer one came; None before the first.
 
-        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises :class:`gripmon.records.MessageRefused` for
+        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises :class:`gripmon.model.records.MessageRefused` for
         a message that is no record, or one of a major version that isn't known here.
         """
         newest: zenoh.Sample | None = None
@@ -142,7 +142,7 @@ class Client:
         request_id: str | None = None,
         monitor_id: str = "",
     ) -> CommandReply:
-        """Tell the monitor something (:class:`gripmon.records.Command`) and wait for its answer.
+        """Tell the monitor something (:class:`gripmon.model.records.Command`) and wait for its answer.
 
         A refused command has changed nothing.  ``request_id`` (64 characters at most; by default a new one) is that of
         an earlier attempt: if it was carried out then, its answer comes again.  Raises :class:`NotCarriedOut`;

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from gripmon.client.names import MonitorName
-from gripmon.records import Origin, Protection, Smoothed, State, Transform, Verdict
+from gripmon.model.records import Origin, Protection, Smoothed, State, Transform, Verdict
 
 if TYPE_CHECKING:
-    from gripmon.records import Array
+    from gripmon.model.records import Array
 
 
 class Unusable(enum.StrEnum):

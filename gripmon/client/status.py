@@ -8,7 +8,7 @@ import math
 import msgspec
 
 from gripmon.client.names import MonitorName
-from gripmon.records import Severity, StandingAlert, StateRecord, Verdict
+from gripmon.model.records import Severity, StandingAlert, StateRecord, Verdict
 
 SILENT_AFTER_S = 5.0
 """A monitor says its state once a second; one that hasn't for so long, though its session stands, hangs."""

@@ -18,7 +18,7 @@ from gripmon.client.judging import judge
 from gripmon.client.names import monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
-from gripmon.records import ClockReading, MessageRefused, from_json
+from gripmon.model.records import ClockReading, MessageRefused, from_json
 from gripmon.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
 
 _LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import gripmon
-from gripmon.camera import Camera, make_camera
+from gripmon.model.camera import Camera, make_camera
 from gripmon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.config.calibrated import mismatch as calibrated_mismatch
 from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
@@ -26,9 +26,9 @@ from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.corners import TaughtEdges, TaughtModel
 from gripmon.corners.taught import mismatch
-from gripmon.geometry import from_record, to_record
-from gripmon.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
-from gripmon.records import Array, ReferenceRecord, to_json
+from gripmon.model.geometry import from_record, to_record
+from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
+from gripmon.model.records import Array, ReferenceRecord, to_json
 from gripmon.ros2 import fault_of as ros2_fault
 from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.statefile import AUTO, Owner, calibration_of, default_path

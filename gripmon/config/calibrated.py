@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 import msgspec
 
 from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.config.errors import ConfigError
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.corners.taught import gripper_digest
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 
 _T = TypeVar("_T")
 _WHAT = {

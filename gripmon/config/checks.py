@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.config.settings import ReferenceSettings
 from gripmon.config.typed import Fault
-from gripmon.geometry import invert, make_transform, rotation_from_xyzw
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 NEAREST_M = 0.005
 FARTHEST_M = 5.0

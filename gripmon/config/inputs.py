@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gripmon.config.settings import JawSettings, Settings
 from gripmon.config.typed import Fault
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.ros2 import JOINT_STATE, RosNameError, subscription_key
 from gripmon.sources import (
     FolderSettings,

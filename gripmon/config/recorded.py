@@ -16,7 +16,7 @@ import msgspec
 from gripmon.config import Config, SecondConfig, load_config
 from gripmon.config.errors import ConfigError
 from gripmon.config.yaml_file import as_yaml
-from gripmon.records import MonitorState, RecordedConfiguration, RecordedFile
+from gripmon.model.records import MonitorState, RecordedConfiguration, RecordedFile
 
 _LEFT_OUT = ("source", "publish", "ros2", "state", "view")
 _PLAIN_NAME = re.compile(r"[^/\\\x00]{1,255}")

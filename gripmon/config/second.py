@@ -11,7 +11,7 @@ from msgspec import Meta
 
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera, make_camera
+from gripmon.model.camera import Camera, make_camera
 from gripmon.config.calibrated import wrong_schema
 from gripmon.config.errors import ConfigError
 from gripmon.config.inputs import network_fault, source_fault

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
 from gripmon.metrics import MetricsSettings, package_fault

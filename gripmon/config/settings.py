@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.metrics import MetricsSettings
 from gripmon.monitor import MonitorSettings

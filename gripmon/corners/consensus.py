@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dposv
 
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 
 class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

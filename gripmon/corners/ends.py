@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from gripmon.corners.prediction import STEP_PX, Prediction
 from gripmon.corners.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.corners.settling import Measurement
-from gripmon.gripper import Gripper
-from gripmon.records import END_CORNERS, Array, Image
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import END_CORNERS, Array, Image
 
 ALONG_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""

@@ -22,8 +22,8 @@ from gripmon.corners.consensus import Consensus, Prior, Votes, agree
 from gripmon.corners.ends import FingerEnds
 from gripmon.corners.lines import CornerGeometry, intersect_edges
 from gripmon.corners.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array, EdgeEvidence, Image
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array, EdgeEvidence, Image
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.reduced import (
     LEVELS,
     ORIENTATIONS,
@@ -24,9 +24,9 @@ from gripmon.corners.reduced import (
     evidence_table,
     gradients,
 )
-from gripmon.geometry import invert, skew
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.geometry import invert, skew
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 DENSITY = 0.75
 """Exponent of the length in an edge's number of points: short edges across the fingers tell what long ones don't."""

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
-from gripmon.gripper import Gripper
-from gripmon.records import Array, CornerFault
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, CornerFault
 
 
 class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,7 +8,7 @@ import numpy as np
 
 from gripmon.corners.prediction import STEP_PX, Prediction
 from gripmon.corners.profiles import read_profiles
-from gripmon.records import Image
+from gripmon.model.records import Image
 
 BESIDE_PX = (2.0, 5.0)
 """From where to where the grey levels beside an edge are averaged, px of the zoomed image: clear of its blur."""

@@ -24,8 +24,8 @@ from gripmon.corners.look import unevenness
 from gripmon.corners.prediction import EdgeLayout, Prediction
 from gripmon.corners.search import search_poses
 from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement
-from gripmon.geometry import perturbation_between
-from gripmon.records import Array, Image
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.records import Array, Image
 
 FOUND_EDGES = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""

@@ -16,10 +16,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.geometry import invert
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 if TYPE_CHECKING:
     from gripmon.corners.taught import TaughtEdges

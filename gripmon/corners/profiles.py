@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gripmon.corners.prediction import STEP_PX, Prediction
 from gripmon.corners.saturation import SPREAD, doubt
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
 """Luma weights of ITU-R BT.601 in OpenCV's channel order."""

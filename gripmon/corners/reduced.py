@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.profiles import GREY_BGR
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 Floats = NDArray[np.float32]
 

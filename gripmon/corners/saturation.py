@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 CUT_OFF = 0.998
 """Share of an image's range from which grey levels count as cut off: 254.5 of 255."""

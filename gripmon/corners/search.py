@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.hypotheses import (
     MapScore,
     OutlinePoints,
@@ -29,8 +29,8 @@ from gripmon.corners.hypotheses import (
     rotations,
 )
 from gripmon.corners.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Image
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 
 POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""

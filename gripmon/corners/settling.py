@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.consensus import (
     AGAIN_PX,
     Consensus,
@@ -39,9 +39,9 @@ from gripmon.corners.profiles import (
 from gripmon.corners.search import SearchSettings
 from gripmon.corners.taught import TaughtEdges
 from gripmon.corners.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Image
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.corners.settling import Measurement
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.records import Array, EdgeSums
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, EdgeSums
 
 
 def edge_sums(measurement: Measurement, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float) -> EdgeSums:

@@ -25,11 +25,11 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera, LensSettings
+from gripmon.model.camera import Camera, LensSettings
 from gripmon.corners.profiles import EdgeSettings
-from gripmon.geometry import from_record, invert, rotation_angle, to_record
-from gripmon.gripper import Gripper, contents_of
-from gripmon.records import Array, Transform
+from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
+from gripmon.model.gripper import Gripper, contents_of
+from gripmon.model.records import Array, Transform
 
 LARGEST_OFFSET_M = 0.02
 SAME_POSE = 1e-6

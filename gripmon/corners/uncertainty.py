@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from gripmon.corners.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 CONTRADICTION = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""

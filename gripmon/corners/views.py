@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.settling import Measurement
-from gripmon.gripper import Gripper
-from gripmon.records import MeasurementTrace
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import MeasurementTrace
 
 
 def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> MeasurementTrace:

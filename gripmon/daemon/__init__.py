@@ -31,7 +31,7 @@ from gripmon.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.recording import EventRecorder, Recorder, SpotRecorder
-from gripmon.records import Alert
+from gripmon.model.records import Alert
 from gripmon.sources import Source
 
 __all__ = [

@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import IO
 
-from gripmon.records import FrameRecord, SpotRecord, to_json
+from gripmon.model.records import FrameRecord, SpotRecord, to_json
 
 _log = logging.getLogger(__name__)
 _BUFFER_BYTES = 1 << 16

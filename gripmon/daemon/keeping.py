@@ -7,7 +7,7 @@ from typing import Protocol
 
 import msgspec
 
-from gripmon.records import MonitorState, ReferenceRecord
+from gripmon.model.records import MonitorState, ReferenceRecord
 
 RETRY_S = 1.0
 """Pause before a state that could not be written is tried again."""

@@ -16,7 +16,7 @@ from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import Loop, StopRequest, in_short
 from gripmon.publish import Publisher
 from gripmon.recording import Recorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     Command,
     CommandReply,

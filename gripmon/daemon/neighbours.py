@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from gripmon.laser.pulses.told import Told
-from gripmon.records import (
+from gripmon.model.records import (
     Command,
     CommandError,
     CommandReply,

@@ -21,7 +21,7 @@ from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import Outcome, PulsedWatch
 from gripmon.recording import SpotRecorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Cause,

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.neighbours import Asked
-from gripmon.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
+from gripmon.model.records import CommandError, CommandFault, CommandReply, Frame, FrameRecord, Snapshot, SnapshotImage
 
 _log = logging.getLogger(__name__)
 

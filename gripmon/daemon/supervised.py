@@ -20,7 +20,7 @@ from gripmon.daemon.watch import Watch
 from gripmon.publish import StatePublisher
 from gripmon.publish.presence import in_words
 from gripmon.recording import EventRecorder
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

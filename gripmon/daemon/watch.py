@@ -10,7 +10,7 @@ from typing import NamedTuple
 from gripmon.daemon.drops import Drops
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.policy import AlertBook
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Cause,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 ALLOWED = 4.0
 """Standard deviations of the reference, on every axis, up to which a first shift is the reference's error."""

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 BLOCK_FRAMES, KEPT_BLOCKS = 256, 512
 """Frames of a block, longer than bursts last (they do for half a second), and blocks that are remembered: half an hour

@@ -12,7 +12,7 @@ import numpy as np
 from gripmon.drift.sequential import rarity
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.windows import LENGTHS
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 CORRELATION_FRAMES = 20.0
 """Frames over which errors are assumed to last: what a robot that works over clutter shows at 60 frames/s."""

@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from gripmon.records import Array, Creep
+from gripmon.model.records import Array, Creep
 
 BLOCK_S = 0.5
 """Frames are averaged over so many seconds."""

@@ -12,7 +12,7 @@ from gripmon.drift.sequential import SequentialTest
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.tolerance import square_beyond, whitening
 from gripmon.drift.vibration import VibrationWatch
-from gripmon.records import AlertKind, Array, Creep, Motion, Vibration
+from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
 LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
 """Frames at most, and since the last step, whose mean tells whether the camera is back, and of which the present shift

@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.drift.windows import LENGTHS
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
 """Pairs of windows that a small part of the reported covariance counts for at every length, before the stream has shown

@@ -22,7 +22,7 @@ from gripmon.drift.scatter import Scatter
 from gripmon.drift.settings import DriftSettings
 from gripmon.drift.tolerance import square, square_beyond, times, whitening
 from gripmon.drift.windows import LENGTHS, Windows
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
 """Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""

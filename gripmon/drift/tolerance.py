@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 SWEEPS = 8
 """Rounds over the axes; each can only come closer, and after none of them the answer is too small."""

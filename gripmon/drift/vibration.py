@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from gripmon.records import Array, Vibration
+from gripmon.model.records import Array, Vibration
 
 KEPT_FRAMES = 128
 """Frames that are looked at: two seconds at 60 frames/s."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LENGTHS = tuple(2**k for k in range(13))
 """Frames that a window holds: 1, 2, 4 ... 4096, which is a minute at 60 frames/s."""

@@ -16,11 +16,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from gripmon.atomic import opened_atomically, remove_leftovers
+from gripmon.model.atomic import opened_atomically, remove_leftovers
 from gripmon.export.schemas import SCHEMAS
 from gripmon.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
 from gripmon.playback import RecordedRun
-from gripmon.records import ReferenceRecord
+from gripmon.model.records import ReferenceRecord
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gripmon.export.schemas import AXES, POSE, SCHEMAS, TIME, TRIANGLE, UPPER
 from gripmon.playback import FrameTable
-from gripmon.records import AlertRecord, ReferenceRecord, StateRecord, Transform
-from gripmon.records.recorded import RecordedCommand
+from gripmon.model.records import AlertRecord, ReferenceRecord, StateRecord, Transform
+from gripmon.model.records.recorded import RecordedCommand
 
 _Row = dict[str, Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from gripmon.hindsight.run import Ints, Run
 from gripmon.hindsight.smoother import Smoothed
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 GAP_BLOCKS = 4.0
 """Times the usual interval of blocks from which there is a gap, which gets places of its own."""

@@ -14,7 +14,7 @@ import numpy as np
 from scipy import stats
 from scipy.ndimage import median_filter
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LENGTHS = (4, 8, 16)
 """Frames on each side."""

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.geometry import skew
-from gripmon.records import Array
+from gripmon.model.geometry import skew
+from gripmon.model.records import Array
 
 _SMALL_RAD = 1e-6
 

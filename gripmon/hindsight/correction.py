@@ -19,7 +19,7 @@ from gripmon.hindsight.blocks import Blocks, Spread, at, held, with_gaps
 from gripmon.hindsight.noise import Shares, learn_shares, likeliest_dynamics
 from gripmon.hindsight.run import Bools, Ints, Run, prepare, wild_frames
 from gripmon.hindsight.smoother import Dynamics, Smoothed, smooth
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 BLOCK_S = 0.13
 WILD_FREEDOM = 12.0

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import signal
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 WINDOW, HOP = 256, 64
 AVERAGED = 32

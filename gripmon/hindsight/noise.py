@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from gripmon.hindsight.smoother import MID_S, SLOW_S, UNKNOWN_RATE, Bools, Dynamics, log_likelihood
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LONGEST_LAG_S = 30.0
 TRIM, TRIMMED_MEAN = 0.98, 0.8735

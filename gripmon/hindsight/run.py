@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
 from gripmon.hindsight import chart
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]

@@ -7,7 +7,7 @@ import numpy as np
 from gripmon.hindsight import chart
 from gripmon.hindsight.correction import Correction
 from gripmon.hindsight.run import Ints
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 
 def sample(correction: Correction, wanted_ns: Ints) -> tuple[Array, Array, Ints]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 Bools = NDArray[np.bool_]
 

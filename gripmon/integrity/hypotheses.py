@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 EDGE = 1e-2
 """Probability a frame that an edge that agrees belongs to something else: a border parallel to it, a pad, a shadow."""

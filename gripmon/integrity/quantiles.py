@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 _LOG_RISK = np.linspace(-14.0, 0.0, 281)
 _SQUARES = stats.chi2.isf(10.0**_LOG_RISK, np.array([[1.0], [3.0]]))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.integrity.quantiles import Tails
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 NEAR = 1.02
 """Factor within which a protection level is found; the larger end counts."""

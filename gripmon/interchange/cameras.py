@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.interchange import kalibr, mrcal, opencv_storage, ros_camera_info
 from gripmon.interchange.fault import InterchangeError
 from gripmon.interchange.fitting import fit_brown_conrady

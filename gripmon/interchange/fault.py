@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 
 
 class InterchangeError(ValueError):

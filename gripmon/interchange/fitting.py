@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares
 
-from gripmon.camera import BrownConradyLens, Camera, LensSettings, make_camera
-from gripmon.lenses import BrownMap
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, Camera, LensSettings, make_camera
+from gripmon.model.lenses import BrownMap
+from gripmon.model.records import Array
 
 GOOD_ENOUGH_PX = 0.001
 """A fit with fewer coefficients does if it is as near as this."""

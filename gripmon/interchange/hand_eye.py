@@ -18,9 +18,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.geometry import from_record, invert, to_record
+from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.interchange.fault import number_text
-from gripmon.records import Array, Transform
+from gripmon.model.records import Array, Transform
 
 FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
 _FRAME = re.compile(r"[^/\s\"'<>&][^\s\"'<>&]*")

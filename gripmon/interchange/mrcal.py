@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 from collections.abc import Sequence
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.interchange.fault import (
     InterchangeError,
     brown_conrady,

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.interchange.fault import (
     InterchangeError,
     brown_conrady,

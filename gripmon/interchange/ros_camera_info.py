@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from gripmon.camera import LensSettings
+from gripmon.model.camera import LensSettings
 from gripmon.interchange.fault import (
     InterchangeError,
     brown_conrady,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 AGREES = 0.6
 """Correlation from which a patch agrees: two that have nothing to do with each other reach it once in a hundred times

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import QhullError
 
-from gripmon.camera import Camera
-from gripmon.geometry import invert
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 SIDE = 4
 """Points along a patch's side: a shade, two slopes of light and 13 numbers of texture."""

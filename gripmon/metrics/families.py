@@ -9,7 +9,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
 from gripmon.metrics.tally import LATENCY_BOUNDS_S, Tally
-from gripmon.records import Severity, State, StateRecord, Verdict
+from gripmon.model.records import Severity, State, StateRecord, Verdict
 
 _WHO = ("robot", "camera")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 
-from gripmon.records import (
+from gripmon.model.records import (
     AlertEvent,
     AlertKind,
     AlertRecord,

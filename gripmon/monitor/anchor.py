@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.geometry import perturb, perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.integrity import Doubts, Hypotheses
 from gripmon.monitor.refits import INFLATION, Refits, of_fingers
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.smoothing import LEAST_KEPT, MOST_SCATTER
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners import Measurement
-from gripmon.geometry import invert, rotation_angle, to_record
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import invert, rotation_angle, to_record
+from gripmon.model.gripper import Gripper
 from gripmon.monitor.trust import Standing
 from gripmon.policy import Evidence, Judgement
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Array,

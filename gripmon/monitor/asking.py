@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from gripmon.causes import CauseJudge
-from gripmon.records import Array, EdgeEvidence, Explanation, Frame
+from gripmon.model.records import Array, EdgeEvidence, Explanation, Frame
 
 CALM_FRAMES, LULL_FRAMES = 30, 3
 """Frames in a row in which nothing looks wrong after which the evidence is forgotten, and up to which an explanation

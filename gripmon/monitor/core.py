@@ -10,12 +10,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.causes import CauseJudge, Watches
 from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 from gripmon.drift import Baseline, MotionWatch
-from gripmon.geometry import from_record, perturbation_between, to_record
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, perturbation_between, to_record
+from gripmon.model.gripper import Gripper
 from gripmon.inspection import inspect
 from gripmon.monitor.answers import (
     after_restart,
@@ -35,11 +35,11 @@ from gripmon.monitor.renewal import Renewal
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity, Standing
-from gripmon.pixels import in_full_scale
+from gripmon.model.pixels import in_full_scale
 from gripmon.policy import Evidence, Judgement, Policy
 from gripmon.recalibrate import Proposal
 from gripmon.recalibrate import Refusal as Refused
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     Array,
     Command,

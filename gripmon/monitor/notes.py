@@ -6,8 +6,8 @@ import numpy as np
 
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.records import Array, Limits, MonitorNotes
-from gripmon.records.notes import SixNumbers
+from gripmon.model.records import Array, Limits, MonitorNotes
+from gripmon.model.records.notes import SixNumbers
 from gripmon.smoothing import PoseAverage
 
 

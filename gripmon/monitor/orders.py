@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gripmon.monitor.renewal import Renewal
 from gripmon.policy import Policy
-from gripmon.records import Alert, Array, Command, CommandName
+from gripmon.model.records import Alert, Array, Command, CommandName
 from gripmon.references import CommandRefused
 
 

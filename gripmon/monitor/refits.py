@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.corners import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
-from gripmon.geometry import perturb, perturbation_between
+from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.integrity import Doubts, Hypotheses, Separation, separate
-from gripmon.records import Array, Protection
+from gripmon.model.records import Array, Protection
 
 INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""

@@ -7,14 +7,14 @@ import math
 import numpy as np
 
 from gripmon.corners import Measurement, edge_sums
-from gripmon.geometry import from_record, perturbation_between
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
 from gripmon.monitor.trust import Standing
 from gripmon.policy import NO_REFERENCE, Judgement, Policy
 from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Array,

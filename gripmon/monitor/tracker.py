@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.differential import DegenerateGeometry, Update, differential_update
-from gripmon.geometry import perturb
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import perturb
+from gripmon.model.gripper import Gripper
 from gripmon.jaw import JawKnowledge
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.records import Array, EdgeEvidence, Frame
+from gripmon.model.records import Array, EdgeEvidence, Frame
 
 USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before anything is known about this gripper."""

@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import Measurement
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.look import GripperLook, LookRefused
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.policy import past_alert_limit
-from gripmon.records import Array, Frame, MonitorState, Protection, ReferenceRecord
+from gripmon.model.records import Array, Frame, MonitorState, Protection, ReferenceRecord
 
 PROOF_EVERY = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""

@@ -16,7 +16,7 @@ import numpy as np
 
 from gripmon.corners.profiles import read_profiles
 from gripmon.onboarding.plate_print import PlatePrint
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 _FINE = 3
 """Samples of the prediction a pixel."""

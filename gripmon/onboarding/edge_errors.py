@@ -9,7 +9,7 @@ import numpy as np
 
 from gripmon.corners.consensus import ConsensusSettings
 from gripmon.corners.prediction import STRETCH
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.teaching.lines import EdgePoints, Line
 
 _FEWEST_FREE = 3.0

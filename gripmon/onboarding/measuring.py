@@ -11,13 +11,13 @@ from gripmon.calibration.free_pose import FreePose
 from gripmon.calibration.plane import FingerCorners
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, stand
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import FingertipMeter, MeasurementSettings, Patience
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.onboarding.outlines import Outline
 from gripmon.onboarding.plate_print import PlatePrint
 from gripmon.onboarding.snapping import Snapped, snap
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 JAW_SIGMA_M = 2e-4
 USUAL_SHARE = 0.6

@@ -12,8 +12,8 @@ from gripmon.calibration.plane import Coincidence, GivenCamera, KnownCorners, ca
 from gripmon.calibration.plane_average import PlaneCalibration, against
 from gripmon.calibration.sighting import CalibrationError, Sighting
 from gripmon.calibration.targets import Target
-from gripmon.camera import make_camera
-from gripmon.gripper import Gripper, GripperModel
+from gripmon.model.camera import make_camera
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.onboarding.measuring import (
     check_rough,
     contact_height_m,
@@ -23,8 +23,8 @@ from gripmon.onboarding.measuring import (
 )
 from gripmon.onboarding.outlines import Outline, inferred_model, outlines_of, points_in_gripper
 from gripmon.onboarding.plate_print import plate_print
-from gripmon.provenance import Provenance
-from gripmon.records import Array, Image
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Image
 
 Rough = Mapping[str, tuple[float, float]]
 

@@ -23,10 +23,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
-from gripmon.gripper import AxisMotion, EdgeModel, FingerModel, GripperModel, JawModel, PointModel
-from gripmon.provenance import Provenance
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import AxisMotion, EdgeModel, FingerModel, GripperModel, JawModel, PointModel
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array
 
 FINGERS = ("left", "right")
 SIDES = ("near", "far")

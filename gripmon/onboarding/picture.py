@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 
 from gripmon.calibration.plane import Coincidence
-from gripmon.camera import LensSettings, make_camera
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.corners.profiles import full_scale
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 _WIDTH_PX = 1400
 _LARGEST_ZOOM = 4

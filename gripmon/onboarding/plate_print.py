@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from gripmon.calibration.sighting import Sighting
 from gripmon.calibration.targets import Charuco, Chequerboard, Target
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.profiles import read_profiles
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 _BESIDE = 0.1
 """Of a square, from a corner along both axes: so near a square shows its own colour, before any mark in it."""

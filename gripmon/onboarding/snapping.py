@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.prediction import ROWS
 from gripmon.corners.profiles import (
     EdgeSettings,
@@ -26,7 +26,7 @@ from gripmon.onboarding.before_print import look_at, moves, rough_line, sharpnes
 from gripmon.onboarding.edge_errors import SeenEdge, line_covariances
 from gripmon.onboarding.outlines import INNERMOST, Outline
 from gripmon.onboarding.plate_print import PlatePrint
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 from gripmon.teaching.lines import EdgePoints, settle_line
 
 REACH_PX = 10.0

@@ -12,17 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.corners.consensus import Consensus, Votes
 from gripmon.corners.prediction import Prediction
 from gripmon.corners.profiles import Candidates
 from gripmon.corners.uncertainty import Uncertainty, assess
-from gripmon.geometry import from_record, invert
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, invert
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
 from gripmon.outlook.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
-from gripmon.records import Array, Image, Protection, ReferenceRecord
+from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gripmon.outlook.expected import foresee_frame
 from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.visibility import Rig, Sight, see
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 OPENINGS = 121
 """Openings that are looked at; where the view fails between two that both suffice is not seen."""

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.geometry import exp_rotation, make_transform
+from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.outlook.visibility import Rig, Sight, see
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 SOUGHT_M = 1.0
 """How far a shift of the camera is followed."""

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.geometry import make_transform
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 
 _UPRIGHT = 1e-6
 

@@ -15,10 +15,10 @@ import numpy as np
 from PIL import Image as Pictures
 from PIL import ImageDraw, ImageFont
 
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.outlook.sweep import Grid, Trial
 from gripmon.outlook.visibility import Rig
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, JawScript
 from gripmon.simulator.solids import finger_solids

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from gripmon.policy import PolicySettings
-from gripmon.records import Protection
+from gripmon.model.records import Protection
 
 
 @dataclass(frozen=True, slots=True)

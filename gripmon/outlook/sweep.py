@@ -18,7 +18,7 @@ from gripmon.outlook.mounts import Mount
 from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.visibility import Rig, Sight, see
 from gripmon.recalibrate import refusal
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 OPENINGS = 25
 """Openings over the jaw's travel at which a mount's view is looked at."""

@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import TaughtEdges
 from gripmon.corners.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
-from gripmon.geometry import invert
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 FEWEST_EDGES = 3
 """Edges that must be seen for a fit to be believed."""

@@ -17,7 +17,7 @@ from gripmon.playback import entities
 from gripmon.playback.container import FRAME, Block, Chunk, Manifest, RrdFile, Span, StoreName, texts_of
 from gripmon.playback.lenient import DECODING_ERRORS, read
 from gripmon.playback.table import IntArray, Line, TableBuilder
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     FrameRecord,
     Meta,

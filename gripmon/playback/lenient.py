@@ -6,7 +6,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from gripmon.records import FrameRecord, Meta, Origin, State, Verdict, schema_name
+from gripmon.model.records import FrameRecord, Meta, Origin, State, Verdict, schema_name
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 

@@ -16,7 +16,7 @@ from gripmon.playback import entities
 from gripmon.playback.container import Block
 from gripmon.playback.contents import Contents
 from gripmon.playback.table import FrameTable, IntArray, TableBuilder
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     FrameRecord,
     Meta,

@@ -17,7 +17,7 @@ from gripmon.playback.contents import Contents, frame_numbers
 from gripmon.playback.lenient import read
 from gripmon.playback.merging import Merged, merge
 from gripmon.playback.table import FrameTable, IntArray
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     CornerRecord,
     FrameRecord,

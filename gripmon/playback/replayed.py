@@ -19,7 +19,7 @@ import numpy as np
 
 from gripmon.playback.opening import open_recordings
 from gripmon.playback.recordings import Recording, Shot, decode_image
-from gripmon.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
+from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 
 _NEVER_AS_IMAGE = frozenset({Refusal.NOT_AN_IMAGE, Refusal.WRONG_TYPE, Refusal.NOT_FINITE})
 """What looks like another image, or like none, once it has been encoded with 8 bits."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 from gripmon.playback.table import FrameTable
-from gripmon.records import AlertRecord, Meta, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.model.records import AlertRecord, Meta, RecordedCommand, ReferenceRecord, StateRecord
 
 
 class RecordedRun(Protocol):

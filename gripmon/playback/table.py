@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.records import FrameRecord, Origin, State, Verdict
+from gripmon.model.records import FrameRecord, Origin, State, Verdict
 
 IntArray = NDArray[np.int64]
 FloatArray = NDArray[np.float64]

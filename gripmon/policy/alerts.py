@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from gripmon.records import Alert, AlertEvent, Cause, OpenAlert, Severity
+from gripmon.model.records import Alert, AlertEvent, Cause, OpenAlert, Severity
 
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 

@@ -17,7 +17,7 @@ import numpy as np
 from gripmon.policy.alerts import AlertBook
 from gripmon.policy.limits import time_left_s
 from gripmon.policy.settings import PolicySettings
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     Array,

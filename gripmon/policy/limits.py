@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 
 def time_left_s(shift: Array, velocity: Array, limit_m: float, limit_rad: float) -> float | None:

@@ -1,6 +1,6 @@
 """What the monitor says on the network, and the jaw opening that it hears there.
 
-Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.records`):
+Keys, all below ``gripmon/<robot>/<camera>``, payloads JSON of the records (:mod:`gripmon.model.records`):
 
 ``transform``  every frame; express, real-time priority, dropped rather than waited for when a link is congested; a
                ``get`` brings the last one

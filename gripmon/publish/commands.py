@@ -12,7 +12,7 @@ import zenoh
 
 from gripmon.publish.answers import Answers, send_now
 from gripmon.publish.presence import Presence, in_words
-from gripmon.records import (
+from gripmon.model.records import (
     Command,
     CommandError,
     CommandFault,
@@ -102,9 +102,9 @@ class PendingCommand:
 
 
 class ZenohCommands:
-    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`gripmon.records.CommandRequest` or none.
+    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`gripmon.model.records.CommandRequest` or none.
 
-    It replies a :class:`gripmon.records.CommandReply` as JSON, or as an error a :class:`gripmon.records.CommandError`.
+    It replies a :class:`gripmon.model.records.CommandReply` as JSON, or as an error a :class:`gripmon.model.records.CommandError`.
     What was carried out under an id is not carried out again: the last 256 answers are remembered.
     """
 

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import zenoh
 
-from gripmon.records import FrameNote, Image, to_json
+from gripmon.model.records import FrameNote, Image, to_json
 
 FrameFormat = Literal["raw", "jpeg", "png"]
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.records import JawReading, MessageRefused, from_json, largest_bytes
+from gripmon.model.records import JawReading, MessageRefused, from_json, largest_bytes
 from gripmon.ros2 import JointOpening, MessageError, decode_joint_state
 from gripmon.wire import Link
 from gripmon.wire.malformed import Malformed

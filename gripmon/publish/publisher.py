@@ -13,7 +13,7 @@ import zenoh
 
 from gripmon.publish.answers import Answers
 from gripmon.publish.presence import Presence
-from gripmon.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
+from gripmon.model.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
 from gripmon.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
 
 _T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)

@@ -8,7 +8,7 @@ from collections import deque
 import zenoh
 
 from gripmon.laser.pulses.told import Told, of_message
-from gripmon.records import LaserPulse, MessageRefused, from_json, largest_bytes
+from gripmon.model.records import LaserPulse, MessageRefused, from_json, largest_bytes
 from gripmon.wire import Link
 from gripmon.wire.malformed import Malformed
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import ParamSpec
 
 from gripmon.publish.publisher import Publisher, SpotPublisher, StatePublisher
-from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord
+from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, SpotRecord, StateRecord
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
-from gripmon.geometry import perturbation_between
+from gripmon.model.geometry import perturbation_between
 from gripmon.recalibrate.stills import StillFrame
-from gripmon.records import Array, EdgeSums
+from gripmon.model.records import Array, EdgeSums
 
 STRETCH_PX, EDGE_PX = 0.015, 0.03
 """Standard deviations that last and that nothing explains, px: of a stretch's mean, and of a whole edge."""
@@ -33,7 +33,7 @@ _SCALE = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])  # m by rad: equal pixels, abo
 @dataclass(frozen=True, slots=True)
 class PooledEdges:
     """Stretches of edges summed over all frames, with residuals about one pose; fields as in
-    :class:`~gripmon.records.EdgeSums`.  ``sigma_px`` (s,) standard deviation of a stretch's residual by itself,
+    :class:`~gripmon.model.records.EdgeSums`.  ``sigma_px`` (s,) standard deviation of a stretch's residual by itself,
     ``shared_px`` (s,) of what it shares with the others of its edge.
     """
 

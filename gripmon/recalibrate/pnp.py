@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from scipy.linalg import block_diag
 
-from gripmon.geometry import make_transform, perturb, perturbation_between, skew
-from gripmon.gripper import on_a_line
-from gripmon.records import Array
+from gripmon.model.geometry import make_transform, perturb, perturbation_between, skew
+from gripmon.model.gripper import on_a_line
+from gripmon.model.records import Array
 
 FEWEST_COPLANAR, FEWEST_GENERAL = 4, 6
 """Corners that determine a pose: so many in one plane, or so many in general."""

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.geometry import from_record, perturbation_between, rotation_angle
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
+from gripmon.model.gripper import Gripper
 from gripmon.recalibrate.edges import PooledEdges, fingers_disagree, leave_one_out, pool
 from gripmon.recalibrate.pnp import (
     FEWEST_COPLANAR,
@@ -29,7 +29,7 @@ from gripmon.recalibrate.pnp import (
 )
 from gripmon.recalibrate.settings import RecalibrationSettings
 from gripmon.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
-from gripmon.records import Array, ReferenceInputs, ReferenceRecord
+from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 
 MOST_OUTLYING = 0.25
 """Part of the frames whose pose may lie far from the others' while the camera counts as standing still."""

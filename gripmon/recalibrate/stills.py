@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.geometry import perturb, perturbation_between
-from gripmon.records import Array, EdgeSums
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array, EdgeSums
 
 LASTING = 0.25
 """Part of a claimed variance that averaging never removes, however much of it the frames' scatter explains."""

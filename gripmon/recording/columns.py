@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from gripmon.recording.wire import TraceNote
-from gripmon.records import FrameRecord, Limits, SpotRecord
+from gripmon.model.records import FrameRecord, Limits, SpotRecord
 
 
 @dataclass(frozen=True, slots=True)

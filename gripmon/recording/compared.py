@@ -23,7 +23,7 @@ from gripmon.recording.recorder import Notes, Trace
 from gripmon.recording.rows import RowWriter
 from gripmon.recording.wire import Events, Scene, pack_trace
 from gripmon.recording.worker import measured_picture
-from gripmon.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord, StateRecord
 
 RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32

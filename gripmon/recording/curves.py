@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from gripmon.recording import palette
 from gripmon.recording.columns import Row, Sender
 from gripmon.recording.wire import Scene, TraceNote, pairs
-from gripmon.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
+from gripmon.model.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 
 _XYZ = ["x", "y", "z"]
 _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]

@@ -10,7 +10,7 @@ import rerun as rr
 from gripmon.recording import palette
 from gripmon.recording.columns import AnyRow, Sender
 from gripmon.recording.wire import Events
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertRecord,

@@ -25,7 +25,7 @@ from gripmon.recording.wire import (
     Scene,
     pack_trace,
 )
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     Frame,
     FrameRecord,

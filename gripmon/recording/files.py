@@ -24,7 +24,7 @@ from gripmon.recording.repair import is_complete, repair
 from gripmon.recording.ring import Moments
 from gripmon.recording.wire import Events, Scene
 from gripmon.recording.writers import Writer, make_writer
-from gripmon.records import AlertRecord
+from gripmon.model.records import AlertRecord
 from gripmon.rerun_private import free_closed_streams
 
 APPLICATION_ID = "gripmon"

@@ -9,8 +9,8 @@ import rerun as rr
 
 from gripmon.laser.pointer.refinement import Refined
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
-from gripmon.geometry import invert
-from gripmon.records import Array
+from gripmon.model.geometry import invert
+from gripmon.model.records import Array
 
 _AXIS_M = 0.1
 _USED, _LEFT_OUT, _BEAM, _PLANE = (40, 120, 230), (230, 60, 60), (235, 90, 90), (90, 180, 120, 90)

@@ -8,14 +8,14 @@ from pathlib import Path
 import msgspec
 
 from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.camera import Camera
-from gripmon.gripper import Gripper
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
 from gripmon.recording.feed import ProcessRecorder, Truth
 from gripmon.recording.recorder import NullRecorder, Recorder, SpotRecorder
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
 from gripmon.recording.wire import make_scene, make_spot_scene
-from gripmon.records import RecordedConfiguration, ReferenceRecord
+from gripmon.model.records import RecordedConfiguration, ReferenceRecord
 
 
 def open_recorder(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gripmon.recording import palette
 from gripmon.recording.wire import Scene, TraceNote, pairs
-from gripmon.records import FrameRecord
+from gripmon.model.records import FrameRecord
 
 if TYPE_CHECKING:
     from gripmon.recording.columns import Row, Sender

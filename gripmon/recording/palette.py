@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gripmon.records import State, Verdict
+from gripmon.model.records import State, Verdict
 
 Colour = tuple[int, int, int, int]
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.atomic import write_atomically
-from gripmon.records import Alert, AlertKind, AlertRecord, Cause, Severity
+from gripmon.model.atomic import write_atomically
+from gripmon.model.records import Alert, AlertKind, AlertRecord, Cause, Severity
 
 SUFFIX = ".pinned"
 

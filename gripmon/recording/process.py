@@ -13,7 +13,7 @@ import msgspec
 
 from gripmon.recording.health import SILENT_AFTER_S, stands_still
 from gripmon.recording.wire import ImageRing, Scene, Status, framed
-from gripmon.records import Limits
+from gripmon.model.records import Limits
 
 # The working directory must not be searched for modules (-P), but where this package came from must.
 _BOOTSTRAP = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     Frame,
     FrameRecord,

@@ -10,7 +10,7 @@ import rerun as rr
 
 from gripmon.recording import palette
 from gripmon.recording.wire import Scene
-from gripmon.records import Array, FrameRecord, ReferenceRecord, Verdict
+from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Verdict
 
 if TYPE_CHECKING:
     from gripmon.recording.columns import Row, Sender

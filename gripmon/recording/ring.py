@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from gripmon.recording.columns import AnyRow
-from gripmon.records import Alert, AlertEvent, AlertKind, AlertRecord, Severity
+from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Severity
 
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 _MOMENTS_KEPT = 64

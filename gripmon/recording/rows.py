@@ -33,7 +33,7 @@ from gripmon.recording.overlay import OverlayWriter
 from gripmon.recording.rig import RigWriter
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Events, Scene
-from gripmon.records import FrameRecord, Meta, ReferenceRecord, to_json
+from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 
 
 class RowWriter:

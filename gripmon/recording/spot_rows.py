@@ -25,7 +25,7 @@ import rerun as rr
 
 from gripmon.laser.pointer.document import LaserCalibration, setup_of
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
-from gripmon.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.recording import palette
 from gripmon.recording.columns import Sender, SpotRow
 from gripmon.recording.events import EventWriter
@@ -33,7 +33,7 @@ from gripmon.recording.laser_scene import plane_corners
 from gripmon.recording.rows import log_origin
 from gripmon.recording.spot_layout import IMAGE
 from gripmon.recording.wire import Events, Scene
-from gripmon.records import Array, SpotRecord, to_json
+from gripmon.model.records import Array, SpotRecord, to_json
 
 _AXIS_M, _SIDE = 0.1, 0.4
 _SPOT_PX = 2.5

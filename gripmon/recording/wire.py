@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.camera import Camera
-from gripmon.gripper import Gripper
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.view import ViewSettings
-from gripmon.records import (
+from gripmon.model.records import (
     AlertRecord,
     Array,
     FrameRecord,
@@ -94,7 +94,7 @@ class TraceNote(msgspec.Struct, frozen=True, array_like=True):
 
 class FrameNote(msgspec.Struct, frozen=True, array_like=True):
     """``limits`` where they are others than those of the frame before; ``statistic_share`` as in
-    :class:`gripmon.records.MonitorNotes`.
+    :class:`gripmon.model.records.MonitorNotes`.
     """
 
     record: FrameRecord | SpotRecord

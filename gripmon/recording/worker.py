@@ -22,7 +22,7 @@ from gripmon.recording.pins import pinned_by
 from gripmon.recording.ring import Moments, PictureRing, Trigger
 from gripmon.recording.settings import RecordingSettings
 from gripmon.recording.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
-from gripmon.records import Alert, AlertRecord, FrameRecord, Limits
+from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
 
 _NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import AffectedRange, Displacement, Event, Limits
 from gripmon.report.formats import COVERAGE

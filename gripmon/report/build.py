@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.records import AlertKind, ReferenceRecord, Verdict
+from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
 from gripmon.report.affected import motion_ranges, verdict_ranges
 from gripmon.report.clock import straightened
 from gripmon.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
@@ -138,7 +138,7 @@ def _references(source: Source, in_force_ns: dict[tuple[str, int], int]) -> list
 
 
 def _step(before: ReferenceRecord, after: ReferenceRecord) -> Displacement:
-    from gripmon.geometry import from_record, perturbation_between
+    from gripmon.model.geometry import from_record, perturbation_between
 
     vector = perturbation_between(from_record(before.cam_T_grip), from_record(after.cam_T_grip))
     variances = [np.reshape(r.covariance, (6, 6)).diagonal() for r in (before, after)]

@@ -10,7 +10,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records import CauseWeight
+from gripmon.model.records import CauseWeight
 
 Vector = tuple[float, float, float]
 

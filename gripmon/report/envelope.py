@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import Curve
 from gripmon.report.formats import COVERAGE

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.records import AlertKind, ReferenceRecord, Severity
+from gripmon.model.records import AlertKind, ReferenceRecord, Severity
 from gripmon.report.clock import SECOND_NS, Clock
 from gripmon.report.content import Event, Moment, Onset
 from gripmon.report.formats import count, duration

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.hindsight import LEAST_FRAMES, ChangePoint, correct
-from gripmon.records import AlertKind, Severity
+from gripmon.model.records import AlertKind, Severity
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import Displacement, Event, Limits, Moment, Onset
 from gripmon.report.limits import excess

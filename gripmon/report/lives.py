@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gripmon.records import AlertEvent, AlertKind, AlertRecord, Cause, Severity
+from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Severity
 from gripmon.report.clock import Clock
 
 MOTIONS = (AlertKind.STEP, AlertKind.CREEP, AlertKind.DRIFT)

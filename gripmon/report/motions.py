@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from gripmon.records import AlertKind, Array, Severity
+from gripmon.model.records import AlertKind, Array, Severity
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import Displacement, Event, Moment, Onset
 from gripmon.report.hindsight import Hindsight

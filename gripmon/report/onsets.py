@@ -6,7 +6,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.report.clock import SECOND_NS
 from gripmon.report.content import Onset
 from gripmon.report.track import Track

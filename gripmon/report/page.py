@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.records import AlertKind, CauseWeight, Origin
+from gripmon.model.records import AlertKind, CauseWeight, Origin
 from gripmon.report import formats
 from gripmon.report.build import Told
 from gripmon.report.content import AffectedRange, Event, Noise, RecordingReport, Report

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array, StateRecord
+from gripmon.model.records import Array, StateRecord
 from gripmon.report.affected import runs_of_equal
 from gripmon.report.clock import SECOND_NS, Clock
 from gripmon.report.content import Noise, Running, Share, Slice, Stretch

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
 from gripmon.playback import RecordedRun
-from gripmon.records import RecordedConfiguration
+from gripmon.model.records import RecordedConfiguration
 
 if TYPE_CHECKING:
     from pathlib import Path

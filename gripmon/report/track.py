@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.records import Array, ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.report.content import Displacement
 
 if TYPE_CHECKING:

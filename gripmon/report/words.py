@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gripmon.records import AlertKind, Cause
+from gripmon.model.records import AlertKind, Cause
 from gripmon.report.content import AffectedRange, Event, RecordingReport
 from gripmon.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, period, size, span
 from gripmon.report.limits import excess

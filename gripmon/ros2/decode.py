@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from gripmon.pixels import ENCODINGS, unpacked
-from gripmon.records import Image
+from gripmon.model.pixels import ENCODINGS, unpacked
+from gripmon.model.records import Image
 from gripmon.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, typestore
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def decode_image(payload: bytes) -> tuple[int, Image]:
     """``sensor_msgs/msg/Image`` -> stamp and image: H x W (one channel, and the brightness of ``yuv422``) or H x W x 3,
     BGR (colours, Bayer patterns).
 
-    The encodings are :data:`gripmon.pixels.ENCODINGS`; in the machine's byte order; it may be a read-only view of the
+    The encodings are :data:`gripmon.model.pixels.ENCODINGS`; in the machine's byte order; it may be a read-only view of the
     payload.
     """
     message = _decoded(IMAGE, payload, MOST_IMAGE_BYTES)

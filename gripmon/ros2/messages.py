@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.geometry import from_record, invert, skew, to_record
-from gripmon.records import (
+from gripmon.model.geometry import from_record, invert, skew, to_record
+from gripmon.model.records import (
     Array,
     FrameRecord,
     Protection,

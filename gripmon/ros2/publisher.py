@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import zenoh
 
-from gripmon.records import AlertEvent, AlertRecord, FrameRecord, ReferenceRecord, StandingAlert, StateRecord, Transform
+from gripmon.model.records import AlertEvent, AlertRecord, FrameRecord, ReferenceRecord, StandingAlert, StateRecord, Transform
 from gripmon.ros2.messages import Messages, inverse
 from gripmon.ros2.names import Qos
 from gripmon.ros2.node import Node, TopicPublisher

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.geometry import invert, make_transform
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert, make_transform
+from gripmon.model.records import Array
 from gripmon.simulator import textures
 from gripmon.simulator.scenario import Background
 from gripmon.simulator.viewing import RayGrid

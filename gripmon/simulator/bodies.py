@@ -8,8 +8,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import Cover, Prop, Scenario
 from gripmon.simulator.scene import COVER_TRAVEL, SceneState
 from gripmon.simulator.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
 
 _PHASES = 2048
 _REACH_SIGMAS = 3.3

@@ -7,8 +7,8 @@ import math
 
 import numpy as np
 
-from gripmon.geometry import exp_rotation, make_transform
-from gripmon.records import Array
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import (
     Bump,
     Cover,

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.simulator.bodies import Bodies
 from gripmon.simulator.scene import SceneState
 from gripmon.simulator.solids import hidden_by

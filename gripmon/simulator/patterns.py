@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import FingerMark, ObjectLook
 from gripmon.simulator.solids import Solid
 from gripmon.simulator.textures import Factor, Rng

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
 from gripmon.simulator.background import TableView
 from gripmon.simulator.bodies import Bodies
 from gripmon.simulator.coverage import Coverage, CoverageRaster

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.camera import Camera
-from gripmon.geometry import exp_rotation, make_transform
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.simulator import disturbance
 from gripmon.simulator.scenario import BentFinger, MountMotion, Scenario
 

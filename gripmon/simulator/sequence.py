@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Frame
+from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Frame
 from gripmon.simulator import disturbance
 from gripmon.simulator.bodies import Bodies
 from gripmon.simulator.outline import Outline, OutlineSeen

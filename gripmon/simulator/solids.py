@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import FingerShape
 
 _TOUCH_M = 1e-5  # bodies that touch within this don't hide each other's surface

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.simulator import patterns, textures
 from gripmon.simulator.scenario import Cover, FingerLook, ObjectLook
 from gripmon.simulator.solids import Solid

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from gripmon.pixels import in_full_scale
-from gripmon.records import Frame
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Frame
 
 
 class SourceError(ValueError):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from gripmon.records import Frame, Image
+from gripmon.model.records import Frame, Image
 from gripmon.sources.base import SourceError
 
 if TYPE_CHECKING:

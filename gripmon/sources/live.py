@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources.base import SourceError, Waiting
 from gripmon.sources.newest import NewestFrame
 

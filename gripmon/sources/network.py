@@ -10,7 +10,7 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.records import Frame, FrameNote, Image, Refusal, largest_bytes
+from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
 from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.sources.lateness import MOST_LATE_S, Lateness
 from gripmon.sources.payload import (

@@ -6,7 +6,7 @@ import logging
 import threading
 from typing import Protocol
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources.base import READ_TIMEOUT_S, Waiting
 
 _log = logging.getLogger(__name__)

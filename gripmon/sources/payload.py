@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gripmon.pixels import ENCODINGS, unpacked
-from gripmon.records import FrameNote, Image, MessageRefused, from_json
+from gripmon.model.pixels import ENCODINGS, unpacked
+from gripmon.model.records import FrameNote, Image, MessageRefused, from_json
 
 if TYPE_CHECKING:
     from PIL.ImageFile import ImageFile

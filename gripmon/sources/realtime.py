@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Frame, Image
+from gripmon.model.records import Frame, Image
 from gripmon.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 
 _log = logging.getLogger(__name__)

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from gripmon.records import Array, Frame
+from gripmon.model.records import Array, Frame
 from gripmon.sources.base import Source, SourceError
 
 if TYPE_CHECKING:
-    from gripmon.camera import Camera
-    from gripmon.gripper import Gripper
+    from gripmon.model.camera import Camera
+    from gripmon.model.gripper import Gripper
     from gripmon.simulator import Scenario, Simulator
 
 

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from gripmon.records import Frame
+from gripmon.model.records import Frame
 from gripmon.sources.base import SourceError
 
 _log = logging.getLogger(__name__)

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import TaughtEdges
-from gripmon.geometry import to_record
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import to_record
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.records import Array, Image, ReferenceRecord
+from gripmon.model.records import Array, Image, ReferenceRecord
 from gripmon.teaching.corner_pose import CameraError, CornerPose, PoseRefused, pose_from_corners
 from gripmon.teaching.measure import Taught, teach
 from gripmon.teaching.placing import Prior, place, prior_of, usual_view
@@ -117,7 +117,7 @@ def reference_of(pose: CornerPose) -> ReferenceRecord:
 
 
 def _pose(reference: ReferenceRecord) -> Array:
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
 
     return from_record(reference.cam_T_grip)
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from gripmon.calibration.intrinsics import lens_vector, model_of
 from gripmon.calibration.lens_models import LensModel, parameter_names
-from gripmon.camera import Camera
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.teaching.snapping import Snapped
 
 BY_HAND_PX = 1.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from gripmon.corners.taught import TaughtEdge, sight_axes
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.teaching.lines import Line
 from gripmon.teaching.pooling import Pooled, pool
 from gripmon.teaching.shape import SLOPE_SHARE, UNKNOWN_SLOPE, slopes

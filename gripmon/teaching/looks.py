@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gripmon.corners.prediction import STEP_PX
 from gripmon.corners.profiles import full_scale
 from gripmon.corners.taught import Look
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.teaching.estimate import EdgeLines
 from gripmon.teaching.views import View, Viewer
 

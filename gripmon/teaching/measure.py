@@ -18,12 +18,12 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import Measurement, MeasurementSettings
 from gripmon.corners.taught import TaughtCorner, TaughtEdge, TaughtEdges
-from gripmon.geometry import perturbation_between
-from gripmon.gripper import Gripper
-from gripmon.records import ReferenceRecord
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import ReferenceRecord
 from gripmon.smoothing import GATE
 from gripmon.teaching.checks import check_edges, check_enough, check_reference, check_standing
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, estimate_edges

@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners.profiles import full_scale
 from gripmon.corners.taught import TaughtEdges, TaughtModel
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Image
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 from gripmon.teaching.views import TeachingImage
 
 Picture = Image

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
-from gripmon.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
-from gripmon.gripper import Gripper
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
+from gripmon.model.gripper import Gripper
 from gripmon.recalibrate import RecalibrationRefused, solutions
-from gripmon.records import Array, ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 
 ROUGH_SHARE = 0.006
 """How exactly corners are put by hand: standard deviation, as a part of the image's width."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 _ROUNDS = 30
 _SETTLED = 1e-3

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import TaughtEdges
 from gripmon.drift import foresee
-from gripmon.gripper import Gripper
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings
 from gripmon.outlook import FEWEST_EDGES, Promise, expect, promise
 from gripmon.recalibrate import refusal
-from gripmon.records import Array, ReferenceRecord
+from gripmon.model.records import Array, ReferenceRecord
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 
 LARGEST_SLOPE = 5.0
 """Depth for each metre of offset at most: a face that is seen more grazingly than 11° tells no depth."""

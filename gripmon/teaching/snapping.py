@@ -11,12 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.corners.settling import ZOOMS, Expected
-from gripmon.geometry import perturb
-from gripmon.gripper import Gripper, on_a_line
-from gripmon.records import Array, CornerFault, Image
+from gripmon.model.geometry import perturb
+from gripmon.model.gripper import Gripper, on_a_line
+from gripmon.model.records import Array, CornerFault, Image
 from gripmon.teaching.placing import Placed, Prior, place, rough_sigma_px
 
 FEWEST_PUT = 4

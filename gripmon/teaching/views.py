@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.corners.prediction import EdgeLayout, Prediction, lay_out, predict
 from gripmon.corners.profiles import (
@@ -24,9 +24,9 @@ from gripmon.corners.profiles import (
     read_profiles,
 )
 from gripmon.corners.taught import TaughtEdge, TaughtEdges, sight_axes
-from gripmon.geometry import from_record, invert, perturb, perturbation_between, to_record
-from gripmon.gripper import Gripper
-from gripmon.records import Array, Image, ReferenceRecord
+from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image, ReferenceRecord
 from gripmon.teaching.lines import EdgePoints
 
 USUAL_SHARE = 0.6

@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 
 from gripmon import __version__
-from gripmon.geometry import from_record, rotation_angle
+from gripmon.model.geometry import from_record, rotation_angle
 from gripmon.inspection import inspect
-from gripmon.pixels import in_full_scale
-from gripmon.records import Array, Frame, Image
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Array, Frame, Image
 from gripmon.sources import Source, Waiting
 from gripmon.teaching.bench import Bench, Found, rough_fault
 from gripmon.teaching.snapping import FEWEST_PUT, SnappedCorner

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from gripmon import __version__
-from gripmon.atomic import write_atomically
+from gripmon.model.atomic import write_atomically
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.onboarding.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
 from gripmon.teachpage.desk import BadRequest, Picture, encoded

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from benchmarks.peers import LOST_M, PEERS, timed
 from benchmarks.scenes import Sequence, Shot
 from gripmon.drift import DriftSettings
-from gripmon.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
+from gripmon.model.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.records import Array, FrameRecord, Origin, ReferenceRecord, Verdict
+from gripmon.model.records import Array, FrameRecord, Origin, ReferenceRecord, Verdict
 
 WAYS = ("edges", "corners")
 """Both values of ``monitor.measurement``."""

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from benchmarks.accuracy_runs import Track
 from benchmarks.scenes import Scene
-from gripmon.geometry import invert
-from gripmon.records import Array
+from gripmon.model.geometry import invert
+from gripmon.model.records import Array
 from gripmon.simulator import Simulator
 from gripmon.simulator.scenario import JawScript, Tilt
 

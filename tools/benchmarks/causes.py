@@ -95,7 +95,7 @@ def measure(rows: list[str], trials: int, seed: int) -> list[Outcome]:
 def judged(row: str, number: int, trial: Any, told: Any) -> Outcome:
     """Right: the cause, and the finger where it is one's; where nothing happened, that none is named."""
     from benchmarks.causes_trials import ROWS
-    from gripmon.records import Cause
+    from gripmon.model.records import Cause
 
     expected = ROWS[row].cause
     truth = (expected, trial.part)

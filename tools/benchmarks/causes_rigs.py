@@ -10,10 +10,10 @@ import numpy as np
 
 from benchmarks.jumps import rigs
 from benchmarks.scenes import _look, bevelled, gripper_models
-from gripmon.camera import LensSettings, make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Array
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import JawScript, Light
 

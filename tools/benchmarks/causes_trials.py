@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 
 from benchmarks.causes_rigs import AFTER, WELL, Rig, Rng, draw_rig
-from gripmon.camera import LensSettings, PaperLens
-from gripmon.geometry import perturb
-from gripmon.records import Array, Cause, Frame, Image
+from gripmon.model.camera import LensSettings, PaperLens
+from gripmon.model.geometry import perturb
+from gripmon.model.records import Array, Cause, Frame, Image
 from gripmon.simulator.scenario import BentFinger, Cover, Defocus, Light, LightStep, Tilt
 
 _RING = 24

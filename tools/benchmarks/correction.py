@@ -174,7 +174,7 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
 
     from benchmarks.noise_model import NoiseModel
     from benchmarks.scene import config_for
-    from gripmon.geometry import from_record
+    from gripmon.model.geometry import from_record
     from gripmon.hindsight import chart
 
     nominal_T = from_record(config_for((768, 576)).reference.cam_T_grip)

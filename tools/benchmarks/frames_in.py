@@ -89,7 +89,7 @@ def measure(size: tuple[int, int, int], frame_format: str, *, shared: bool, fram
 
 def _take(camera: NetworkCamera, driver: subprocess.Popen[bytes]) -> list[float]:
     """From stamp to decoded image, ms, until the driver ends."""
-    from gripmon.records import Frame
+    from gripmon.model.records import Frame
 
     took_ms: list[float] = []
     while driver.poll() is None:

@@ -23,7 +23,7 @@ from gripmon.config import Config
 from gripmon.monitor import Monitor
 from gripmon.publish import Publisher, ZenohPublisher
 from gripmon.recording import NullRecorder, Recorder
-from gripmon.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
 from gripmon.wire import Link, PublishSettings
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"

@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.gripper import Gripper
-from gripmon.records import Array
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
 
 Changes = dict[str, Any]

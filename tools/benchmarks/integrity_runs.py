@@ -20,13 +20,13 @@ from benchmarks.integrity_misleading import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.rendered import Rendered
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.drift import DriftSettings
-from gripmon.geometry import from_record, perturbation_between, rotation_angle, to_record
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, perturbation_between, rotation_angle, to_record
+from gripmon.model.gripper import Gripper
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.outlook import Rig, foresee_frame
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertEvent,
     AlertKind,

@@ -15,10 +15,10 @@ import numpy as np
 
 from benchmarks.integrity_draft import Condition, Draft
 from benchmarks.scenes import CAMERA, START_SIGMA_M, START_SIGMA_RAD, gripper_models
-from gripmon.camera import Camera, PaperLens, make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Array
+from gripmon.model.camera import Camera, PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
 

@@ -19,10 +19,10 @@ from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
 from benchmarks.machine import ROOT
-from gripmon.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.geometry import perturb
-from gripmon.gripper import Gripper, GripperModel, load_gripper
-from gripmon.records import Frame
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import perturb
+from gripmon.model.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.records import Frame
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.disturbance import full_motion
 from gripmon.simulator.scenario import Background, JawScript, MountMotion, Tilt

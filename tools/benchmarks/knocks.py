@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from benchmarks import jumps
 from benchmarks.machine import ROOT
 from benchmarks.scenes import tapered_gripper
-from gripmon.camera import Camera, LensSettings, make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
-from gripmon.gripper import Gripper, GripperModel, load_gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.gripper import Gripper, GripperModel, load_gripper
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import (
     Background,

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
-from gripmon.camera import BrownConradyLens, Camera, make_camera
-from gripmon.geometry import invert, make_transform
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, Camera, make_camera
+from gripmon.model.geometry import invert, make_transform
+from gripmon.model.records import Array
 
 PAPER_LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=543.0, fy_px=543.0, cx_px=320.0, cy_px=240.0)
 

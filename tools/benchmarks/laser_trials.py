@@ -19,7 +19,7 @@ from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import invert, make_transform, perturbation_between
+from gripmon.model.geometry import invert, make_transform, perturbation_between
 
 Array = NDArray[np.float64]
 

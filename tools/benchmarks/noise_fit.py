@@ -28,7 +28,7 @@ from benchmarks.noise_measured import FPS, REGIMES, SEED, SIZE, VIBRATION_HZ, VI
 from benchmarks.noise_model import FOLDER, Array, MeasuredScene, NoiseModel, Part, VibrationModel
 from benchmarks.noise_statistics import LAGS, Statistics, mean, statistics, whitened
 from benchmarks.scene import config_for
-from gripmon.geometry import from_record, perturbation_between
+from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.simulator.disturbance import about_pivot, full_motion
 from gripmon.simulator.scenario import MountMotion, Scenario
 

@@ -22,9 +22,9 @@ import numpy as np
 
 from benchmarks.scene import FPS, config_for
 from gripmon.config import Config
-from gripmon.geometry import from_record, perturbation_between
+from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.monitor import Monitor
-from gripmon.records import Array, Origin, Verdict
+from gripmon.model.records import Array, Origin, Verdict
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import (
     Background,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.noise_measured import Series
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LAGS = np.array([1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 384, 512, 768, 1024])
 WINDOWS = tuple(2**k for k in range(11))

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
 from gripmon.calibration.targets import Chequerboard, CircleGrid
-from gripmon.camera import LensSettings, PaperLens, make_camera
-from gripmon.geometry import exp_rotation, make_transform, perturb
-from gripmon.gripper import Gripper, load_gripper
-from gripmon.records import Array
+from gripmon.model.camera import LensSettings, PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform, perturb
+from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
 

@@ -21,9 +21,9 @@ from gripmon.calibration.detection import detect
 from gripmon.calibration.intrinsics import calibrate
 from gripmon.calibration.sighting import Sighting
 from gripmon.calibration.targets import Chequerboard
-from gripmon.camera import BrownConradyLens, LensSettings, make_camera
-from gripmon.geometry import exp_rotation
-from gripmon.records import Array
+from gripmon.model.camera import BrownConradyLens, LensSettings, make_camera
+from gripmon.model.geometry import exp_rotation
+from gripmon.model.records import Array
 
 LENS = BrownConradyLens(
     width_px=768,

@@ -16,11 +16,11 @@ from gripmon.calibration.intrinsics import calibrate_single_view
 from gripmon.calibration.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
 from gripmon.calibration.plane_average import average
 from gripmon.calibration.sighting import CalibrationError, NotFound, Sighting
-from gripmon.camera import make_camera
-from gripmon.geometry import perturbation_between
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import perturbation_between
 from gripmon.onboarding import KnownGripper, UnknownGripper
 from gripmon.onboarding.measuring import contact_height_m
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 from gripmon.simulator.scenario import Sensor
 
 ROUGH_PX = 4.0

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from gripmon.camera import Camera
+from gripmon.model.camera import Camera
 from gripmon.config import builtin_config, load_config
 from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.corners.prediction import SamplingSettings
 from gripmon.differential import DegenerateGeometry, differential_update
-from gripmon.geometry import from_record, invert, perturb
-from gripmon.gripper import Gripper
+from gripmon.model.geometry import from_record, invert, perturb
+from gripmon.model.gripper import Gripper
 from gripmon.recalibrate import RecalibrationRefused, recalibrate
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import Background
 

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from benchmarks.machine import ROOT
 from benchmarks.scenes import Sequence
 from benchmarks.tags import FingerTags, TagTracker, apriltags_installed, pose_of
-from gripmon.camera import Camera
-from gripmon.geometry import invert
-from gripmon.gripper import Gripper, load_gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.records import Array
 
 Grey = NDArray[np.uint8]
 

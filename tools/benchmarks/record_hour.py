@@ -23,7 +23,7 @@ from gripmon.recording.columns import Row
 from gripmon.recording.files import FileSeries
 from gripmon.recording.wire import Events, Scene, make_scene, pack_trace
 from gripmon.recording.worker import encode_picture
-from gripmon.records import StateRecord
+from gripmon.model.records import StateRecord
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from benchmarks import machine, scene
 from gripmon.monitor import Monitor
 from gripmon.recording import ProcessRecorder, open_recorder
-from gripmon.records import Frame, FrameRecord, MeasurementTrace
+from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 
 FRAMES_PER_HOUR = round(3600 * scene.FPS)
 _LIGHT = {

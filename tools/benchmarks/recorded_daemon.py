@@ -14,7 +14,7 @@ import cv2
 
 from benchmarks import harness, scene
 from benchmarks.switched import SwitchedRecorder
-from gripmon.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 
 
 class _Said:

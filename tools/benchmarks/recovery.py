@@ -138,9 +138,9 @@ def _trial(plan: Plan, scene: Any, index: int, kind: str) -> Outcome:
 def _monitor(camera: Any, gripper: Any, cam_T_grip: Any) -> Callable[[Any], Any]:
     import numpy as np
 
-    from gripmon.geometry import to_record
+    from gripmon.model.geometry import to_record
     from gripmon.monitor import Monitor, MonitorSettings
-    from gripmon.records import ReferenceRecord
+    from gripmon.model.records import ReferenceRecord
 
     sigma = np.array([2e-4] * 3 + [2e-3] * 3)
     covariance = tuple(np.diag(sigma**2).ravel().tolist())
@@ -154,7 +154,7 @@ def _watch(process: Callable[[Any], Any], frames: Sequence[Any], truths: Sequenc
 
     import numpy as np
 
-    from gripmon.records import Origin, Verdict
+    from gripmon.model.records import Origin, Verdict
 
     found = back = None
     valid = lies = inexact = 0
@@ -183,7 +183,7 @@ def _rendered(plan: Plan) -> dict[str, list[Outcome]]:
     import numpy as np
 
     from benchmarks import jumps, rendered
-    from gripmon.geometry import perturb
+    from gripmon.model.geometry import perturb
 
     rows: dict[str, list[Outcome]] = {}
     rng = np.random.default_rng([plan.seed, 99])

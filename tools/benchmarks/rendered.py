@@ -24,9 +24,9 @@ from benchmarks.conditions import CLEAN, HARD, Limit
 from benchmarks.machine import ROOT
 from benchmarks.scenes import START_SIGMA_M, START_SIGMA_RAD, Sequence, Shot
 from benchmarks.tags import FingerTags, with_tags
-from gripmon.camera import PaperLens, make_camera
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Frame
+from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Frame
 
 FOLDER = ROOT.parent / "shared" / "data" / "rendered"
 _PREFIX, _TRUE_JAW = "rendered ", ", true jaw"

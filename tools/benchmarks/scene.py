@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from benchmarks import tags
 from benchmarks.machine import ROOT
-from gripmon.camera import PaperLens, make_camera
+from gripmon.model.camera import PaperLens, make_camera
 from gripmon.config import Config, load_config
-from gripmon.geometry import from_record
-from gripmon.records import Frame
+from gripmon.model.geometry import from_record
+from gripmon.model.records import Frame
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import Background, Creep
 

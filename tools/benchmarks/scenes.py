@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 from benchmarks.conditions import Condition, Draw, scenario
 from benchmarks.machine import ROOT
 from benchmarks.tags import FingerTags
-from gripmon.camera import Camera, PaperLens, make_camera
+from gripmon.model.camera import Camera, PaperLens, make_camera
 from gripmon.corners import MeasurementSettings, TaughtEdges
-from gripmon.geometry import exp_rotation, make_transform, perturb, to_record
-from gripmon.gripper import Gripper, GripperModel
-from gripmon.records import Array, Frame, ReferenceRecord
+from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
+from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.records import Array, Frame, ReferenceRecord
 from gripmon.simulator import FrameTruth, Hidden, Scenario, Simulator
 from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
 from gripmon.teaching import TeachingImage, TeachingRefused, teach

@@ -112,7 +112,7 @@ def _run(average: Any, error: Any, motion: Any, covariance: Any) -> tuple[Any, _
     import numpy as np
 
     from benchmarks.scene import FPS, config_for
-    from gripmon.geometry import from_record, perturb, perturbation_between
+    from gripmon.model.geometry import from_record, perturb, perturbation_between
     from gripmon.smoothing import PoseAverage
 
     config = config_for((768, 576))

@@ -9,7 +9,7 @@ import msgspec
 
 from gripmon.config import Config
 from gripmon.recording import Notes, ProcessRecorder, Trace, open_recorder
-from gripmon.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
 
 
 class SwitchedRecorder:

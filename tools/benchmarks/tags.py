@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
-from gripmon.camera import Camera
-from gripmon.geometry import make_transform
-from gripmon.gripper import Gripper, load_gripper
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import make_transform
+from gripmon.model.gripper import Gripper, load_gripper
+from gripmon.model.records import Array
 
 _CELLS = 8  # across a 36h11 tag, its black border included
 _QUIET_CELLS = 1

@@ -19,7 +19,7 @@ from benchmarks.wire import MAX_AGE_S
 from benchmarks.wire_others import RouterProcess, free_endpoint
 from gripmon.client import Policy, TransformClient
 from gripmon.publish import ZenohPublisher
-from gripmon.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
+from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 from gripmon.wire import Link, PublishSettings
 
 RATES_BYTES_PER_S = (100e3, 70e3, 30e3)

@@ -183,7 +183,7 @@ def real_record() -> bytes:
     from benchmarks import scene
 
     from gripmon.monitor import Monitor
-    from gripmon.records import to_json
+    from gripmon.model.records import to_json
 
     config, ring = scene.config_for((768, 576)), scene.render((768, 576), 4)
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)

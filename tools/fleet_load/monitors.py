@@ -16,7 +16,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.publish import ZenohPublisher
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     AlertRecord,

@@ -11,8 +11,8 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from gripmon.geometry import make_transform
-from gripmon.records import Array
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 
 DH = (
     (0.1625, 0.0, math.pi / 2),

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.client import Reading
-from gripmon.geometry import from_record, invert, make_transform
-from gripmon.records import Array, Transform, Verdict
+from gripmon.model.geometry import from_record, invert, make_transform
+from gripmon.model.records import Array, Transform, Verdict
 from servoing.arm import Arm, twist_to
 from servoing.rules import Action, Limits, action_for, may_grasp
 from servoing.stage import APPROACH_S, BEGIN_S, standoff_m

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gripmon.camera import Camera
-from gripmon.geometry import make_transform
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 from gripmon.simulator.scenario import GraspedObject
 
 SIGMA_PX = 0.1

@@ -19,8 +19,8 @@ import yaml
 
 from gripmon.client import Policy, Reading, TransformClient
 from gripmon.config import Config, load_config
-from gripmon.geometry import from_record
-from gripmon.records import Array
+from gripmon.model.geometry import from_record
+from gripmon.model.records import Array
 from gripmon.simulator import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]

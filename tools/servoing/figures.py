@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.records import Array, Verdict
+from gripmon.model.records import Array, Verdict
 from servoing.runs import GRIPMON, SMOOTHED, SOURCES, TRUTH, WITHOUT, Run, Track
 
 WORSE_M = 5e-5

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 from servoing import stage
 from servoing.figures import LABELS
 from servoing.runs import GRIPMON, SMOOTHED, TRUTH, WITHOUT, Run

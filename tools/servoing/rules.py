@@ -6,7 +6,7 @@ import enum
 import math
 from dataclasses import dataclass
 
-from gripmon.records import Verdict
+from gripmon.model.records import Verdict
 
 
 class Action(enum.StrEnum):

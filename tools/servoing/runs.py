@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.client import Policy, Reading
-from gripmon.geometry import from_record, invert
-from gripmon.records import Array, Verdict
+from gripmon.model.geometry import from_record, invert
+from gripmon.model.records import Array, Verdict
 from gripmon.simulator import Simulator
 from servoing import stage
 from servoing.arm import Arm

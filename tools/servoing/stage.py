@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.geometry import exp_rotation, make_transform
-from gripmon.records import Array
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.records import Array
 from gripmon.simulator.disturbance import smooth_step
 from gripmon.simulator.scenario import Background, Bump, Cover, GraspedObject, Scenario
 from servoing.arm import HOME_RAD, Arm

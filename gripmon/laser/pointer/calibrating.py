@@ -16,8 +16,8 @@ from gripmon.laser.pointer.refinement import Refined, refine
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
 
 FARTHEST_PLANE_M = 50.0
 NEAREST_PLANE_M = 0.01

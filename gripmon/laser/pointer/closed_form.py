@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import make_transform
-from gripmon.records import Array
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 
 FEWEST_SHIFTS = 6
 """Spots of an orientation: twelve equations for the eleven unknowns of its matrix."""

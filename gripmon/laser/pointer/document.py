@@ -10,10 +10,10 @@ from msgspec import Meta
 
 from gripmon.laser.pointer.refinement import Refined
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
-from gripmon.camera import LensSettings
-from gripmon.geometry import from_record, invert, skew, to_record
-from gripmon.provenance import Provenance
-from gripmon.records import Array, Transform
+from gripmon.model.camera import LensSettings
+from gripmon.model.geometry import from_record, invert, skew, to_record
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Transform
 
 Vector = tuple[float, float, float]
 _Length = Annotated[float, Meta(ge=0.0)]

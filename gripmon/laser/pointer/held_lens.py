@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.laser.pointer.refinement import Refined
 from gripmon.laser.pointer.setup import PARAMETERS
 from gripmon.laser.pointer.spot_problem import LensPrior, SpotProblem
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 
 def with_held_lens(refined: Refined, problem: SpotProblem, lens: LensPrior) -> Refined:

@@ -11,9 +11,9 @@ from gripmon.laser.pointer import common_plane
 from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
-from gripmon.geometry import invert
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
+from gripmon.model.records import Array
 
 SUSPECT_PX = 3.0
 """Noise of spots from which it is asked whether the poses are what they are taken for."""

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from gripmon.laser.pointer.calibrating import LaserResult
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
-from gripmon.geometry import invert
-from gripmon.records import Array, Image
+from gripmon.model.geometry import invert
+from gripmon.model.records import Array, Image
 
 _WIDTH, _HEIGHT, _MARGIN = 800, 640, 50
 _PAPER, _INK, _FAINT = (255, 255, 255), (40, 40, 40), (205, 205, 205)

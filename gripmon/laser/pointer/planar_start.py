@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from gripmon.laser.pointer.setup import basis
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)
 SPACING_RAD = np.radians(15.0)

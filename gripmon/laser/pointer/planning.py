@@ -11,9 +11,9 @@ from gripmon.laser.pointer.document import pose_jacobian
 from gripmon.laser.pointer.refinement import Refined
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup, spots_on_plane
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import make_camera
-from gripmon.geometry import invert, make_transform
-from gripmon.records import Array
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import invert, make_transform
+from gripmon.model.records import Array
 
 CANDIDATES = 4000
 STEEPEST_TILT_RAD = np.radians(55.0)

@@ -19,8 +19,8 @@ from scipy.stats import f as fisher_f
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
 from gripmon.laser.pointer.spot_problem import SpotProblem, State
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import LensSettings
-from gripmon.records import Array
+from gripmon.model.camera import LensSettings
+from gripmon.model.records import Array
 
 BIWEIGHT = 4.685
 """Tukey's constant: 95 % efficiency for normal errors."""

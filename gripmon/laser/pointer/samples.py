@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.geometry import exp_rotation, make_transform, rotation_from_xyzw
-from gripmon.records import Array
+from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
+from gripmon.model.records import Array
 
 Row = Mapping[str, Any]
 

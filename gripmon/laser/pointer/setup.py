@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.geometry import perturb, skew
-from gripmon.records import Array
+from gripmon.model.geometry import perturb, skew
+from gripmon.model.records import Array
 
 PARAMETERS = (
     "cam_T_base.x_m", "cam_T_base.y_m", "cam_T_base.z_m", "cam_T_base.rx_rad", "cam_T_base.ry_rad", "cam_T_base.rz_rad",

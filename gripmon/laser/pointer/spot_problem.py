@@ -9,8 +9,8 @@ import numpy as np
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
 from gripmon.calibration.lens_models import LensModel
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.records import Array
 
 _FX, _FY = 0, 1  # the first two parameters of every lens model
 

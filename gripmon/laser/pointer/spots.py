@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibration.sighting import NotFound
-from gripmon.records import Array, Image
+from gripmon.model.records import Array, Image
 
 BACKGROUND_PX = 31
 """Width of the window whose median is the background, where no image with the laser off is given: spots are smaller."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
-from gripmon.records import Array, Frame, Image, PulseFault
+from gripmon.model.records import Array, Frame, Image, PulseFault
 
 _NS = 1_000_000_000
 _ENDS_KEPT = 256

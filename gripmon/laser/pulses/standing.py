@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from gripmon.laser.pointer.spots import SHARE_OF_PEAK, Spot
-from gripmon.records import Array, Frame, Image
+from gripmon.model.records import Array, Frame, Image
 
 _REACH = 3.0
 """Half of the window's width, in radii of a disc of the spot's area."""

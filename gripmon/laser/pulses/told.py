@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from gripmon.laser.pointer.samples import Row, check_scale, pose_of
-from gripmon.records import Array, LaserPulse
+from gripmon.model.records import Array, LaserPulse
 
 LONGEST_S = 60.0
 """Nobody holds an arm still for so long to show a spot: such stamps are of two clocks, or of another unit."""

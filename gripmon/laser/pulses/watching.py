@@ -12,14 +12,14 @@ import numpy as np
 from gripmon.laser.pointer.document import LaserCalibration, setup_of
 from gripmon.laser.pointer.spots import Spot, find_spots
 from gripmon.calibration.sighting import NotFound
-from gripmon.camera import make_camera
-from gripmon.geometry import from_record, perturb, quaternion_xyzw, skew
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import from_record, perturb, quaternion_xyzw, skew
 from gripmon.policy import AlertBook
 from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.standing import way_px
 from gripmon.laser.pulses.told import Told
-from gripmon.records import (
+from gripmon.model.records import (
     Alert,
     AlertKind,
     ArmPose,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.laser.watch.world import COUNT, Calibrated, foresee_moved
 
 PLACES = 12

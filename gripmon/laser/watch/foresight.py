@@ -12,8 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.geometry import make_transform
-from gripmon.records import Array
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 from gripmon.laser.watch.motion import UNIT
 from gripmon.laser.watch.motions import KINDS, SCALES, assumed
 from gripmon.laser.watch.moving import on_plane

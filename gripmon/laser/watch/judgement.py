@@ -9,8 +9,8 @@ import numpy as np
 
 from gripmon.laser.pointer.spots import Spot
 from gripmon.calibration.sighting import NotFound
-from gripmon.records import Alert, Array, CauseWeight, State, Verdict
-from gripmon.records.values import OpenEnum
+from gripmon.model.records import Alert, Array, CauseWeight, State, Verdict
+from gripmon.model.records.values import OpenEnum
 
 
 class SpotFault(OpenEnum):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.laser.watch.beliefs import MOVED, Beliefs
 from gripmon.laser.watch.judgement import CameraMotion
 from gripmon.laser.watch.motions import SCALES

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.records import Array, Cause
+from gripmon.model.records import Array, Cause
 from gripmon.laser.watch.world import CAMERA, COUNT, LASER, PLANE
 
 KINDS: tuple[tuple[Cause, slice, float], ...] = (

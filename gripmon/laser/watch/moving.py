@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
+from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 from gripmon.laser.watch import words
 from gripmon.laser.watch.beliefs import MOVED
 from gripmon.laser.watch.judgement import CameraMotion

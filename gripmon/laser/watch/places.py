@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.geometry import rotation_angle
-from gripmon.records import Array
+from gripmon.model.geometry import rotation_angle
+from gripmon.model.records import Array
 from gripmon.laser.watch.beliefs import PLACES
 
 SAME_M, SAME_RAD = 5e-3, 0.02

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.laser.watch.beliefs import MOVED, Bank, Beliefs, Pulse, as_calibrated
 from gripmon.laser.watch.motions import BACK, newborn
 from gripmon.laser.watch.world import Calibrated

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 
 class SpotWatchSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.laser.pointer.spots import Spot
-from gripmon.records import Array
+from gripmon.model.records import Array
 from gripmon.laser.watch.judgement import Disagreement
 from gripmon.laser.watch.ways import INPUTS, disagreements, ways
 from gripmon.laser.watch.world import COUNT, Calibrated, Foreseen, larger

@@ -11,7 +11,7 @@ from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.spots import Spot
 from gripmon.calibration.sighting import NotFound
 from gripmon.policy import AlertBook
-from gripmon.records import Alert, State, Verdict
+from gripmon.model.records import Alert, State, Verdict
 from gripmon.laser.watch import words
 from gripmon.laser.watch.beliefs import Pulse
 from gripmon.laser.watch.judgement import SpotFault, SpotJudgement, SpotSeen

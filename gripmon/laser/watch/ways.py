@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.laser.pointer.setup import basis, origin_axes
-from gripmon.camera import Camera
-from gripmon.geometry import skew
-from gripmon.records import Array
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import skew
+from gripmon.model.records import Array
 from gripmon.laser.watch.judgement import Disagreement
 from gripmon.laser.watch.world import COUNT, World
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
+from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 from gripmon.laser.watch.judgement import CameraMotion, SpotFault
 
 _WHAT = {

@@ -14,9 +14,9 @@ import numpy as np
 from gripmon.laser.pointer.document import NAMES, LaserCalibration
 from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes, pose_slopes, spots_on_plane
 from gripmon.calibration.sighting import CalibrationError
-from gripmon.camera import Camera, make_camera
-from gripmon.geometry import from_record, perturb, skew
-from gripmon.records import Array
+from gripmon.model.camera import Camera, make_camera
+from gripmon.model.geometry import from_record, perturb, skew
+from gripmon.model.records import Array
 
 PARAMETERS = (
     "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",

@@ -11,8 +11,8 @@ from typing import Annotated, Self
 
 import msgspec
 
-from gripmon.records.commands import CommandName
-from gripmon.records.references import MonitorState
+from gripmon.model.records.commands import CommandName
+from gripmon.model.records.references import MonitorState
 
 
 class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recording/1"):

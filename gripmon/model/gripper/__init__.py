@@ -7,10 +7,10 @@ as a table over the opening says (adaptive grippers move on an arc, so their fin
 
 from __future__ import annotations
 
-from gripmon.gripper.core import LARGEST_EXTENT_M, EdgeView, Gripper, on_a_line
-from gripmon.gripper.faces import FaceLoop
-from gripmon.gripper.file import gripper_from_dict, load_gripper
-from gripmon.gripper.model import (
+from gripmon.model.gripper.core import LARGEST_EXTENT_M, EdgeView, Gripper, on_a_line
+from gripmon.model.gripper.faces import FaceLoop
+from gripmon.model.gripper.file import gripper_from_dict, load_gripper
+from gripmon.model.gripper.model import (
     AxisMotion,
     EdgeModel,
     FaceModel,

@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.values import OpenEnum
+from gripmon.model.records.values import OpenEnum
 
 
 class Severity(enum.StrEnum):

@@ -12,8 +12,8 @@ exp(omega) R``.
 
 from __future__ import annotations
 
-from gripmon.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
-from gripmon.records.commands import (
+from gripmon.model.records.alerts import Alert, AlertEvent, AlertKind, Cause, CauseWeight, OpenAlert, Severity
+from gripmon.model.records.commands import (
     Command,
     CommandError,
     CommandFault,
@@ -24,8 +24,8 @@ from gripmon.records.commands import (
     SnapshotImage,
     accepting,
 )
-from gripmon.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
-from gripmon.records.frames import (
+from gripmon.model.records.evidence import END_CORNERS, EdgeEvidence, EdgeSums
+from gripmon.model.records.frames import (
     CornerFault,
     CornerRecord,
     Frame,
@@ -38,16 +38,16 @@ from gripmon.records.frames import (
     unmeasured_record,
     withheld,
 )
-from gripmon.records.json_schema import json_schema, summary
-from gripmon.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
-from gripmon.records.looks import LookRecord
-from gripmon.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
-from gripmon.records.motion import Creep, Explanation, Motion, Vibration
-from gripmon.records.notes import Limits, MonitorNotes
-from gripmon.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
-from gripmon.records.references import MonitorState, ReferenceInputs, ReferenceRecord
-from gripmon.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
-from gripmon.records.values import Array, Drift, Image, Protection, Smoothed, Transform, to_json
+from gripmon.model.records.json_schema import json_schema, summary
+from gripmon.model.records.laser import ArmPose, CameraShift, LaserPulse, PulseFault, SpotGap, SpotRecord
+from gripmon.model.records.looks import LookRecord
+from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StandingAlert, StateRecord
+from gripmon.model.records.motion import Creep, Explanation, Motion, Vibration
+from gripmon.model.records.notes import Limits, MonitorNotes
+from gripmon.model.records.recorded import Meta, RecordedCommand, RecordedConfiguration, RecordedFile
+from gripmon.model.records.references import MonitorState, ReferenceInputs, ReferenceRecord
+from gripmon.model.records.schemas import MESSAGES, MessageRefused, from_json, largest_bytes, schema_name
+from gripmon.model.records.values import Array, Drift, Image, Protection, Smoothed, Transform, to_json
 
 __all__ = [
     "END_CORNERS",

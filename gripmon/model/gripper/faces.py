@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 LARGEST_WARP_M = 5e-4
 """A loop this far off its plane still counts as flat: as exactly as callipers measure."""

@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
-from gripmon.gripper.model import AxisMotion, GripperError, JawModel, TableMotion
-from gripmon.records import Array
+from gripmon.model.gripper.model import AxisMotion, GripperError, JawModel, TableMotion
+from gripmon.model.records import Array
 
 _T = TypeVar("_T")
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import msgspec
 
-from gripmon.records.commands import CommandRequest
-from gripmon.records.laser import LaserPulse
-from gripmon.records.messages import FrameNote, JawReading
-from gripmon.records.schemas import MESSAGES
-from gripmon.records.values import OpenEnum
+from gripmon.model.records.commands import CommandRequest
+from gripmon.model.records.laser import LaserPulse
+from gripmon.model.records.messages import FrameNote, JawReading
+from gripmon.model.records.schemas import MESSAGES
+from gripmon.model.records.values import OpenEnum
 
 _DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _FROM_OTHERS = (JawReading, FrameNote, LaserPulse, CommandRequest)
@@ -21,7 +21,7 @@ _LATER_TEXT = "; later versions may have more names"
 
 
 def json_schema(names: Sequence[str] = tuple(MESSAGES)) -> dict[str, Any]:
-    """The schema of one message, or of any of several, by their names in :data:`gripmon.records.MESSAGES`.
+    """The schema of one message, or of any of several, by their names in :data:`gripmon.model.records.MESSAGES`.
 
     It holds for this version and for later ones of the same major version: fields and names that aren't known pass.
     KeyError for a name that is none.

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from gripmon.records import Array, Transform
+from gripmon.model.records import Array, Transform
 
 _SMALL_RAD = 1e-8
 _IDENTITY = np.eye(4)

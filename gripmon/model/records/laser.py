@@ -7,9 +7,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.alerts import Alert
-from gripmon.records.frames import State, Verdict
-from gripmon.records.values import OpenEnum
+from gripmon.model.records.alerts import Alert
+from gripmon.model.records.frames import State, Verdict
+from gripmon.model.records.values import OpenEnum
 
 Stamp = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Pair = tuple[float, float]

@@ -8,9 +8,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.frames import FrameRecord
-from gripmon.records.references import MonitorState
-from gripmon.records.values import OpenEnum
+from gripmon.model.records.frames import FrameRecord
+from gripmon.model.records.references import MonitorState
+from gripmon.model.records.values import OpenEnum
 
 
 class CommandName(enum.StrEnum):

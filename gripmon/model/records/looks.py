@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.values import Transform
+from gripmon.model.records.values import Transform
 
 
 class LookRecord(msgspec.Struct, frozen=True):

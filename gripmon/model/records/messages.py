@@ -7,8 +7,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.alerts import Alert, AlertKind, Severity
-from gripmon.records.frames import State, Verdict
+from gripmon.model.records.alerts import Alert, AlertKind, Severity
+from gripmon.model.records.frames import State, Verdict
 
 
 class StandingAlert(msgspec.Struct, frozen=True):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.gripper.faces import LARGEST_SKEW, LARGEST_WARP_M, FaceLoop, extent_m, normal_of, off_plane_m, triangles
-from gripmon.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
-from gripmon.gripper.motion import motion_table, offset_m
-from gripmon.records import Array
+from gripmon.model.gripper.faces import LARGEST_SKEW, LARGEST_WARP_M, FaceLoop, extent_m, normal_of, off_plane_m, triangles
+from gripmon.model.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
+from gripmon.model.gripper.motion import motion_table, offset_m
+from gripmon.model.records import Array
 
 LARGEST_EXTENT_M = 1.0
 SMALLEST_SPREAD_RATIO = 0.02

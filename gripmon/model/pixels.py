@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.records import Frame, Image, Refusal
+from gripmon.model.records import Frame, Image, Refusal
 
 
 class Pixels(NamedTuple):

@@ -1,4 +1,4 @@
-"""The lens maps behind :mod:`gripmon.camera`: ideal <-> distorted normalised coordinates, with analytic Jacobians.
+"""The lens maps behind :mod:`gripmon.model.camera`: ideal <-> distorted normalised coordinates, with analytic Jacobians.
 
 ``xy`` are ideal normalised coordinates x/z, y/z, ``q`` distorted ones, ``((u - cx)/fx, (v - cy)/fy)``, both (2, n).
 """
@@ -10,7 +10,7 @@ from typing import Protocol
 
 import numpy as np
 
-from gripmon.records import Array
+from gripmon.model.records import Array
 
 _WIDEST_RAD = math.radians(89.0)  # beyond it x/z is no useful coordinate
 _TABLE_SIZE = 2048

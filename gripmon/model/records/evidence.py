@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gripmon.records.values import Array
+from gripmon.model.records.values import Array
 
 if TYPE_CHECKING:
     import numpy as np

@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.gripper.core import Gripper
-from gripmon.gripper.model import GripperError, GripperModel
+from gripmon.model.gripper.core import Gripper
+from gripmon.model.gripper.model import GripperError, GripperModel
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types

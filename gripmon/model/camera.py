@@ -18,8 +18,8 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from gripmon.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
-from gripmon.records import Array
+from gripmon.model.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
+from gripmon.model.records import Array
 
 _MIN_DEPTH_M = 1e-6
 _MIN_FOCAL_PX = 10.0

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.provenance import Provenance
+from gripmon.model.provenance import Provenance
 
 Vector = tuple[float, float, float]
 Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]

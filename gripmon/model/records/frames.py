@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.alerts import Alert
-from gripmon.records.references import ReferenceRecord
-from gripmon.records.values import Array, Covariance, Drift, Image, OpenEnum, Protection, Smoothed, Transform
+from gripmon.model.records.alerts import Alert
+from gripmon.model.records.references import ReferenceRecord
+from gripmon.model.records.values import Array, Covariance, Drift, Image, OpenEnum, Protection, Smoothed, Transform
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,7 +1,7 @@
 """The messages by name, and reading one that may come from anybody.
 
 A message says its schema and that one's major version, ``"schema": "gripmon.transform/1"``.  Within a major version
-fields and names (:class:`gripmon.records.values.OpenEnum`) may be added; a reader passes over what it doesn't know.
+fields and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader passes over what it doesn't know.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from typing import TypeVar
 
 import msgspec
 
-from gripmon.records.commands import CommandError, CommandReply, CommandRequest
-from gripmon.records.frames import FrameRecord
-from gripmon.records.laser import LaserPulse, SpotRecord
-from gripmon.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
-from gripmon.records.references import ReferenceRecord
+from gripmon.model.records.commands import CommandError, CommandReply, CommandRequest
+from gripmon.model.records.frames import FrameRecord
+from gripmon.model.records.laser import LaserPulse, SpotRecord
+from gripmon.model.records.messages import AlertRecord, ClockReading, FrameNote, JawReading, StateRecord
+from gripmon.model.records.references import ReferenceRecord
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 

@@ -7,9 +7,9 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from gripmon.records.alerts import Cause, OpenAlert
-from gripmon.records.looks import LookRecord
-from gripmon.records.values import Covariance, Transform
+from gripmon.model.records.alerts import Cause, OpenAlert
+from gripmon.model.records.looks import LookRecord
+from gripmon.model.records.values import Covariance, Transform
 
 
 class ReferenceInputs(msgspec.Struct, frozen=True):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gripmon.records.alerts import AlertKind, Cause, CauseWeight
-from gripmon.records.values import Array
+from gripmon.model.records.alerts import AlertKind, Cause, CauseWeight
+from gripmon.model.records.values import Array
 
 UNEXPLAINED = CauseWeight(Cause.UNKNOWN, 1.0)
 
