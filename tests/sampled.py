@@ -9,10 +9,10 @@ from meters import box_gripper, difference
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.corners import FingertipMeter, MeasurementSettings
-from gripmon.corners.consensus import Consensus, ConsensusSettings, Votes
-from gripmon.corners.prediction import Prediction
-from gripmon.corners.uncertainty import Uncertainty
+from gripmon.track.edges import FingertipMeter, MeasurementSettings
+from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Votes
+from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.uncertainty import Uncertainty
 from gripmon.model.gripper import Gripper
 from gripmon.outlook import EDGE_POINT_SIGMA_PX, ForeseeingMeter
 from gripmon.model.records import Image

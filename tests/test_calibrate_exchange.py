@@ -28,7 +28,7 @@ from gripmon.cli import main
 from gripmon.config import load_config
 from gripmon.config.calibrated import read_camera
 from gripmon.config.yaml_file import as_yaml
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import perturb, to_record
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of

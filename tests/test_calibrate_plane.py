@@ -20,7 +20,7 @@ from gripmon.config import load_config, read_gripper
 from gripmon.config.recorded import from_recorded, to_recorded
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of

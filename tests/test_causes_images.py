@@ -15,7 +15,7 @@ from watched import new_monitor
 
 from gripmon.model.camera import make_camera
 from gripmon.causes import CauseJudge, CauseSettings
-from gripmon.corners import FingertipMeter
+from gripmon.track.edges import FingertipMeter
 from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image
 from gripmon.simulator import Scenario, Simulator

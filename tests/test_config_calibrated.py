@@ -15,7 +15,7 @@ from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.config import ConfigError, load_config
 from gripmon.config.yaml_file import as_yaml, read_yaml
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.model.provenance import provenance_of

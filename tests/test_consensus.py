@@ -8,7 +8,7 @@ from meters import JAW_SIGMA_M, box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
-from gripmon.corners.consensus import (
+from gripmon.track.edges.consensus import (
     Consensus,
     ConsensusSettings,
     Prior,
@@ -19,9 +19,9 @@ from gripmon.corners.consensus import (
     grid_of_starts,
     prior_information,
 )
-from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.corners.profiles import Candidates, profile_offsets_px
-from gripmon.corners.uncertainty import CONTRADICTION, assess, without_one_edge
+from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.profiles import Candidates, profile_offsets_px
+from gripmon.track.edges.uncertainty import CONTRADICTION, assess, without_one_edge
 
 CAMERA, GRIPPER = make_camera(PAPER_LENS), box_gripper()
 SETTINGS = ConsensusSettings()

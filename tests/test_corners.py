@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.corners import Measurement, MeasurementSettings, agreeing_fingers, trace_of
-from gripmon.corners.consensus import ConsensusSettings
-from gripmon.corners.lines import CornerSettings
+from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
+from gripmon.track.edges.consensus import ConsensusSettings
+from gripmon.track.edges.lines import CornerSettings
 from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import CornerFault
 from gripmon.simulator import Simulator, make_scenario

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from simulated import nominal_cam_T_grip
 
-from gripmon.differential import DegenerateGeometry, differential_update, equation_17
+from gripmon.track.differential import DegenerateGeometry, differential_update, equation_17
 
 FOCAL_PX = 962.0
 # The four innermost corners, then one of the outer two: the paper's order of what stays visible.

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf
 
-from gripmon.corners.profiles import (
+from gripmon.track.edges.profiles import (
     Candidates,
     EdgeSettings,
     estimate_noise,

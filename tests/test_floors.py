@@ -50,7 +50,7 @@ HEAVY = (
 
 
 def room_of(path: Path) -> str:
-    """``gripmon/corners/fit.py`` -> ``corners``; the package's own ``__init__`` -> ``gripmon``."""
+    """``gripmon/track/edges/fit.py`` -> ``corners``; the package's own ``__init__`` -> ``gripmon``."""
     parts = path.relative_to(PACKAGE).with_suffix("").parts
     return "gripmon" if parts == ("__init__",) else parts[0]
 

@@ -12,7 +12,7 @@ from golden_images import FOLDER, SCENES, load, simulator
 from meters import EVERYWHERE, USUAL_SHARE, difference
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 
 NAMES = sorted(SCENES)
 

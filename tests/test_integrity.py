@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gripmon.integrity import Doubts, Hypotheses, Separation, bounds, hypotheses_of, separate
-from gripmon.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
-from gripmon.integrity.quantiles import Tails
-from gripmon.integrity.separation import NEAR
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, bounds, hypotheses_of, separate
+from gripmon.track.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
+from gripmon.track.integrity.quantiles import Tails
+from gripmon.track.integrity.separation import NEAR
 
 # --- quantiles ---
 

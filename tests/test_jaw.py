@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.jaw import CONTRADICTION, SYSTEMATIC_M, Fused, JawKnowledge
+from gripmon.track.jaw import CONTRADICTION, SYSTEMATIC_M, Fused, JawKnowledge
 
 SIGMA_M, OFFSET_SIGMA_M = 5e-5, 2e-4
 Z_BY_JAW = -3.2  # what an error of the opening does to the distance, as with the box fingers

@@ -11,8 +11,8 @@ from simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, load_gripper
-from gripmon.look import GripperLook, LookAgreement, LookRefused
-from gripmon.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
+from gripmon.track.look import GripperLook, LookAgreement, LookRefused
+from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
 from gripmon.model.records import LookRecord
 from gripmon.simulator import Scenario, Simulator
 from gripmon.simulator.scenario import (

@@ -11,8 +11,8 @@ from sampled import OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import LensSettings
-from gripmon.corners import Measurement
-from gripmon.differential import differential_update
+from gripmon.track.edges import Measurement
+from gripmon.track.differential import differential_update
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.recalibrate import recalibrate

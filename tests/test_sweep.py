@@ -14,7 +14,7 @@ from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 from watched import reference_of
 
 from gripmon.model.camera import make_camera
-from gripmon.corners.prediction import lay_out
+from gripmon.track.edges.prediction import lay_out
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.outlook import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal

@@ -8,9 +8,9 @@ from meters import box_gripper, moved
 from simulated import nominal_cam_T_grip
 from taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
 
-from gripmon.corners.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.corners.profiles import profile_offsets_px
-from gripmon.corners.taught import TaughtEdge, TaughtEdges, sight_axes
+from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulator.solids import finger_solids
 from gripmon.teaching.lines import EdgePoints, find_line, settle_line

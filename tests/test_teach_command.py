@@ -24,8 +24,8 @@ from gripmon.cli import main
 from gripmon.config import ConfigError, builtin_config, load_config
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import read_yaml
-from gripmon.corners import TaughtModel
-from gripmon.corners.taught import TaughtEdge, gripper_digest
+from gripmon.track.edges import TaughtModel
+from gripmon.track.edges.taught import TaughtEdge, gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.teaching.document import to_yaml

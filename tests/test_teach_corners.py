@@ -21,7 +21,7 @@ from gripmon.config import Settings, builtin_config, load_config
 from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
 from gripmon.config.yaml_file import as_yaml, read_yaml
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings

@@ -22,7 +22,7 @@ from taught_scenes import (
     taught_from,
 )
 
-from gripmon.corners.taught import sight_axes
+from gripmon.track.edges.taught import sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulator.solids import finger_solids
 from gripmon.teaching import TeachingRefused

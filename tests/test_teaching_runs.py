@@ -14,7 +14,7 @@ from test_teaching import silhouette_offsets_m
 from watched import pose_of, reference_of
 
 from gripmon.config import builtin_config, load_config
-from gripmon.corners import MeasurementSettings, TaughtEdges
+from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.recalibrate import RecalibrationSettings

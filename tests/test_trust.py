@@ -17,7 +17,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import Watched, new_monitor, reference_of, watch
 
 from gripmon.model.camera import make_camera
-from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.model.geometry import perturb
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity

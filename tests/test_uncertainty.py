@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from test_consensus import EDGES, NO_FLOORS, PREDICTION, PRIOR, REPORTED, SAMPLES, XI, candidates, votes_for
 
-from gripmon.corners.consensus import agree
-from gripmon.corners.uncertainty import assess
+from gripmon.track.edges.consensus import agree
+from gripmon.track.edges.uncertainty import assess
 
 EDGE, STRETCH = PREDICTION.layout.edge, PREDICTION.layout.stretch
 NO_JAW = XI * [1, 1, 1, 1, 1, 1, 0]

@@ -17,7 +17,7 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.config.checks import FEWEST_CORNERS_IN_VIEW
-from gripmon.corners.prediction import CORNER_MARGIN_PX, lay_out
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import FEWEST_CORNERS, Rig, behind_another_finger, border, freedom, moved_camera, over_jaw, see

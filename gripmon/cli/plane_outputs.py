@@ -18,7 +18,7 @@ from gripmon.calibration.sighting import CalibrationError
 from gripmon.calibration.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperError, GripperModel
 from gripmon.onboarding import KnownGripper, Look, UnknownGripper

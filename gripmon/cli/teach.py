@@ -16,8 +16,8 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.corners import TaughtModel
-    from gripmon.corners.taught import TaughtEdge
+    from gripmon.track.edges import TaughtModel
+    from gripmon.track.edges.taught import TaughtEdge
     from gripmon.model.records import Image
     from gripmon.teaching import Taught
 
@@ -260,8 +260,8 @@ def _check_different(inputs: list[_Input]) -> None:
 def _model(config: Config, taught: Taught, inputs: list[_Input], arguments: argparse.Namespace) -> TaughtModel:
     from datetime import UTC, datetime
 
-    from gripmon.corners import TaughtModel
-    from gripmon.corners.taught import Provenance, TaughtImage, identity
+    from gripmon.track.edges import TaughtModel
+    from gripmon.track.edges.taught import Provenance, TaughtImage, identity
 
     camera, gripper, reference = identity(
         config.camera, config.gripper, config.reference.reference_id, config.cam_T_grip
@@ -304,7 +304,7 @@ def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
     import cv2
 
     from gripmon.model.atomic import write_atomically
-    from gripmon.corners import TaughtEdges
+    from gripmon.track.edges import TaughtEdges
     from gripmon.teaching.picture import draw
 
     picture = draw(

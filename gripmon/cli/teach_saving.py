@@ -13,7 +13,7 @@ from gripmon import __version__
 
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
-    from gripmon.corners import TaughtModel
+    from gripmon.track.edges import TaughtModel
     from gripmon.model.records import ReferenceRecord
     from gripmon.teaching import Taught
     from gripmon.teaching.bench import Found
@@ -162,8 +162,8 @@ class FileSaving:
     ) -> TaughtModel:
         from datetime import UTC, datetime
 
-        from gripmon.corners import TaughtModel
-        from gripmon.corners.taught import Provenance, TaughtImage, identity
+        from gripmon.track.edges import TaughtModel
+        from gripmon.track.edges.taught import Provenance, TaughtImage, identity
         from gripmon.model.geometry import from_record
 
         bench, names = self._inputs.bench, iter(files)

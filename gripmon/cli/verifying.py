@@ -47,7 +47,7 @@ def measured(first: Calibrated, arguments: argparse.Namespace, warnings: list[st
 
 def _config(first: Calibrated, arguments: argparse.Namespace) -> Config:
     """The configuration, which has to be of the same camera and gripper."""
-    from gripmon.corners.taught import gripper_digest
+    from gripmon.track.edges.taught import gripper_digest
 
     if arguments.config is None:
         raise common.CommandFailedError(

@@ -24,8 +24,8 @@ from gripmon.config.session import joined_or_fault
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
-from gripmon.corners import TaughtEdges, TaughtModel
-from gripmon.corners.taught import mismatch
+from gripmon.track.edges import TaughtEdges, TaughtModel
+from gripmon.track.edges.taught import mismatch
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
 from gripmon.model.records import Array, ReferenceRecord, to_json

@@ -13,7 +13,7 @@ from gripmon.model.camera import LensSettings
 from gripmon.config.errors import ConfigError
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
-from gripmon.corners.taught import gripper_digest
+from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.gripper import Gripper
 
 _T = TypeVar("_T")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.integrity import Doubts, Hypotheses
+from gripmon.track.integrity import Doubts, Hypotheses
 from gripmon.monitor.refits import INFLATION, Refits, of_fingers
 from gripmon.model.records import Array
 from gripmon.smoothing import LEAST_KEPT, MOST_SCATTER

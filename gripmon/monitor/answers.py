@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners import Measurement
+from gripmon.track.edges import Measurement
 from gripmon.model.geometry import invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.monitor.trust import Standing

@@ -12,7 +12,7 @@ import numpy as np
 
 from gripmon.model.camera import Camera
 from gripmon.causes import CauseJudge, Watches
-from gripmon.corners import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
+from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 from gripmon.drift import Baseline, MotionWatch
 from gripmon.model.geometry import from_record, perturbation_between, to_record
 from gripmon.model.gripper import Gripper

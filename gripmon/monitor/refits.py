@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.integrity import Doubts, Hypotheses, Separation, separate
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, separate
 from gripmon.model.records import Array, Protection
 
 INFLATION = 1.2

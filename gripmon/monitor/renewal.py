@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from gripmon.corners import Measurement, edge_sums
+from gripmon.track.edges import Measurement, edge_sums
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.causes import CauseSettings
-from gripmon.corners import MeasurementSettings
+from gripmon.track.edges import MeasurementSettings
 from gripmon.drift import DriftSettings
 from gripmon.policy import PolicySettings
 from gripmon.recalibrate import RecalibrationSettings

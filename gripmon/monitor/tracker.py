@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.differential import DegenerateGeometry, Update, differential_update
+from gripmon.track.edges import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.track.differential import DegenerateGeometry, Update, differential_update
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper
-from gripmon.jaw import JawKnowledge
+from gripmon.track.jaw import JawKnowledge
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.model.records import Array, EdgeEvidence, Frame
 

@@ -12,10 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners import Measurement
+from gripmon.track.edges import Measurement
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.look import GripperLook, LookRefused
+from gripmon.track.look import GripperLook, LookRefused
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners import FingerEndsSeen, Measurement
+from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
 from gripmon.monitor.settings import MonitorSettings

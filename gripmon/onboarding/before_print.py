@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gripmon.corners.profiles import read_profiles
+from gripmon.track.edges.profiles import read_profiles
 from gripmon.onboarding.plate_print import PlatePrint
 from gripmon.model.records import Array, Image
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.corners.consensus import ConsensusSettings
-from gripmon.corners.prediction import STRETCH
+from gripmon.track.edges.consensus import ConsensusSettings
+from gripmon.track.edges.prediction import STRETCH
 from gripmon.model.records import Array
 from gripmon.teaching.lines import EdgePoints, Line
 

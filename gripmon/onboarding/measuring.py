@@ -12,7 +12,7 @@ from gripmon.calibration.plane import FingerCorners
 from gripmon.calibration.plane_equations import FEWEST_CORNERS, stand
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.model.camera import Camera
-from gripmon.corners import FingertipMeter, MeasurementSettings, Patience
+from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 from gripmon.model.gripper import Gripper
 from gripmon.onboarding.outlines import Outline
 from gripmon.onboarding.plate_print import PlatePrint

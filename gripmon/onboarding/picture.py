@@ -9,7 +9,7 @@ import numpy as np
 
 from gripmon.calibration.plane import Coincidence
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.corners.profiles import full_scale
+from gripmon.track.edges.profiles import full_scale
 from gripmon.model.records import Array, Image
 
 _WIDTH_PX = 1400

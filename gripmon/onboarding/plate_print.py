@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from gripmon.calibration.sighting import Sighting
 from gripmon.calibration.targets import Charuco, Chequerboard, Target
 from gripmon.model.camera import Camera
-from gripmon.corners.profiles import read_profiles
+from gripmon.track.edges.profiles import read_profiles
 from gripmon.model.records import Array, Image
 
 _BESIDE = 0.1

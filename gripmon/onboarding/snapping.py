@@ -12,8 +12,8 @@ import numpy as np
 
 from gripmon.calibration.sighting import CalibrationError
 from gripmon.model.camera import Camera
-from gripmon.corners.prediction import ROWS
-from gripmon.corners.profiles import (
+from gripmon.track.edges.prediction import ROWS
+from gripmon.track.edges.profiles import (
     EdgeSettings,
     estimate_noise,
     find_candidates,

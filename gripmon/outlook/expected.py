@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners import FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.corners.consensus import Consensus, Votes
-from gripmon.corners.prediction import Prediction
-from gripmon.corners.profiles import Candidates
-from gripmon.corners.uncertainty import Uncertainty, assess
+from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Candidates
+from gripmon.track.edges.uncertainty import Uncertainty, assess
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners import TaughtEdges
-from gripmon.corners.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
+from gripmon.track.edges import TaughtEdges
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners import TaughtEdges
+from gripmon.track.edges import TaughtEdges
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings

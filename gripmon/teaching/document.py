@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.corners.taught import TaughtModel
+from gripmon.track.edges.taught import TaughtModel
 
 _HEADER = """\
 # Taught model: written by gripmon teach, named by `taught:` in a configuration.  Not to be edited: teach again.

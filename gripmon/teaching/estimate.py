@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from gripmon.corners.taught import TaughtEdge, sight_axes
+from gripmon.track.edges.taught import TaughtEdge, sight_axes
 from gripmon.model.records import Array
 from gripmon.teaching.lines import Line
 from gripmon.teaching.pooling import Pooled, pool

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import STRETCH
+from gripmon.track.edges.prediction import STRETCH
 from gripmon.model.records import Array
 
 _TUKEY = 4.685

@@ -8,9 +8,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import STEP_PX
-from gripmon.corners.profiles import full_scale
-from gripmon.corners.taught import Look
+from gripmon.track.edges.prediction import STEP_PX
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import Look
 from gripmon.model.records import Array
 from gripmon.teaching.estimate import EdgeLines
 from gripmon.teaching.views import View, Viewer

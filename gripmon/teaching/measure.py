@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners import Measurement, MeasurementSettings
-from gripmon.corners.taught import TaughtCorner, TaughtEdge, TaughtEdges
+from gripmon.track.edges import Measurement, MeasurementSettings
+from gripmon.track.edges.taught import TaughtCorner, TaughtEdge, TaughtEdges
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners.profiles import full_scale
-from gripmon.corners.taught import TaughtEdges, TaughtModel
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.teaching.views import TeachingImage

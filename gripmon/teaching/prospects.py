@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gripmon.model.camera import Camera
-from gripmon.corners import TaughtEdges
+from gripmon.track.edges import TaughtEdges
 from gripmon.drift import foresee
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.corners.settling import ZOOMS, Expected
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.settling import ZOOMS, Expected
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image

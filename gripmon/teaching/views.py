@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.corners.prediction import EdgeLayout, Prediction, lay_out, predict
-from gripmon.corners.profiles import (
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
+from gripmon.track.edges.profiles import (
     Candidates,
     estimate_noise,
     find_candidates,
@@ -23,7 +23,7 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.corners.taught import TaughtEdge, TaughtEdges, sight_axes
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, ReferenceRecord

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from benchmarks import rendered
 from gripmon.model.camera import Camera
 from gripmon.config import builtin_config, load_config
-from gripmon.corners import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.corners.prediction import SamplingSettings
-from gripmon.differential import DegenerateGeometry, differential_update
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.prediction import SamplingSettings
+from gripmon.track.differential import DegenerateGeometry, differential_update
 from gripmon.model.geometry import from_record, invert, perturb
 from gripmon.model.gripper import Gripper
 from gripmon.recalibrate import RecalibrationRefused, recalibrate

@@ -22,7 +22,7 @@ from benchmarks.conditions import Condition, Draw, scenario
 from benchmarks.machine import ROOT
 from benchmarks.tags import FingerTags
 from gripmon.model.camera import Camera, PaperLens, make_camera
-from gripmon.corners import MeasurementSettings, TaughtEdges
+from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gripmon.corners.settling
+import gripmon.track.edges.settling
 import gripmon.monitor.core
-from gripmon.corners import FingertipMeter
+from gripmon.track.edges import FingertipMeter
 from gripmon.drift import MotionWatch
 from gripmon.monitor import Monitor, Tracker
 from gripmon.monitor.asking import Inquiry
@@ -27,11 +27,11 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "predict": ((FingertipMeter, "_predicted"),),
     "sample profiles, find candidates": ((FingertipMeter, "_look"),),
     "joint fit": (
-        (gripmon.corners.settling, "agree"),
-        (gripmon.corners.settling, "assess"),
+        (gripmon.track.edges.settling, "agree"),
+        (gripmon.track.edges.settling, "assess"),
         (FingertipMeter, "measure"),
     ),
-    "corners": ((gripmon.corners.settling, "intersect_edges"),),
+    "corners": ((gripmon.track.edges.settling, "intersect_edges"),),
     "look at the stream": ((StreamWatch, "add"),),
     "drift test": ((MotionWatch, "add"),),
     "causes": ((Inquiry, "ponder"),),

@@ -26,7 +26,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera, LensSettings
-from gripmon.corners.profiles import EdgeSettings
+from gripmon.track.edges.profiles import EdgeSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.records import Array, Transform

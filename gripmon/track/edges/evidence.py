@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.consensus import Consensus, Prior, Votes, agree
-from gripmon.corners.ends import FingerEnds
-from gripmon.corners.lines import CornerGeometry, intersect_edges
-from gripmon.corners.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
+from gripmon.track.edges.consensus import Consensus, Prior, Votes, agree
+from gripmon.track.edges.ends import FingerEnds
+from gripmon.track.edges.lines import CornerGeometry, intersect_edges
+from gripmon.track.edges.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array, EdgeEvidence, Image
 

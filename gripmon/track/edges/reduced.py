@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners.profiles import GREY_BGR
+from gripmon.track.edges.profiles import GREY_BGR
 from gripmon.model.records import Array, Image
 
 Floats = NDArray[np.float32]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners.reduced import (
+from gripmon.track.edges.reduced import (
     LEVELS,
     ORIENTATIONS,
     Floats,

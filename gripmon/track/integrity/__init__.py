@@ -1,7 +1,7 @@
 """What may be promised of a transform: bounds on its error under everything that may be wrong, at a stated risk."""
 
-from gripmon.integrity.hypotheses import Hypotheses, hypotheses_of
-from gripmon.integrity.quantiles import bounds
-from gripmon.integrity.separation import Doubts, Separation, separate
+from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
+from gripmon.track.integrity.quantiles import bounds
+from gripmon.track.integrity.separation import Doubts, Separation, separate
 
 __all__ = ["Doubts", "Hypotheses", "Separation", "bounds", "hypotheses_of", "separate"]

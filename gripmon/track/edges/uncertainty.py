@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from gripmon.corners.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
+from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
 from gripmon.model.records import Array
 
 CONTRADICTION = 3.0

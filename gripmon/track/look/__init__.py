@@ -1,6 +1,6 @@
 """The gripper's own learned look: a second witness of where it is, which fails in other ways than its edges."""
 
-from gripmon.look.agreement import LookAgreement
-from gripmon.look.core import GripperLook, LookRefused
+from gripmon.track.look.agreement import LookAgreement
+from gripmon.track.look.core import GripperLook, LookRefused
 
 __all__ = ["GripperLook", "LookAgreement", "LookRefused"]

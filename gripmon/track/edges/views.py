@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.corners.settling import Measurement
+from gripmon.track.edges.settling import Measurement
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import MeasurementTrace
 

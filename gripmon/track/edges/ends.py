@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import STEP_PX, Prediction
-from gripmon.corners.profiles import EdgeSettings, find_candidates, read_profiles
-from gripmon.corners.settling import Measurement
+from gripmon.track.edges.prediction import STEP_PX, Prediction
+from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
+from gripmon.track.edges.settling import Measurement
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Image
 

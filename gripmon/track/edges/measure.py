@@ -12,18 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.corners.consensus import (
+from gripmon.track.edges.consensus import (
     Consensus,
     agree,
     agree_from_grid,
     grid_of_starts,
 )
-from gripmon.corners.ends import FingerEndsSeen
-from gripmon.corners.evidence import FingerMeter
-from gripmon.corners.look import unevenness
-from gripmon.corners.prediction import EdgeLayout, Prediction
-from gripmon.corners.search import search_poses
-from gripmon.corners.settling import ZOOMS, Effort, Expected, Measurement
+from gripmon.track.edges.ends import FingerEndsSeen
+from gripmon.track.edges.evidence import FingerMeter
+from gripmon.track.edges.look import unevenness
+from gripmon.track.edges.prediction import EdgeLayout, Prediction
+from gripmon.track.edges.search import search_poses
+from gripmon.track.edges.settling import ZOOMS, Effort, Expected, Measurement
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from gripmon.corners.prediction import STEP_PX, Prediction
-from gripmon.corners.profiles import read_profiles
+from gripmon.track.edges.prediction import STEP_PX, Prediction
+from gripmon.track.edges.profiles import read_profiles
 from gripmon.model.records import Image
 
 BESIDE_PX = (2.0, 5.0)

@@ -17,8 +17,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from gripmon.corners.prediction import Prediction
-from gripmon.corners.profiles import Candidates
+from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Candidates
 from gripmon.model.records import Array
 
 

@@ -22,7 +22,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 
 if TYPE_CHECKING:
-    from gripmon.corners.taught import TaughtEdges
+    from gripmon.track.edges.taught import TaughtEdges
 
 
 class SamplingSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -17,8 +17,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.corners.prediction import STEP_PX, Prediction
-from gripmon.corners.saturation import SPREAD, doubt
+from gripmon.track.edges.prediction import STEP_PX, Prediction
+from gripmon.track.edges.saturation import SPREAD, doubt
 from gripmon.model.records import Array, Image
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)

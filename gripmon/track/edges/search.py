@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.corners.hypotheses import (
+from gripmon.track.edges.hypotheses import (
     MapScore,
     OutlinePoints,
     Poses,
@@ -28,7 +28,7 @@ from gripmon.corners.hypotheses import (
     project,
     rotations,
 )
-from gripmon.corners.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
+from gripmon.track.edges.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.model.camera import Camera
-from gripmon.corners.consensus import (
+from gripmon.track.edges.consensus import (
     AGAIN_PX,
     Consensus,
     ConsensusSettings,
@@ -23,9 +23,9 @@ from gripmon.corners.consensus import (
     base_weights,
     prior_information,
 )
-from gripmon.corners.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
-from gripmon.corners.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
-from gripmon.corners.profiles import (
+from gripmon.track.edges.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
+from gripmon.track.edges.prediction import EdgeLayout, Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.profiles import (
     Candidates,
     EdgeSettings,
     cut_off_spread,
@@ -36,9 +36,9 @@ from gripmon.corners.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.corners.search import SearchSettings
-from gripmon.corners.taught import TaughtEdges
-from gripmon.corners.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
+from gripmon.track.edges.search import SearchSettings
+from gripmon.track.edges.taught import TaughtEdges
+from gripmon.track.edges.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image

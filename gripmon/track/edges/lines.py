@@ -16,8 +16,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.corners.consensus import Consensus, Votes
-from gripmon.corners.prediction import Prediction
+from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.prediction import Prediction
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.integrity.quantiles import Tails
+from gripmon.track.integrity.quantiles import Tails
 from gripmon.model.records import Array
 
 NEAR = 1.02

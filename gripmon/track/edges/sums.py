@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.corners.settling import Measurement
+from gripmon.track.edges.settling import Measurement
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeSums

@@ -1,0 +1,28 @@
+"""Fingertip corners from images: predicted edges, sub-pixel candidates, one joint fit, intersections."""
+
+from gripmon.track.edges.consensus import prior_information
+from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen
+from gripmon.track.edges.measure import FingertipMeter, Patience
+from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
+from gripmon.track.edges.sums import edge_sums
+from gripmon.track.edges.taught import TaughtEdges, TaughtModel
+from gripmon.track.edges.uncertainty import NormalEquations
+from gripmon.track.edges.views import agreeing_fingers, trace_of
+
+__all__ = [
+    "JAW_UNREPORTED_SIGMA_M",
+    "Effort",
+    "FingerEnds",
+    "FingerEndsSeen",
+    "FingertipMeter",
+    "Measurement",
+    "MeasurementSettings",
+    "NormalEquations",
+    "Patience",
+    "TaughtEdges",
+    "TaughtModel",
+    "agreeing_fingers",
+    "edge_sums",
+    "prior_information",
+    "trace_of",
+]
