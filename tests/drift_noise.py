@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.drift import Finding, SequentialTest
+from gripmon.judge.drift import Finding, SequentialTest
 from gripmon.model.records import Array
 
 SIGMA = np.array([5e-6, 4e-6, 2e-5, 3e-4, 3e-4, 1e-4])

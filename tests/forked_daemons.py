@@ -18,7 +18,7 @@ if __name__ == "__main__":
     import gripmon.daemon
     import gripmon.monitor
     import gripmon.publish
-    import gripmon.statefile  # noqa: F401
+    import gripmon.judge.statefile  # noqa: F401
 
     cv2.setNumThreads(1)
     for _ in sys.stdin:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gripmon.policy import Evidence, Judgement, Policy, PolicySettings
+from gripmon.judge.policy import Evidence, Judgement, Policy, PolicySettings
 from gripmon.model.records import (
     Alert,
     AlertEvent,

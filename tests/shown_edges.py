@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import Camera, LensSettings, make_camera
-from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Cause, EdgeEvidence
 

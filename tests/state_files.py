@@ -16,7 +16,7 @@ from gripmon.model.records import (
     Severity,
     Transform,
 )
-from gripmon.statefile import (
+from gripmon.judge.statefile import (
     Calibration,
     Owner,
     StateFile,

@@ -8,7 +8,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule
 
-from gripmon.policy import AlertBook
+from gripmon.judge.policy import AlertBook
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, OpenAlert, Severity
 
 UPDATE_S, CLEAR_S = 2.0, 1.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.drift import Baseline
+from gripmon.judge.drift import Baseline
 
 REFERENCE_SIGMA = np.array([2e-4] * 3 + [2e-3] * 3)
 

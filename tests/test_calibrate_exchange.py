@@ -34,7 +34,7 @@ from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.records import Cause, MonitorState, ReferenceRecord, to_json
 from gripmon.simulator.scenario import Sensor
-from gripmon.statefile import Calibration, Owner, pack
+from gripmon.judge.statefile import Calibration, Owner, pack
 
 TRUE = nominal_cam_T_grip()
 BROWN = BrownConradyLens(

@@ -14,7 +14,7 @@ from shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_see
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.model.camera import LensSettings, PaperLens, make_camera
-from gripmon.causes import CauseSettings
+from gripmon.judge.causes import CauseSettings
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Cause
 

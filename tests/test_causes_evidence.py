@@ -13,9 +13,9 @@ from shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocke
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.model.camera import LensSettings
-from gripmon.causes.pooling import pool
-from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
-from gripmon.causes.weighing import FREEDOM, Errors, Model, weigh
+from gripmon.judge.causes.pooling import pool
+from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
+from gripmon.judge.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Cause
 

@@ -14,7 +14,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import new_monitor
 
 from gripmon.model.camera import make_camera
-from gripmon.causes import CauseJudge, CauseSettings
+from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.track.edges import FingertipMeter
 from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from shown_edges import OPENING_M
 
-from gripmon.causes import BlurWatch, FingerWatch, JawWatch, ResidualWatch
+from gripmon.judge.causes import BlurWatch, FingerWatch, JawWatch, ResidualWatch
 
 
 def test_a_blur_that_stays_as_it_is_is_no_news_and_another_one_is():

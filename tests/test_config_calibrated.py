@@ -19,7 +19,7 @@ from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.model.provenance import provenance_of
-from gripmon.statefile import calibration_of
+from gripmon.judge.statefile import calibration_of
 
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"
 COVARIANCE = tuple(np.diag([1e-10] * 3 + [1e-8] * 3).ravel().tolist())

@@ -112,7 +112,7 @@ def test_every_import_points_downward():
     [
         ("geometry", "from gripmon.model.records import Array", 0),
         ("geometry", "from gripmon import monitor", 1),
-        ("corners", "import gripmon.policy", 1),
+        ("corners", "import gripmon.judge.policy", 1),
         ("corners", "def f():\n    from gripmon.daemon import run", 1),
         ("monitor", "import zenoh", 1),
         ("publish", "import zenoh", 0),

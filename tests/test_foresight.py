@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from drift_noise import COVARIANCE
 
-from gripmon.drift import CORRELATION_FRAMES, DriftSettings, SequentialTest, foresee
-from gripmon.drift.foresight import _variance_of_means
+from gripmon.judge.drift import CORRELATION_FRAMES, DriftSettings, SequentialTest, foresee
+from gripmon.judge.drift.foresight import _variance_of_means
 
 SETTINGS = DriftSettings()
 

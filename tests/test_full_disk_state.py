@@ -21,7 +21,7 @@ from watched import frames_of, reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertEvent, AlertKind, CommandReply, Origin, ReferenceRecord, from_json
 
 KNOCKED = {

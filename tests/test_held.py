@@ -15,7 +15,7 @@ from watched import pose_of, reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.policy import PolicySettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict
 from gripmon.simulator.scenario import Sensor
 

@@ -14,7 +14,7 @@ from remote_monitor import remote_monitor
 from gripmon.cli import main
 from gripmon.client import Policy, TransformClient
 from gripmon.config import builtin_config
-from gripmon.policy import PolicySettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "integrity.md"

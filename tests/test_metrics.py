@@ -36,7 +36,7 @@ from test_run_on_the_network import PREFIX, configured, refused, running
 
 from gripmon.cli import main
 from gripmon.metrics import LATENCY_BOUNDS_S, MetricsError, MetricsServer, MetricsSettings
-from gripmon.policy import PolicySettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import AlertEvent, Severity, State, StateRecord, Verdict
 
 ROOT = Path(__file__).resolve().parent.parent

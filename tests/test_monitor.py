@@ -13,8 +13,8 @@ from watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, 
 
 from gripmon.model.geometry import invert
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.policy import PolicySettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.policy import PolicySettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
 
 MICROMETRES = 1e-6

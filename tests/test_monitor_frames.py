@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, replaced
 
-from gripmon.causes import CauseJudge
+from gripmon.judge.causes import CauseJudge
 from gripmon.model.records import AlertKind, Cause, Verdict, to_json
 
 

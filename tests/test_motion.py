@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drift_noise import COVARIANCE, SIGMA, autocorrelated, white
 
-from gripmon.drift import DriftSettings, MotionWatch
+from gripmon.judge.drift import DriftSettings, MotionWatch
 from gripmon.model.records import AlertKind, Motion
 
 FPS = 60.0

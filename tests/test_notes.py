@@ -11,7 +11,7 @@ import pytest
 from drift_noise import COVARIANCE, SIGMA, white
 from watched import frames_of, new_monitor
 
-from gripmon.drift import DriftSettings, MotionWatch, SequentialTest
+from gripmon.judge.drift import DriftSettings, MotionWatch, SequentialTest
 from gripmon.model.records import Frame, Limits
 
 PLAIN = DriftSettings(tolerated_m=0.0, tolerated_rad=0.0)

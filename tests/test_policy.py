@@ -28,7 +28,7 @@ from policy_runs import (
     told,
 )
 
-from gripmon.policy import Evidence
+from gripmon.judge.policy import Evidence
 from gripmon.model.records import AlertEvent, AlertKind, Cause, State, Verdict, Vibration
 
 K = AlertKind

@@ -24,7 +24,7 @@ from policy_runs import (
     settled,
 )
 
-from gripmon.policy import Policy, PolicySettings
+from gripmon.judge.policy import Policy, PolicySettings
 from gripmon.model.records import AlertKind, Cause, Protection, Verdict
 
 K = AlertKind

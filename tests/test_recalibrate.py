@@ -9,7 +9,7 @@ from box_models import random_rotation
 from scipy.spatial.transform import Rotation
 from simulated import nominal_cam_T_grip
 
-from gripmon.recalibrate import RecalibrationRefused, recalibrate, rivals, solutions
+from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, rivals, solutions
 
 FOCAL_PX = 962.0
 PLANE_GRIP_M = np.array(

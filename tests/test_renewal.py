@@ -11,9 +11,9 @@ from watched import reference_of
 
 from gripmon.monitor import MonitorSettings
 from gripmon.monitor.renewal import Renewal
-from gripmon.policy import Policy
-from gripmon.recalibrate import Proposal, Refusal
-from gripmon.recalibrate.recalibrator import RefusalReason
+from gripmon.judge.policy import Policy
+from gripmon.judge.recalibrate import Proposal, Refusal
+from gripmon.judge.recalibrate.recalibrator import RefusalReason
 from gripmon.model.records import (
     Alert,
     AlertEvent,

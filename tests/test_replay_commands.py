@@ -20,7 +20,7 @@ from network_daemon import ENVIRONMENT
 from replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.config import builtin_config
-from gripmon.statefile import unpack
+from gripmon.judge.statefile import unpack
 
 PREFIX = "gripmon/demo/wrist"
 

@@ -38,7 +38,7 @@ from gripmon.model.records import (
     Severity,
     Verdict,
 )
-from gripmon.references import ReferenceBook
+from gripmon.judge.references import ReferenceBook
 
 HERE = Path(__file__).resolve().parent
 ROBOT = "gripmon/demo/wrist"

@@ -15,7 +15,7 @@ from gripmon.track.edges import Measurement
 from gripmon.track.differential import differential_update
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, load_gripper
-from gripmon.recalibrate import recalibrate
+from gripmon.judge.recalibrate import recalibrate
 
 SAMPLES = 200
 ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")

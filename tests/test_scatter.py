@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from drift_noise import COVARIANCE, autocorrelated, claimed
 
-from gripmon.drift.scatter import PRIOR_SHARE, PRIOR_WINDOWS, Scatter
-from gripmon.drift.windows import LENGTHS, Windows
+from gripmon.judge.drift.scatter import PRIOR_SHARE, PRIOR_WINDOWS, Scatter
+from gripmon.judge.drift.windows import LENGTHS, Windows
 
 FRAMES, STREAMS = 12_000, 24
 NO_MORE = np.ones((len(LENGTHS), STREAMS))

@@ -9,7 +9,7 @@ import pytest
 from drift_noise import COVARIANCE, SIGMA, autocorrelated, claimed, feed, vibrating, white
 from scipy import stats
 
-from gripmon.drift import DriftSettings, SequentialTest
+from gripmon.judge.drift import DriftSettings, SequentialTest
 
 PLAIN = DriftSettings(tolerated_m=0.0, tolerated_rad=0.0)
 NOISES = {"white": white, "autocorrelated": autocorrelated, "vibrating": vibrating}

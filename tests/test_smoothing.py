@@ -14,7 +14,7 @@ from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from gripmon.smoothing import SETTLING, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
+from gripmon.judge.smoothing import SETTLING, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
 
 SETTINGS = SmoothingSettings()
 PERIOD_S = 1.0 / 60.0
@@ -149,7 +149,7 @@ def test_a_covariance_that_is_not_positive_definite_is_refused():
 def test_the_gate_lets_all_but_one_in_a_million_of_honest_measurements_pass():
     from scipy.stats import chi2
 
-    from gripmon.smoothing import GATE
+    from gripmon.judge.smoothing import GATE
 
     assert chi2.sf(GATE, 6) == pytest.approx(1.3e-6, rel=0.1)
 

@@ -24,8 +24,8 @@ from gripmon.model.records import (
     MonitorState,
     Transform,
 )
-from gripmon.references import KEPT, ReferenceBook
-from gripmon.statefile import (
+from gripmon.judge.references import KEPT, ReferenceBook
+from gripmon.judge.statefile import (
     Owner,
     StateFileError,
     calibration_of,

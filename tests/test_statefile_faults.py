@@ -10,7 +10,7 @@ import pytest
 from state_files import DATA, STATE, beside, opened, read_once, state_of, write
 from test_references import broken
 
-from gripmon.statefile import (
+from gripmon.judge.statefile import (
     StateFileError,
     unpack,
 )
@@ -40,7 +40,7 @@ def test_a_folder_without_the_right_to_write_still_gives_its_state(path: Path, m
             raise OSError(errno.EROFS, "Read-only file system")
         return real(name, flags, *rest, **named)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("gripmon.statefile.os.open", read_only)
+    monkeypatch.setattr("gripmon.judge.statefile.os.open", read_only)
     file = opened(path)
     assert file.state == STATE
     assert file.failure == f"state not kept: {path}.lock can't be locked: Read-only file system"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.records import Cause, Frame
-from gripmon.stream import StreamFault, StreamSettings, StreamWatch
+from gripmon.judge.stream import StreamFault, StreamSettings, StreamWatch
 
 FPS = 30.0
 START_NS = 1_700_000_000_000_000_000

@@ -15,9 +15,9 @@ from watched import pose_of, reference_of
 
 from gripmon.config import builtin_config, load_config
 from gripmon.track.edges import MeasurementSettings, TaughtEdges
-from gripmon.drift import DriftSettings
+from gripmon.judge.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import FingerLook, Scenario, Sensor

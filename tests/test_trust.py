@@ -22,8 +22,8 @@ from gripmon.model.geometry import perturb
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import Trust
-from gripmon.policy import PolicySettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.policy import PolicySettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.simulator import FrameTruth, Scenario, Simulator
 from gripmon.simulator.scenario import BentFinger, Bump, ObjectLook, Prop

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from drift_noise import COVARIANCE, SIGMA
 
-from gripmon.drift.vibration import VibrationWatch
+from gripmon.judge.drift.vibration import VibrationWatch
 from gripmon.model.records import Vibration
 
 FPS = 60.0

@@ -13,7 +13,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
 from gripmon.simulator import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulator.scenario import Background, Cover, Creep

@@ -148,7 +148,7 @@ def _configuration(path: Path) -> Calibrated:
 
 
 def _state(path: Path, data: bytes) -> Calibrated:
-    from gripmon.statefile import unpack
+    from gripmon.judge.statefile import unpack
 
     try:
         kept = unpack(data)

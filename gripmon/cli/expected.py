@@ -62,7 +62,7 @@ def _jaw(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> dict[str, 
 
 def _drift(config: Config, outlook: Outlook) -> dict[str, Any]:
     """What the drift test notices, and after how many frames."""
-    from gripmon.drift import CORRELATION_FRAMES, foresee
+    from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 
     settings = config.settings.monitor.drift
     foresight = foresee(outlook.covariance, settings)
@@ -82,7 +82,7 @@ def _recalibration(config: Config, outlook: Outlook) -> dict[str, Any]:
     averaged over frames whose errors last is hardly more certain.
     """
     from gripmon.monitor import CORNER_COUNTS
-    from gripmon.recalibrate import coplanar, refusal
+    from gripmon.judge.recalibrate import coplanar, refusal
 
     gripper, variant = config.gripper, config.settings.monitor.recalibrate_corners
     taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[variant])

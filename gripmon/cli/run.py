@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gripmon.monitor import Monitor
     from gripmon.recording import Recorder
     from gripmon.model.records import Alert, MonitorState
-    from gripmon.statefile import StateFile
+    from gripmon.judge.statefile import StateFile
 
 _log = logging.getLogger(__name__)
 
@@ -200,7 +200,7 @@ def run_daemon(
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     """The file for what survives a restart; None without one."""
     from gripmon.model.records import MonitorState
-    from gripmon.statefile import StateFile, StateFileError
+    from gripmon.judge.statefile import StateFile, StateFileError
 
     path = config.state_path
     if path is None:

@@ -228,7 +228,7 @@ def _faults_of(path: Path) -> Iterator[None]:
 
 def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: int) -> Image:
     """An image that fits the camera, in full scale; anything else ends the command with exit code 2."""
-    from gripmon.inspection import inspect
+    from gripmon.judge.inspection import inspect
     from gripmon.model.pixels import in_full_scale
     from gripmon.model.records import Frame
     from gripmon.sources.folder import read_image

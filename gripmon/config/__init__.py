@@ -31,7 +31,7 @@ from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, Gripper
 from gripmon.model.records import Array, ReferenceRecord, to_json
 from gripmon.ros2 import fault_of as ros2_fault
 from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
-from gripmon.statefile import AUTO, Owner, calibration_of, default_path
+from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.wire import Joining
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from gripmon.monitor import MonitorSettings
 from gripmon.recording import RecordingSettings, ViewSettings
 from gripmon.ros2 import JointOpening, Ros2Settings
 from gripmon.sources import SourceSettings
-from gripmon.statefile import StateSettings
+from gripmon.judge.statefile import StateSettings
 from gripmon.wire import PublishSettings
 
 Name = Annotated[

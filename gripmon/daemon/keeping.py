@@ -16,7 +16,7 @@ _CLOSE_WITHIN_S = 1.0
 
 
 class StateSink(Protocol):
-    """Where states go, e.g. :class:`gripmon.statefile.StateFile`; ``failure`` is empty while all is well."""
+    """Where states go, e.g. :class:`gripmon.judge.statefile.StateFile`; ``failure`` is empty while all is well."""
 
     @property
     def failure(self) -> str: ...

@@ -15,7 +15,7 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest, in_short
 from gripmon.daemon.watch import Judged
-from gripmon.policy import AlertBook
+from gripmon.judge.policy import AlertBook
 from gripmon.publish import SpotPublisher
 from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from gripmon.daemon.drops import Drops
 from gripmon.daemon.settings import DaemonSettings
-from gripmon.policy import AlertBook
+from gripmon.judge.policy import AlertBook
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -4,7 +4,7 @@ all along.
 An edge that has belonged to something else since the first frame bends the average, too, so that the average is kept
 without it as well: each hypothesis has a Kalman filter of its own (a bank of filters, as for solution separation over
 time).  Frames err together before a background that stands still: what their scatter doesn't show stays in the
-average's covariance, as in :mod:`gripmon.smoothing`.
+average's covariance, as in :mod:`gripmon.judge.smoothing`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.track.integrity import Doubts, Hypotheses
 from gripmon.monitor.refits import INFLATION, Refits, of_fingers
 from gripmon.model.records import Array
-from gripmon.smoothing import LEAST_KEPT, MOST_SCATTER
+from gripmon.judge.smoothing import LEAST_KEPT, MOST_SCATTER
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""

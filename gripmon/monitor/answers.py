@@ -9,7 +9,7 @@ from gripmon.track.edges import Measurement
 from gripmon.model.geometry import invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.monitor.trust import Standing
-from gripmon.policy import Evidence, Judgement
+from gripmon.judge.policy import Evidence, Judgement
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -28,8 +28,8 @@ from gripmon.model.records import (
     Severity,
     Smoothed,
 )
-from gripmon.smoothing import PoseAverage
-from gripmon.stream import StreamFault
+from gripmon.judge.smoothing import PoseAverage
+from gripmon.judge.stream import StreamFault
 
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from gripmon.causes import CauseJudge
+from gripmon.judge.causes import CauseJudge
 from gripmon.model.records import Array, EdgeEvidence, Explanation, Frame
 
 CALM_FRAMES, LULL_FRAMES = 30, 3

@@ -11,12 +11,12 @@ import msgspec
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.causes import CauseJudge, Watches
+from gripmon.judge.causes import CauseJudge, Watches
 from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
-from gripmon.drift import Baseline, MotionWatch
+from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.model.geometry import from_record, perturbation_between, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.inspection import inspect
+from gripmon.judge.inspection import inspect
 from gripmon.monitor.answers import (
     after_restart,
     drift_between,
@@ -36,9 +36,9 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.trust import Integrity, Standing
 from gripmon.model.pixels import in_full_scale
-from gripmon.policy import Evidence, Judgement, Policy
-from gripmon.recalibrate import Proposal
-from gripmon.recalibrate import Refusal as Refused
+from gripmon.judge.policy import Evidence, Judgement, Policy
+from gripmon.judge.recalibrate import Proposal
+from gripmon.judge.recalibrate import Refusal as Refused
 from gripmon.model.records import (
     Alert,
     Array,
@@ -61,9 +61,9 @@ from gripmon.model.records import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.references import CommandRefused, Keep
-from gripmon.smoothing import PoseAverage
-from gripmon.stream import StreamFault, StreamWatch
+from gripmon.judge.references import CommandRefused, Keep
+from gripmon.judge.smoothing import PoseAverage
+from gripmon.judge.stream import StreamFault, StreamWatch
 
 RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
 

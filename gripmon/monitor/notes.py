@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.drift import Baseline, MotionWatch
+from gripmon.judge.drift import Baseline, MotionWatch
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.model.records import Array, Limits, MonitorNotes
 from gripmon.model.records.notes import SixNumbers
-from gripmon.smoothing import PoseAverage
+from gripmon.judge.smoothing import PoseAverage
 
 
 class NoteTaker:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gripmon.monitor.renewal import Renewal
-from gripmon.policy import Policy
+from gripmon.judge.policy import Policy
 from gripmon.model.records import Alert, Array, Command, CommandName
-from gripmon.references import CommandRefused
+from gripmon.judge.references import CommandRefused
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +25,7 @@ class Moment:
 def obey(command: Command, policy: Policy, renewal: Renewal, moment: Moment) -> tuple[str, tuple[Alert, ...]]:
     """What was done, in words, and the alerts of it.
 
-    Raises :class:`gripmon.references.CommandRefused`, and nothing has changed then.
+    Raises :class:`gripmon.judge.references.CommandRefused`, and nothing has changed then.
     """
     name, reference = command.name, renewal.book.current
     if name in (CommandName.STATE, CommandName.SNAPSHOT):

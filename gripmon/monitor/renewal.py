@@ -12,8 +12,8 @@ from gripmon.model.gripper import Gripper
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import CORNER_COUNTS
 from gripmon.monitor.trust import Standing
-from gripmon.policy import NO_REFERENCE, Judgement, Policy
-from gripmon.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
+from gripmon.judge.policy import NO_REFERENCE, Judgement, Policy
+from gripmon.judge.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -29,7 +29,7 @@ from gripmon.model.records import (
     Severity,
     State,
 )
-from gripmon.references import CommandRefused, Keep, ReferenceBook
+from gripmon.judge.references import CommandRefused, Keep, ReferenceBook
 
 KEEP_AGAIN_S = 10.0
 """Pause before a reference that could not be kept is measured and tried again: a full disk stays full for a while."""

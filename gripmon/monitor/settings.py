@@ -7,13 +7,13 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.causes import CauseSettings
+from gripmon.judge.causes import CauseSettings
 from gripmon.track.edges import MeasurementSettings
-from gripmon.drift import DriftSettings
-from gripmon.policy import PolicySettings
-from gripmon.recalibrate import RecalibrationSettings
-from gripmon.smoothing import SmoothingSettings
-from gripmon.stream import StreamSettings
+from gripmon.judge.drift import DriftSettings
+from gripmon.judge.policy import PolicySettings
+from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.judge.smoothing import SmoothingSettings
+from gripmon.judge.stream import StreamSettings
 
 
 class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -19,7 +19,7 @@ from gripmon.track.look import GripperLook, LookRefused
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
-from gripmon.policy import past_alert_limit
+from gripmon.judge.policy import past_alert_limit
 from gripmon.model.records import Array, Frame, MonitorState, Protection, ReferenceRecord
 
 PROOF_EVERY = 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from gripmon.policy import PolicySettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
 
 

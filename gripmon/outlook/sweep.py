@@ -10,14 +10,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.drift import DriftSettings, foresee
+from gripmon.judge.drift import DriftSettings, foresee
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.outlook.expected import Foreseen, foresee_frame
 from gripmon.outlook.margins import border, moved_camera, sideways_m
 from gripmon.outlook.mounts import Mount
 from gripmon.outlook.promise import Promise, promise
 from gripmon.outlook.visibility import Rig, Sight, see
-from gripmon.recalibrate import refusal
+from gripmon.judge.recalibrate import refusal
 from gripmon.model.records import Array
 
 OPENINGS = 25

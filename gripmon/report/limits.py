@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.policy import PolicySettings
+from gripmon.judge.policy import PolicySettings
 from gripmon.report.content import Limits
 
 

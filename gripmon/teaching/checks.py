@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gripmon.smoothing import GATE
+from gripmon.judge.smoothing import GATE
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, motion_off
 from gripmon.teaching.lines import find_line
 from gripmon.teaching.views import ImageRefused, TeachingRefused, View, Viewer, sampled

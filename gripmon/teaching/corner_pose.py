@@ -17,7 +17,7 @@ from gripmon.calibration.lens_models import LensModel, parameter_names
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
+from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.records import Array
 from gripmon.teaching.snapping import Snapped
 

@@ -24,7 +24,7 @@ from gripmon.track.edges.taught import TaughtCorner, TaughtEdge, TaughtEdges
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord
-from gripmon.smoothing import GATE
+from gripmon.judge.smoothing import GATE
 from gripmon.teaching.checks import check_edges, check_enough, check_reference, check_standing
 from gripmon.teaching.estimate import SHAPE_M, EdgeLines, estimate_edges
 from gripmon.teaching.lines import find_line, of_image, settle_line

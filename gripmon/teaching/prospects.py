@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from gripmon.model.camera import Camera
 from gripmon.track.edges import TaughtEdges
-from gripmon.drift import foresee
+from gripmon.judge.drift import foresee
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings
 from gripmon.outlook import FEWEST_EDGES, Promise, expect, promise
-from gripmon.recalibrate import refusal
+from gripmon.judge.recalibrate import refusal
 from gripmon.model.records import Array, ReferenceRecord
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from gripmon import __version__
 from gripmon.model.geometry import from_record, rotation_angle
-from gripmon.inspection import inspect
+from gripmon.judge.inspection import inspect
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image
 from gripmon.sources import Source, Waiting

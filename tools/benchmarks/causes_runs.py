@@ -9,10 +9,10 @@ import numpy as np
 from benchmarks.causes_rigs import START_SIGMA
 from benchmarks.causes_trials import Trial
 from gripmon.model.camera import make_camera
-from gripmon.drift import DriftSettings
+from gripmon.judge.drift import DriftSettings
 from gripmon.model.geometry import to_record
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.recalibrate import RecalibrationSettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import Alert, AlertEvent, Cause, ReferenceRecord
 
 

@@ -212,7 +212,7 @@ def live(measured_T: Any, covariance: Any, measured: Any) -> tuple[Any, Any]:
     import numpy as np
 
     from benchmarks.scene import config_for
-    from gripmon.smoothing import PoseAverage
+    from gripmon.judge.smoothing import PoseAverage
 
     average = PoseAverage(config_for((768, 576)).settings.monitor.smoothing)
     smoothed_T, raw_T = np.empty_like(measured_T), measured_T.copy()

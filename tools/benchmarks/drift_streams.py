@@ -12,7 +12,7 @@ import numpy as np
 from scipy import stats
 
 from benchmarks.noise_model import NoiseModel
-from gripmon.drift import DriftSettings, SequentialTest
+from gripmon.judge.drift import DriftSettings, SequentialTest
 
 FRAMES_PER_S = 60.0
 FRAMES_PER_DAY = 86_400.0 * FRAMES_PER_S

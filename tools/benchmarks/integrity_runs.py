@@ -21,7 +21,7 @@ from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.rendered import Rendered
 from gripmon.model.camera import Camera
-from gripmon.drift import DriftSettings
+from gripmon.judge.drift import DriftSettings
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import Monitor, MonitorSettings

@@ -18,7 +18,7 @@ from gripmon.track.edges.prediction import SamplingSettings
 from gripmon.track.differential import DegenerateGeometry, differential_update
 from gripmon.model.geometry import from_record, invert, perturb
 from gripmon.model.gripper import Gripper
-from gripmon.recalibrate import RecalibrationRefused, recalibrate
+from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.model.records import Array, Image
 from gripmon.simulator import Simulator, make_scenario
 from gripmon.simulator.scenario import Background

@@ -98,7 +98,7 @@ def trial(seed: int, number: int) -> Outcome:
     from benchmarks.knocks import BEFORE, draw_knock
     from gripmon.model.geometry import from_record, to_record
     from gripmon.monitor import Monitor, MonitorSettings
-    from gripmon.recalibrate import Refusal
+    from gripmon.judge.recalibrate import Refusal
     from gripmon.model.records import ReferenceRecord, State
 
     knock = draw_knock(seed, number)

@@ -113,7 +113,7 @@ def _run(average: Any, error: Any, motion: Any, covariance: Any) -> tuple[Any, _
 
     from benchmarks.scene import FPS, config_for
     from gripmon.model.geometry import from_record, perturb, perturbation_between
-    from gripmon.smoothing import PoseAverage
+    from gripmon.judge.smoothing import PoseAverage
 
     config = config_for((768, 576))
     settings = config.settings.monitor

@@ -14,13 +14,13 @@ from typing import Any
 import gripmon.track.edges.settling
 import gripmon.monitor.core
 from gripmon.track.edges import FingertipMeter
-from gripmon.drift import MotionWatch
+from gripmon.judge.drift import MotionWatch
 from gripmon.monitor import Monitor, Tracker
 from gripmon.monitor.asking import Inquiry
-from gripmon.policy import Policy
+from gripmon.judge.policy import Policy
 from gripmon.publish import ZenohPublisher
-from gripmon.smoothing import PoseAverage
-from gripmon.stream import StreamWatch
+from gripmon.judge.smoothing import PoseAverage
+from gripmon.judge.stream import StreamWatch
 
 STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "inspect the image": ((gripmon.monitor.core, "inspect"),),

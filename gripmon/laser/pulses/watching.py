@@ -14,7 +14,7 @@ from gripmon.laser.pointer.spots import Spot, find_spots
 from gripmon.calibration.sighting import NotFound
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import from_record, perturb, quaternion_xyzw, skew
-from gripmon.policy import AlertBook
+from gripmon.judge.policy import AlertBook
 from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.standing import way_px

@@ -10,7 +10,7 @@ import numpy as np
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.spots import Spot
 from gripmon.calibration.sighting import NotFound
-from gripmon.policy import AlertBook
+from gripmon.judge.policy import AlertBook
 from gripmon.model.records import Alert, State, Verdict
 from gripmon.laser.watch import words
 from gripmon.laser.watch.beliefs import Pulse

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.causes.pooling import PIECES, Pooled
-from gripmon.causes.state import JAW, POSE, State
+from gripmon.judge.causes.pooling import PIECES, Pooled
+from gripmon.judge.causes.state import JAW, POSE, State
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.causes.state import EdgeView, State
+from gripmon.judge.causes.state import EdgeView, State
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 

@@ -54,7 +54,7 @@ class _Usual:
 
 class BlurWatch:
     """Whether the edges' blur is another than usual.  What has changed is told by
-    :class:`gripmon.causes.CauseJudge`: motion smears edges, too.
+    :class:`gripmon.judge.causes.CauseJudge`: motion smears edges, too.
     """
 
     def __init__(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.causes.state import EdgeView, State, edge_places
+from gripmon.judge.causes.state import EdgeView, State, edge_places
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
 

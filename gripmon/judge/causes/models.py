@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.causes.state import FINGERS, FOCAL, JAW, POSE, finger_lever_m, finger_slice
-from gripmon.causes.weighing import Model
+from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, finger_lever_m, finger_slice
+from gripmon.judge.causes.weighing import Model
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 

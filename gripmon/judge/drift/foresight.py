@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.drift.sequential import rarity
-from gripmon.drift.settings import DriftSettings
-from gripmon.drift.windows import LENGTHS
+from gripmon.judge.drift.sequential import rarity
+from gripmon.judge.drift.settings import DriftSettings
+from gripmon.judge.drift.windows import LENGTHS
 from gripmon.model.records import Array
 
 CORRELATION_FRAMES = 20.0
@@ -39,7 +39,7 @@ class Foresight:
 
 
 def foresee(covariance: Array, settings: DriftSettings) -> Foresight:
-    """What the test of :mod:`gripmon.drift.sequential` notices where frames have errors of ``covariance`` (6, 6)."""
+    """What the test of :mod:`gripmon.judge.drift.sequential` notices where frames have errors of ``covariance`` (6, 6)."""
     windows = np.full((len(LENGTHS), 1), np.inf)
     threshold, inflation = rarity(settings.false_alarms_per_day, settings.frames_per_s, windows)
     of_mean = _variance_of_means(np.array([*LENGTHS, 2 * LENGTHS[-1]], dtype=float))

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from gripmon.causes.comparing import Comparison, Key
-from gripmon.causes.state import FOCAL, JAW, POSE, finger_slice
-from gripmon.causes.weighing import Weighed
+from gripmon.judge.causes.comparing import Comparison, Key
+from gripmon.judge.causes.state import FOCAL, JAW, POSE, finger_slice
+from gripmon.judge.causes.weighing import Weighed
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Cause
 

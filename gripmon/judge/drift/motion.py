@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from gripmon.drift.history import History, goes_on
-from gripmon.drift.sequential import SequentialTest
-from gripmon.drift.settings import DriftSettings
-from gripmon.drift.tolerance import square_beyond, whitening
-from gripmon.drift.vibration import VibrationWatch
+from gripmon.judge.drift.history import History, goes_on
+from gripmon.judge.drift.sequential import SequentialTest
+from gripmon.judge.drift.settings import DriftSettings
+from gripmon.judge.drift.tolerance import square_beyond, whitening
+from gripmon.judge.drift.vibration import VibrationWatch
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
 LEVEL_FRAMES, NEWEST_FRAMES = 64, 8

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.policy.alerts import AlertBook
-from gripmon.policy.limits import time_left_s
-from gripmon.policy.settings import PolicySettings
+from gripmon.judge.policy.alerts import AlertBook
+from gripmon.judge.policy.limits import time_left_s
+from gripmon.judge.policy.settings import PolicySettings
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -22,7 +22,7 @@ from gripmon.model.atomic import remove_leftovers, write_atomically
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import GripperModel, contents_of
 from gripmon.model.records import MonitorState, ReferenceRecord
-from gripmon.references import state_fault
+from gripmon.judge.references import state_fault
 
 _log = logging.getLogger(__name__)
 

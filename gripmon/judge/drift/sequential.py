@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from gripmon.drift.extremes import BLOCK_FRAMES, Extremes
-from gripmon.drift.scatter import Scatter
-from gripmon.drift.settings import DriftSettings
-from gripmon.drift.tolerance import square, square_beyond, times, whitening
-from gripmon.drift.windows import LENGTHS, Windows
+from gripmon.judge.drift.extremes import BLOCK_FRAMES, Extremes
+from gripmon.judge.drift.scatter import Scatter
+from gripmon.judge.drift.settings import DriftSettings
+from gripmon.judge.drift.tolerance import square, square_beyond, times, whitening
+from gripmon.judge.drift.windows import LENGTHS, Windows
 from gripmon.model.records import Array
 
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4

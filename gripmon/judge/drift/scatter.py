@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.drift.windows import LENGTHS
+from gripmon.judge.drift.windows import LENGTHS
 from gripmon.model.records import Array
 
 PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3

@@ -1,6 +1,6 @@
 """A new reference from the fingertip corners alone, and from many frames: when to believe it, when to ask a person."""
 
-from gripmon.recalibrate.pnp import (
+from gripmon.judge.recalibrate.pnp import (
     FEWEST_COPLANAR,
     FEWEST_GENERAL,
     Recalibration,
@@ -11,9 +11,9 @@ from gripmon.recalibrate.pnp import (
     rivals,
     solutions,
 )
-from gripmon.recalibrate.recalibrator import Proposal, Recalibrator, Refusal, RefusalReason
-from gripmon.recalibrate.settings import RecalibrationSettings
-from gripmon.recalibrate.stills import StillFrame
+from gripmon.judge.recalibrate.recalibrator import Proposal, Recalibrator, Refusal, RefusalReason
+from gripmon.judge.recalibrate.settings import RecalibrationSettings
+from gripmon.judge.recalibrate.stills import StillFrame
 
 __all__ = [
     "FEWEST_COPLANAR",

@@ -13,10 +13,10 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.causes.baseline import Baseline
-from gripmon.causes.comparing import Comparison, Key, Report, compare
-from gripmon.causes.pooling import Pooled, pool
-from gripmon.causes.words import sentence
+from gripmon.judge.causes.baseline import Baseline
+from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
+from gripmon.judge.causes.pooling import Pooled, pool
+from gripmon.judge.causes.words import sentence
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
 

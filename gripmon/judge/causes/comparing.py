@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.causes.baseline import Baseline
-from gripmon.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
-from gripmon.causes.pooling import Pooled
-from gripmon.causes.state import EdgeView, State
-from gripmon.causes.weighing import Errors, Weighed, weigh
+from gripmon.judge.causes.baseline import Baseline
+from gripmon.judge.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
+from gripmon.judge.causes.pooling import Pooled
+from gripmon.judge.causes.state import EdgeView, State
+from gripmon.judge.causes.weighing import Errors, Weighed, weigh
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
 from gripmon.model.gripper import Gripper
-from gripmon.recalibrate.edges import PooledEdges, fingers_disagree, leave_one_out, pool
-from gripmon.recalibrate.pnp import (
+from gripmon.judge.recalibrate.edges import PooledEdges, fingers_disagree, leave_one_out, pool
+from gripmon.judge.recalibrate.pnp import (
     FEWEST_COPLANAR,
     Recalibration,
     RecalibrationRefused,
@@ -27,8 +27,8 @@ from gripmon.recalibrate.pnp import (
     rivals,
     solutions,
 )
-from gripmon.recalibrate.settings import RecalibrationSettings
-from gripmon.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
+from gripmon.judge.recalibrate.settings import RecalibrationSettings
+from gripmon.judge.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 
 MOST_OUTLYING = 0.25
