@@ -19,8 +19,8 @@ from simulated import BOX_FINGERS, nominal_cam_T_grip
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import Image
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, Cover, Defocus, FingerLook, JawScript, Light, Sensor
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, Cover, Defocus, FingerLook, JawScript, Light, Sensor
 
 FOLDER = Path(__file__).parent / "golden"
 SIZE = {"width_px": 320, "height_px": 240}

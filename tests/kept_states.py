@@ -12,7 +12,7 @@ from gripmon.config import builtin_config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import MonitorState
 from gripmon.judge.references import ReferenceBook
-from gripmon.simulator import Simulator, make_scenario
+from gripmon.simulate import Simulator, make_scenario
 from gripmon.judge.statefile import StateFile
 
 DIFFERENT = 12

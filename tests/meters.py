@@ -12,7 +12,7 @@ from gripmon.model.camera import Camera, FisheyeLens, LensSettings, make_camera
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Image
-from gripmon.simulator import Scenario, Simulator
+from gripmon.simulate import Scenario, Simulator
 
 FISHEYE_LENS = FisheyeLens(
     width_px=768,

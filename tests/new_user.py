@@ -17,8 +17,8 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario, Simulator, write_sequence
-from gripmon.simulator.scenario import Background, Bump, JawScript, Sensor
+from gripmon.simulate import Scenario, Simulator, write_sequence
+from gripmon.simulate.scenario import Background, Bump, JawScript, Sensor
 
 BOARD = CircleGrid(12, 10, 0.008, 0.004)
 TARGET = "circles:12x10:0.008:0.004"

@@ -10,8 +10,8 @@ import yaml
 
 from gripmon.model.camera import BrownConradyLens, LensSettings, PaperLens, make_camera
 from gripmon.model.gripper import Gripper, GripperModel, load_gripper
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, Sensor
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook, Sensor
 
 BOX_FINGERS = Path(__file__).parent.parent / "configs" / "grippers" / "two_box_fingers.yaml"
 PAPER_LENS = PaperLens(

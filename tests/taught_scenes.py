@@ -15,8 +15,8 @@ from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, JawScript
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, JawScript
 from gripmon.teaching import Taught, TeachingImage, teach
 
 CAMERA = make_camera(PAPER_LENS)

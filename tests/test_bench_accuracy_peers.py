@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
-from gripmon.simulator import Simulator
+from gripmon.simulate import Simulator
 
 pytestmark = pytest.mark.usefixtures("tools_importable")
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from simulated import nominal_cam_T_grip, plain_scenario, simulator
 
-from gripmon.simulator.scenario import Pairs
+from gripmon.simulate.scenario import Pairs
 
 METHOD = Path(__file__).resolve().parent.parent.parent / "shared" / "method.md"
 VARIANTS = ("3P-U", "4P-U", "5P-U", "all-U", "4P-R", "5P-R", "edges")

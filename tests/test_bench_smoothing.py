@@ -41,7 +41,7 @@ def test_the_ways_are_those_of_the_simulator():
     from benchmarks.scene import config_for
 
     from gripmon.model.geometry import from_record
-    from gripmon.simulator.scenario import Scenario
+    from gripmon.simulate.scenario import Scenario
 
     ways = smoothing._ways()
     step = ways["step of 0.05 mm"][0]

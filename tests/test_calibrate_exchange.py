@@ -33,7 +33,7 @@ from gripmon.model.geometry import perturb, to_record
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.records import Cause, MonitorState, ReferenceRecord, to_json
-from gripmon.simulator.scenario import Sensor
+from gripmon.simulate.scenario import Sensor
 from gripmon.judge.statefile import Calibration, Owner, pack
 
 TRUE = nominal_cam_T_grip()

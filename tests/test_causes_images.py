@@ -18,8 +18,8 @@ from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.track.edges import FingertipMeter
 from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, BentFinger, Cover, Defocus, ObjectLook, Prop, Tilt
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, BentFinger, Cover, Defocus, ObjectLook, Prop, Tilt
 
 FPS, WELL, AFTER = 30.0, 6, 5
 AT_S = (WELL - 0.5) / FPS

@@ -17,8 +17,8 @@ from gripmon.track.edges.consensus import ConsensusSettings
 from gripmon.track.edges.lines import CornerSettings
 from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import CornerFault
-from gripmon.simulator import Simulator, make_scenario
-from gripmon.simulator.scenario import BentFinger, JawScript
+from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate.scenario import BentFinger, JawScript
 
 PLAIN = plain_scenario()
 IDS = box_gripper().corner_ids

@@ -18,7 +18,7 @@ from gripmon.cli import demo
 from gripmon.cli.comparison import compare
 from gripmon.model.geometry import from_record, make_transform, to_record
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
-from gripmon.simulator import FrameTruth
+from gripmon.simulate import FrameTruth
 
 
 def test_the_demo_keeps_what_it_promises(tmp_path: Path):

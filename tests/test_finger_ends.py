@@ -15,8 +15,8 @@ from gripmon.model.camera import make_camera
 from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.track.edges.ends import along_fingers
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
-from gripmon.simulator import Scenario, Simulator, make_scenario
-from gripmon.simulator.scenario import Background, FingerMark, ObjectLook, Prop
+from gripmon.simulate import Scenario, Simulator, make_scenario
+from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
 
 PLAIN = plain_scenario()
 CUBE = Path(__file__).parent.parent / "configs" / "grippers" / "visp_cube.yaml"

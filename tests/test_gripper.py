@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from gripmon.cli import main
 from gripmon.config import builtin_config
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
-from gripmon.simulator.solids import finger_solids
+from gripmon.simulate.solids import finger_solids
 
 SHIPPED = sorted((Path(__file__).parent.parent / "configs" / "grippers").glob("*.yaml"))
 

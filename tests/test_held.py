@@ -17,7 +17,7 @@ from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict
-from gripmon.simulator.scenario import Sensor
+from gripmon.simulate.scenario import Sensor
 
 SCENE = plain_scenario(sensor=Sensor())
 BACKGROUND = 180

@@ -14,8 +14,8 @@ from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.track.look import GripperLook, LookAgreement, LookRefused
 from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
 from gripmon.model.records import LookRecord
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import (
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import (
     Background,
     Cover,
     Defocus,

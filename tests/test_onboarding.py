@@ -34,8 +34,8 @@ from gripmon.model.gripper import Gripper, contents_of, load_gripper
 from gripmon.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of
 from gripmon.onboarding.outlines import inferred_model, points_in_gripper
 from gripmon.model.records import Image
-from gripmon.simulator import Simulator, make_scenario
-from gripmon.simulator.background import _TILE_PX
+from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate.background import _TILE_PX
 
 TRUE = nominal_cam_T_grip()
 TARGETS: dict[str, Target] = {"discs": DISCS, "chequerboard": CHEQUERBOARD, "charuco": CHARUCO}

@@ -20,7 +20,7 @@ import yaml
 from gripmon.cli import main
 from gripmon.config import builtin_config, load_config
 from gripmon.report import Report
-from gripmon.simulator import Simulator
+from gripmon.simulate import Simulator
 from gripmon.sources import make_simulator
 
 ROOT = Path(__file__).parent.parent

@@ -22,7 +22,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 from gripmon.model.camera import make_camera
 from gripmon.track.edges import Effort, Measurement
 from gripmon.track.edges.search import SearchSettings, search_poses
-from gripmon.simulator import make_scenario
+from gripmon.simulate import make_scenario
 
 SETTINGS = SearchSettings()
 

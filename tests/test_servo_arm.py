@@ -118,7 +118,7 @@ def scene():
 
     from gripmon.config import load_config
     from gripmon.model.geometry import from_record
-    from gripmon.simulator.scenario import GraspedObject
+    from gripmon.simulate.scenario import GraspedObject
 
     config = load_config(TOOLS.parent / "configs" / "demo.yaml", check_source=False)
     points_m = object_points_m(GraspedObject())

@@ -191,7 +191,7 @@ def test_the_truth_of_the_servo_is_that_of_the_camera_it_gave_the_monitor(tmp_pa
     from servoing import stage
     from servoing.feed import reference_cam_T_grip, write_config
 
-    from gripmon.simulator import Simulator
+    from gripmon.simulate import Simulator
     from gripmon.sources import make_simulator
 
     for number, row in enumerate(stage.ROWS):

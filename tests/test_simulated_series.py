@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from simulated import simulator
 
-from gripmon.simulator import Simulator, make_scenario
+from gripmon.simulate import Simulator, make_scenario
 
 
 def plate_points_m(series: Simulator, index: int, uv_px: np.ndarray) -> np.ndarray:

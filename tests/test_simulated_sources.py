@@ -21,7 +21,7 @@ from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Frame
-from gripmon.simulator import make_scenario
+from gripmon.simulate import make_scenario
 from gripmon.sources import (
     SimulatedScene,
     SimulatedSettings,

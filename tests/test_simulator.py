@@ -12,9 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
-from gripmon.simulator import SCENARIO_NAMES, Hidden, Scenario, make_scenario, write_sequence
-from gripmon.simulator.disturbance import exposure, jaw_opening_m, law
-from gripmon.simulator.scenario import (
+from gripmon.simulate import SCENARIO_NAMES, Hidden, Scenario, make_scenario, write_sequence
+from gripmon.simulate.disturbance import exposure, jaw_opening_m, law
+from gripmon.simulate.scenario import (
     BentFinger,
     Bump,
     Cover,

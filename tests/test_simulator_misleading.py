@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
-from gripmon.simulator import Hidden
-from gripmon.simulator.scenario import (
+from gripmon.simulate import Hidden
+from gripmon.simulate.scenario import (
     Cover,
     FingerMark,
     FingerShape,

@@ -7,9 +7,9 @@ import msgspec
 import numpy as np
 from simulated import PLAIN_FINGERS, plain_scenario, simulator
 
-from gripmon.simulator import Hidden
-from gripmon.simulator.scenario import Cover, GraspedObject, JawScript
-from gripmon.simulator.solids import PlacedSolid, box, hidden_by, paint_order, place
+from gripmon.simulate import Hidden
+from gripmon.simulate.scenario import Cover, GraspedObject, JawScript
+from gripmon.simulate.solids import PlacedSolid, box, hidden_by, paint_order, place
 
 
 def test_what_is_hidden_leaves_no_trace_in_the_picture_and_what_is_visible_does() -> None:

@@ -20,10 +20,10 @@ from simulated import (
 
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.config import builtin_config, load_config
-from gripmon.simulator import SCENARIO_NAMES, Simulator, make_scenario
-from gripmon.simulator.background import _smear_kernel
-from gripmon.simulator.coverage import CoverageRaster
-from gripmon.simulator.scenario import (
+from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
+from gripmon.simulate.background import _smear_kernel
+from gripmon.simulate.coverage import CoverageRaster
+from gripmon.simulate.scenario import (
     Background,
     Creep,
     Defocus,
@@ -32,7 +32,7 @@ from gripmon.simulator.scenario import (
     Sensor,
     Shadow,
 )
-from gripmon.simulator.sensor import blur
+from gripmon.simulate.sensor import blur
 
 FISHEYE_LENS = FisheyeLens(
     width_px=768,

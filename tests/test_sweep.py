@@ -18,8 +18,8 @@ from gripmon.track.edges.prediction import lay_out
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.outlook import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook
 
 AT_PX = (386.0, 298.0)
 SEEN = Mount(0.115, math.radians(32.0), 0.0, 0.0)

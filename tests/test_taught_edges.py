@@ -12,7 +12,7 @@ from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.model.geometry import invert
-from gripmon.simulator.solids import finger_solids
+from gripmon.simulate.solids import finger_solids
 from gripmon.teaching.lines import EdgePoints, find_line, settle_line
 from gripmon.teaching.pooling import pool
 from gripmon.teaching.shape import slopes

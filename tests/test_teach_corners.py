@@ -27,8 +27,8 @@ from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.outlook import expect
 from gripmon.model.provenance import Provenance
-from gripmon.simulator import Simulator
-from gripmon.simulator.scenario import JawScript, Sensor
+from gripmon.simulate import Simulator
+from gripmon.simulate.scenario import JawScript, Sensor
 from gripmon.teaching import TeachingImage
 from gripmon.teaching.bench import Bench
 from gripmon.teaching.corner_pose import CameraError, PoseRefused, pose_from_corners

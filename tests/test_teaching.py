@@ -24,7 +24,7 @@ from taught_scenes import (
 
 from gripmon.track.edges.taught import sight_axes
 from gripmon.model.geometry import invert
-from gripmon.simulator.solids import finger_solids
+from gripmon.simulate.solids import finger_solids
 from gripmon.teaching import TeachingRefused
 
 POSE = nominal_cam_T_grip()

@@ -19,8 +19,8 @@ from gripmon.judge.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame
-from gripmon.simulator import Simulator, make_scenario
-from gripmon.simulator.scenario import FingerLook, Scenario, Sensor
+from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
 from gripmon.teaching import TeachingImage, teach
 
 POSE = nominal_cam_T_grip()

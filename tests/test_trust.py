@@ -25,8 +25,8 @@ from gripmon.monitor.weigher import Trust
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import Frame, Protection, State, Verdict, to_json
-from gripmon.simulator import FrameTruth, Scenario, Simulator
-from gripmon.simulator.scenario import BentFinger, Bump, ObjectLook, Prop
+from gripmon.simulate import FrameTruth, Scenario, Simulator
+from gripmon.simulate.scenario import BentFinger, Bump, ObjectLook, Prop
 
 FPS, BEGINS = 20.0, 16
 """Frame in which something begins to happen: until then the view is free, and the gripper's place has proved itself."""

@@ -15,8 +15,8 @@ from gripmon.model.camera import make_camera
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
-from gripmon.simulator import FrameTruth, Scenario, Simulator, make_scenario
-from gripmon.simulator.scenario import Background, Cover, Creep
+from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
+from gripmon.simulate.scenario import Background, Cover, Creep
 
 FPS = 30.0
 SCENES = {

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Array, FrameRecord, Origin, Severity, Verdict
-from gripmon.simulator import FrameTruth
+from gripmon.simulate import FrameTruth
 
 EVENT_NAMES = {
     "creep": "creep",

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from gripmon.client import Client
     from gripmon.config import Config
     from gripmon.model.records import Array, FrameRecord
-    from gripmon.simulator import Simulator
+    from gripmon.simulate import Simulator
 
 _DESCRIPTION = """\
 Run the whole daemon on a simulated wrist camera: a cable pulls the camera aside (creep), a collision

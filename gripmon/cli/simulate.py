@@ -13,7 +13,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.simulator import Scenario
+    from gripmon.simulate import Scenario
 
 _DESCRIPTION = """\
 Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
@@ -53,7 +53,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon simulate``."""
-    from gripmon.simulator import SCENARIO_NAMES, Simulator, write_sequence
+    from gripmon.simulate import SCENARIO_NAMES, Simulator, write_sequence
 
     if arguments.list:
         print("\n".join(SCENARIO_NAMES))
@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
     from gripmon.config import ConfigError, load_scenario
-    from gripmon.simulator import make_scenario
+    from gripmon.simulate import make_scenario
 
     name: str = arguments.scenario
     if Path(name).suffix in (".yaml", ".yml"):

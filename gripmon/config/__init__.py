@@ -35,7 +35,7 @@ from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
 from gripmon.wire import Joining
 
 if TYPE_CHECKING:
-    from gripmon.simulator import Scenario
+    from gripmon.simulate import Scenario
 
 __all__ = [
     "Config",
@@ -267,7 +267,7 @@ def _ros2_fault(settings: Settings) -> Fault | None:
 
 def load_scenario(path: Path) -> Scenario:
     """A simulator scenario from a YAML file.  Raises :class:`ConfigError`."""
-    from gripmon.simulator import Scenario
+    from gripmon.simulate import Scenario
 
     try:
         return to_settings(read_yaml(path), Scenario)

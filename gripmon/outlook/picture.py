@@ -19,9 +19,9 @@ from gripmon.model.gripper import Gripper
 from gripmon.outlook.sweep import Grid, Trial
 from gripmon.outlook.visibility import Rig
 from gripmon.model.records import Array, Image
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, JawScript
-from gripmon.simulator.solids import finger_solids
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook, JawScript
+from gripmon.simulate.solids import finger_solids
 
 _WIDTH, _EDGE, _GAP = 1500, 30, 36
 _INK, _FAINT, _PAPER, _MARK = (20, 20, 20), (95, 95, 95), (255, 255, 255), (226, 32, 38)

@@ -14,7 +14,7 @@ from gripmon.sources.base import Source, SourceError
 if TYPE_CHECKING:
     from gripmon.model.camera import Camera
     from gripmon.model.gripper import Gripper
-    from gripmon.simulator import Scenario, Simulator
+    from gripmon.simulate import Scenario, Simulator
 
 
 class SimulatedSettings(
@@ -56,7 +56,7 @@ class SimulatedScene:
 
 def make_simulator(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Simulator:
     """The simulator of these settings, which also knows the truth; SourceError if they don't fit the scene."""
-    from gripmon.simulator import Simulator
+    from gripmon.simulate import Simulator
 
     scenario = _load_scenario(settings, relative_to)
     try:
@@ -66,7 +66,7 @@ def make_simulator(settings: SimulatedSettings, scene: SimulatedScene, relative_
 
 
 def _load_scenario(settings: SimulatedSettings, relative_to: Path) -> Scenario:
-    from gripmon.simulator import Scenario, make_scenario
+    from gripmon.simulate import Scenario, make_scenario
 
     if not settings.scenario.endswith((".yaml", ".yml")):
         try:

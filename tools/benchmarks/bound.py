@@ -27,8 +27,8 @@ from benchmarks.accuracy_runs import Track
 from benchmarks.scenes import Scene
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array
-from gripmon.simulator import Simulator
-from gripmon.simulator.scenario import JawScript, Tilt
+from gripmon.simulate import Simulator
+from gripmon.simulate.scenario import JawScript, Tilt
 
 BOUND_ROW = "standing"
 """The condition in which nothing differs between frames but noise."""

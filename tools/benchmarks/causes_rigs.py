@@ -14,8 +14,8 @@ from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import JawScript, Light
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import JawScript, Light
 
 WELL, AFTER = 24, 24
 """Frames before and after it."""

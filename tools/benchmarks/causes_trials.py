@@ -18,7 +18,7 @@ from benchmarks.causes_rigs import AFTER, WELL, Rig, Rng, draw_rig
 from gripmon.model.camera import LensSettings, PaperLens
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Array, Cause, Frame, Image
-from gripmon.simulator.scenario import BentFinger, Cover, Defocus, Light, LightStep, Tilt
+from gripmon.simulate.scenario import BentFinger, Cover, Defocus, Light, LightStep, Tilt
 
 _RING = 24
 """Frames that are rendered for a stream of which the images don't matter; it is played forwards and backwards."""

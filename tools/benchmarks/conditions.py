@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.simulator.scenario import (
+from gripmon.simulate.scenario import (
     Background,
     Bump,
     Cover,

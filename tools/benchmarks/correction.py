@@ -40,8 +40,8 @@ def scenarios() -> list[Scenario]:
     """All of them, with the motion in each."""
     import numpy as np
 
-    from gripmon.simulator.disturbance import law
-    from gripmon.simulator.scenario import Bump
+    from gripmon.simulate.disturbance import law
+    from gripmon.simulate.scenario import Bump
 
     def still(t: Any, rng: Any) -> Any:
         return np.zeros_like(t)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.integrity_draft import Changes, Condition, Draft, with_
-from gripmon.simulator.scenario import (
+from gripmon.simulate.scenario import (
     BentFinger,
     Bump,
     Cover,

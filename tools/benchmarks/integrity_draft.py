@@ -11,7 +11,7 @@ import numpy as np
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 
 Changes = dict[str, Any]
 

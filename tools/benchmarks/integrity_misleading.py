@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.integrity_conditions import ORDINARY, bump
 from benchmarks.integrity_draft import Changes, Condition, Draft, both, with_
-from gripmon.simulator.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
+from gripmon.simulate.scenario import GraspedObject, JawScript, Light, ObjectLook, Prop, Shadow
 
 _COMES, _GOES = 0.12, 0.88  # shares of the time at which what comes is there, and leaves again
 

@@ -38,8 +38,8 @@ from gripmon.model.records import (
     ReferenceRecord,
     Verdict,
 )
-from gripmon.simulator import Scenario
-from gripmon.simulator.scenario import Bump
+from gripmon.simulate import Scenario
+from gripmon.simulate.scenario import Bump
 
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""

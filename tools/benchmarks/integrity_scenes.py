@@ -19,8 +19,8 @@ from gripmon.model.camera import Camera, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook, FingerMark, JawScript, Sensor
 
 LEAD_FRAMES = (15, 20)
 """Frames at the start of a scene in which the gripper is seen free."""

@@ -23,9 +23,9 @@ from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, Pa
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, GripperModel, load_gripper
 from gripmon.model.records import Frame
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.disturbance import full_motion
-from gripmon.simulator.scenario import Background, JawScript, MountMotion, Tilt
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.disturbance import full_motion
+from gripmon.simulate.scenario import Background, JawScript, MountMotion, Tilt
 
 FPS = 30.0
 LARGEST_M, LARGEST_RAD = 0.01, math.radians(4.0)

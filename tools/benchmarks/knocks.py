@@ -23,8 +23,8 @@ from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, GripperModel, load_gripper
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import (
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import (
     Background,
     BentFinger,
     Cover,

@@ -29,8 +29,8 @@ from benchmarks.noise_model import FOLDER, Array, MeasuredScene, NoiseModel, Par
 from benchmarks.noise_statistics import LAGS, Statistics, mean, statistics, whitened
 from benchmarks.scene import config_for
 from gripmon.model.geometry import from_record, perturbation_between
-from gripmon.simulator.disturbance import about_pivot, full_motion
-from gripmon.simulator.scenario import MountMotion, Scenario
+from gripmon.simulate.disturbance import about_pivot, full_motion
+from gripmon.simulate.scenario import MountMotion, Scenario
 
 TIMES = (0.0, 0.7, 1.5, 3.0, 6.0, 12.0, 24.0, 48.0, 96.0, 200.0, 500.0)
 """Correlation times on offer, frames, beginning with white noise; those that aren't needed get no variance."""

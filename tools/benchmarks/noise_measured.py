@@ -25,8 +25,8 @@ from gripmon.config import Config
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.monitor import Monitor
 from gripmon.model.records import Array, Origin, Verdict
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import (
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import (
     Background,
     FingerLook,
     JawScript,

@@ -20,8 +20,8 @@ from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 
 PAPER_LENS = PaperLens(
     width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7

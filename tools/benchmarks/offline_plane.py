@@ -21,7 +21,7 @@ from gripmon.model.geometry import perturbation_between
 from gripmon.onboarding import KnownGripper, UnknownGripper
 from gripmon.onboarding.measuring import contact_height_m
 from gripmon.model.records import Array, Image
-from gripmon.simulator.scenario import Sensor
+from gripmon.simulate.scenario import Sensor
 
 ROUGH_PX = 4.0
 """Somebody clicks on corners; they are off by up to so much."""

@@ -20,8 +20,8 @@ from gripmon.model.geometry import from_record, invert, perturb
 from gripmon.model.gripper import Gripper
 from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.model.records import Array, Image
-from gripmon.simulator import Simulator, make_scenario
-from gripmon.simulator.scenario import Background
+from gripmon.simulate import Simulator, make_scenario
+from gripmon.simulate.scenario import Background
 
 _RENDERED = "rendered series2, true jaw"
 _ITERATIONS = 5

@@ -20,8 +20,8 @@ from gripmon.model.camera import PaperLens, make_camera
 from gripmon.config import Config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame
-from gripmon.simulator import Scenario, Simulator
-from gripmon.simulator.scenario import Background, Creep
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, Creep
 
 FPS = 60.0
 WARM_UP_PACED = 30

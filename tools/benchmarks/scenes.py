@@ -26,8 +26,8 @@ from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord
-from gripmon.simulator import FrameTruth, Hidden, Scenario, Simulator
-from gripmon.simulator.scenario import Background, FingerLook, JawScript, Sensor
+from gripmon.simulate import FrameTruth, Hidden, Scenario, Simulator
+from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 from gripmon.teaching import TeachingImage, TeachingRefused, teach
 
 CAMERA = PaperLens(

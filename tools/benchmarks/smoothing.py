@@ -141,8 +141,8 @@ def _ways() -> dict[str, Any]:
 
     from benchmarks.noise_model import NoiseModel
     from benchmarks.scene import FPS
-    from gripmon.simulator.disturbance import law
-    from gripmon.simulator.scenario import Bump
+    from gripmon.simulate.disturbance import law
+    from gripmon.simulate.scenario import Bump
 
     vibration = NoiseModel.load("rough").vibration
     assert vibration is not None, "the rough regime has one"

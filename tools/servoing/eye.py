@@ -8,7 +8,7 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import GraspedObject
+from gripmon.simulate.scenario import GraspedObject
 
 SIGMA_PX = 0.1
 """Standard deviation of each image coordinate of each point."""

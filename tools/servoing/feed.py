@@ -21,7 +21,7 @@ from gripmon.client import Policy, Reading, TransformClient
 from gripmon.config import Config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array
-from gripmon.simulator import Scenario
+from gripmon.simulate import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 _DEMO = ROOT / "configs" / "demo.yaml"

@@ -12,7 +12,7 @@ import numpy as np
 from gripmon.client import Policy, Reading
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.records import Array, Verdict
-from gripmon.simulator import Simulator
+from gripmon.simulate import Simulator
 from servoing import stage
 from servoing.arm import Arm
 from servoing.controller import Given, Servo, given_by

@@ -12,8 +12,8 @@ import numpy as np
 
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.records import Array
-from gripmon.simulator.disturbance import smooth_step
-from gripmon.simulator.scenario import Background, Bump, Cover, GraspedObject, Scenario
+from gripmon.simulate.disturbance import smooth_step
+from gripmon.simulate.scenario import Background, Bump, Cover, GraspedObject, Scenario
 from servoing.arm import HOME_RAD, Arm
 
 BEGIN_S = 2.0

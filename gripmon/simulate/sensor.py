@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.simulator import disturbance
-from gripmon.simulator.scenario import Scenario, Shadow
-from gripmon.simulator.viewing import CELL_PX, RayGrid, enlarge_cells
+from gripmon.simulate import disturbance
+from gripmon.simulate.scenario import Scenario, Shadow
+from gripmon.simulate.viewing import CELL_PX, RayGrid, enlarge_cells
 
 Light32 = NDArray[np.float32]
 _BANK_MARGIN_PX = 96

@@ -9,7 +9,7 @@ import numpy as np
 
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import (
+from gripmon.simulate.scenario import (
     Bump,
     Cover,
     Creep,

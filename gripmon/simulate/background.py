@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
-from gripmon.simulator import textures
-from gripmon.simulator.scenario import Background
-from gripmon.simulator.viewing import RayGrid
+from gripmon.simulate import textures
+from gripmon.simulate.scenario import Background
+from gripmon.simulate.viewing import RayGrid
 
 _TILE_PX = 2048
 _SQUARE_M = 0.01

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulator.bodies import Bodies
-from gripmon.simulator.scene import SceneState
-from gripmon.simulator.solids import hidden_by
+from gripmon.simulate.bodies import Bodies
+from gripmon.simulate.scene import SceneState
+from gripmon.simulate.solids import hidden_by
 
 _POINTS_PER_EDGE = 24
 

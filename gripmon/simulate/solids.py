@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import FingerShape
+from gripmon.simulate.scenario import FingerShape
 
 _TOUCH_M = 1e-5  # bodies that touch within this don't hide each other's surface
 _AS_MODELLED = FingerShape()

@@ -12,8 +12,8 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulator import disturbance
-from gripmon.simulator.scenario import BentFinger, MountMotion, Scenario
+from gripmon.simulate import disturbance
+from gripmon.simulate.scenario import BentFinger, MountMotion, Scenario
 
 _TIP_SHARE = 0.1  # of a finger's length: what counts as its tip, and as its root
 

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Frame
-from gripmon.simulator import disturbance
-from gripmon.simulator.bodies import Bodies
-from gripmon.simulator.outline import Outline, OutlineSeen
-from gripmon.simulator.render import Backdrop, Renderer
-from gripmon.simulator.scenario import Scenario
-from gripmon.simulator.scene import Scene
-from gripmon.simulator.sensor import SensorModel
-from gripmon.simulator.truth import FrameTruth, Hidden
+from gripmon.simulate import disturbance
+from gripmon.simulate.bodies import Bodies
+from gripmon.simulate.outline import Outline, OutlineSeen
+from gripmon.simulate.render import Backdrop, Renderer
+from gripmon.simulate.scenario import Scenario
+from gripmon.simulate.scene import Scene
+from gripmon.simulate.sensor import SensorModel
+from gripmon.simulate.truth import FrameTruth, Hidden
 
 
 class Simulator:

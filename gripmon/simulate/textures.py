@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.simulator.scenario import Background
+from gripmon.simulate.scenario import Background
 
 Factor = NDArray[np.float32]
 Grey = NDArray[np.uint8]

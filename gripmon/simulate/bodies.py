@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import Cover, Prop, Scenario
-from gripmon.simulator.scene import COVER_TRAVEL, SceneState
-from gripmon.simulator.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place
-from gripmon.simulator.truth import Hidden
+from gripmon.simulate.scenario import Cover, Prop, Scenario
+from gripmon.simulate.scene import COVER_TRAVEL, SceneState
+from gripmon.simulate.solids import PlacedSolid, Solid, box, finger_solids, hidden_by, mirrored, paint_order, place
+from gripmon.simulate.truth import Hidden
 
 # Half width of a cover over half the view's larger side.
 COVER_HALF = 1.35

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.simulator.scenario import FingerMark, ObjectLook
-from gripmon.simulator.solids import Solid
-from gripmon.simulator.textures import Factor, Rng
+from gripmon.simulate.scenario import FingerMark, ObjectLook
+from gripmon.simulate.solids import Solid
+from gripmon.simulate.textures import Factor, Rng
 
 _LENS_BLUR_PX = 0.6
 _ALONG = np.array([0.0, 0.0, 1.0])

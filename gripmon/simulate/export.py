@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from gripmon.simulator.sequence import Simulator
+from gripmon.simulate.sequence import Simulator
 
 _PNG_COMPRESSION = 1  # noise doesn't compress; time matters more
 

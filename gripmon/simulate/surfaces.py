@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.simulator import patterns, textures
-from gripmon.simulator.scenario import Cover, FingerLook, ObjectLook
-from gripmon.simulator.solids import Solid
-from gripmon.simulator.textures import Factor
+from gripmon.simulate import patterns, textures
+from gripmon.simulate.scenario import Cover, FingerLook, ObjectLook
+from gripmon.simulate.solids import Solid
+from gripmon.simulate.textures import Factor
 
 _LARGEST_TEXTURE_PX = 1200
 _SKIN_LEVEL_DN = 150.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from gripmon.simulator.scenario import (
+from gripmon.simulate.scenario import (
     Background,
     BentFinger,
     Bump,

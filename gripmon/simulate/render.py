@@ -1,7 +1,7 @@
 """The picture before the sensor: background, fingers, object and covers with exact sub-pixel outlines.
 
 The background and the faces' textures are already as blurred as the lens makes them; the masks of
-:mod:`gripmon.simulator.coverage` carry the same blur, so that an outline is at its true place whatever lies beside it.
+:mod:`gripmon.simulate.coverage` carry the same blur, so that an outline is at its true place whatever lies beside it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
-from gripmon.simulator.background import TableView
-from gripmon.simulator.bodies import Bodies
-from gripmon.simulator.coverage import Coverage, CoverageRaster
-from gripmon.simulator.scenario import Scenario
-from gripmon.simulator.scene import Scene, SceneState
-from gripmon.simulator.surfaces import Painter, Surface
-from gripmon.simulator.viewing import RayGrid, enlarge_cells
+from gripmon.simulate.background import TableView
+from gripmon.simulate.bodies import Bodies
+from gripmon.simulate.coverage import Coverage, CoverageRaster
+from gripmon.simulate.scenario import Scenario
+from gripmon.simulate.scene import Scene, SceneState
+from gripmon.simulate.surfaces import Painter, Surface
+from gripmon.simulate.viewing import RayGrid, enlarge_cells
 
 _CARRIER_GAIN = 0.9
 _COVER_BLUR_PX = 1.0
