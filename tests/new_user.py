@@ -12,7 +12,7 @@ import numpy as np
 from plates import Look, pose, render
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.targets import CircleGrid
+from gripmon.calibrate.targets import CircleGrid
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper

@@ -11,7 +11,7 @@ import yaml
 from plates import Look, render
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.targets import Charuco, Chequerboard, CircleGrid, Target
+from gripmon.calibrate.targets import Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image

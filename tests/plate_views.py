@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.plane import Coincidence, FingerCorners, GivenCamera, KnownCorners, calibrate_plane
-from gripmon.calibration.sighting import Sighting
+from gripmon.calibrate.plane import Coincidence, FingerCorners, GivenCamera, KnownCorners, calibrate_plane
+from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import PaperLens
 
 LENS = PaperLens(width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7)

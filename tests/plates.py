@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from gripmon.calibration.targets import Charuco, Chequerboard, CircleGrid, Target
+from gripmon.calibrate.targets import Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation
 from gripmon.model.records import Array, Image

@@ -18,7 +18,7 @@ from laser_images import spot_image
 from laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml

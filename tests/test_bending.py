@@ -7,8 +7,8 @@ import pytest
 from plates import pose, true_uv
 from simulated import PAPER_LENS, STRONG_LENS
 
-from gripmon.calibration.bending import FEWEST, bends
-from gripmon.calibration.targets import Chequerboard
+from gripmon.calibrate.bending import FEWEST, bends
+from gripmon.calibrate.targets import Chequerboard
 from gripmon.model.camera import FisheyeLens, LensSettings
 
 BOARD = Chequerboard(9, 7, 0.01)

@@ -15,9 +15,9 @@ import pytest
 import yaml
 from plates import Look, fingers, pose, render
 
-from gripmon.calibration.documents import CameraCalibration
-from gripmon.calibration.intrinsics import lens_vector
-from gripmon.calibration.targets import parse_target
+from gripmon.calibrate.documents import CameraCalibration
+from gripmon.calibrate.intrinsics import lens_vector
+from gripmon.calibrate.targets import parse_target
 from gripmon.model.camera import BrownConradyLens, PaperLens
 from gripmon.cli import main
 from gripmon.cli.calibration_files import target_of

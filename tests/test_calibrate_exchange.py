@@ -16,7 +16,7 @@ from sample_messages import MEASURED, NOTHING
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
 from urdf_parser_py.urdf import URDF
 
-from gripmon.calibration.documents import (
+from gripmon.calibrate.documents import (
     CalibratedGripper,
     CameraCalibration,
     CameraResiduals,

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 from sightings import CAMERAS, PLATE_M, poses, seen
 
-from gripmon.calibration.intrinsics import (
+from gripmon.calibrate.intrinsics import (
     calibrate,
     calibrate_best,
     calibrate_single_view,
@@ -17,8 +17,8 @@ from gripmon.calibration.intrinsics import (
     lens_vector,
     plate_pose,
 )
-from gripmon.calibration.lens_models import MODELS
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.lens_models import MODELS
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import exp_rotation, log_rotation
 

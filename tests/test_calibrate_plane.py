@@ -14,7 +14,7 @@ from plates import Look
 from scipy.stats import chi2
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.documents import CameraCalibration, CameraResiduals, HandEyeCalibration
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals, HandEyeCalibration
 from gripmon.cli import main
 from gripmon.config import load_config, read_gripper
 from gripmon.config.recorded import from_recorded, to_recorded

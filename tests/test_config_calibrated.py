@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.config import ConfigError, load_config
 from gripmon.config.yaml_file import as_yaml, read_yaml
 from gripmon.track.edges.taught import gripper_digest

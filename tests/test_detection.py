@@ -11,10 +11,10 @@ import pytest
 from plates import Look, fingers, points_of, pose, render, true_uv
 from scipy.spatial import cKDTree
 
-from gripmon.calibration.chequers import _Turns
-from gripmon.calibration.detection import detect
-from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import Chequerboard, parse_target
+from gripmon.calibrate.chequers import _Turns
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.targets import Chequerboard, parse_target
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
 from gripmon.model.records import Array, Image
 

@@ -8,10 +8,10 @@ import pytest
 from plates import Look, fingers, points_of, pose, render, true_uv
 from scipy.spatial import cKDTree
 
-from gripmon.calibration.detection import detect
-from gripmon.calibration.discs import centre_offsets_px
-from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import Charuco, CircleGrid, Target, name_of, parse_target
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.discs import centre_offsets_px
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.targets import Charuco, CircleGrid, Target, name_of, parse_target
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 from gripmon.model.records import Array
 

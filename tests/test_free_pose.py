@@ -13,10 +13,10 @@ from plates import Look
 from scipy.stats import chi2
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.detection import detect
-from gripmon.calibration.free_pose import FreePose, off_plate
-from gripmon.calibration.plane import GivenCamera
-from gripmon.calibration.sighting import Sighting
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.free_pose import FreePose, off_plate
+from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.onboarding import KnownGripper

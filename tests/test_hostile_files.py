@@ -11,7 +11,7 @@ import pytest
 from gripmon_process import gripmon
 
 from gripmon.cli import main
-from gripmon.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
+from gripmon.calibrate.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
 from gripmon.sources import FolderSettings, FolderSource, SourceError
 from gripmon.sources.pulses import read_pulses
 

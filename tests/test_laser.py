@@ -21,7 +21,7 @@ from gripmon.laser.pointer.setup import (
     spots_on_rays,
 )
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturb
 
 

@@ -15,7 +15,7 @@ from laser_scenes import PAPER_LENS, paper_setup, sampled
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml

@@ -13,7 +13,7 @@ from gripmon.laser.pointer.planning import Arm, candidates, plan
 from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.setup import spots_on_plane
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturbation_between
 
 

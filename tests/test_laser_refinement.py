@@ -16,8 +16,8 @@ from gripmon.laser.pointer.setup import (
     LaserSetup,
 )
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
-from gripmon.calibration.lens_models import LensModel
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturb, perturbation_between
 
 

@@ -8,7 +8,7 @@ import pytest
 from laser_images import cluttered, spot_image
 
 from gripmon.laser.pointer.spots import find_spots
-from gripmon.calibration.sighting import NotFound
+from gripmon.calibrate.sighting import NotFound
 
 
 def errors(trials=30, *, off=False, **options):

@@ -23,11 +23,11 @@ from plates import Look
 from scipy.stats import chi2
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.detection import detect
-from gripmon.calibration.plane import Coincidence, GivenCamera
-from gripmon.calibration.plane_average import average
-from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.calibration.targets import CircleGrid, Target
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.plane import Coincidence, GivenCamera
+from gripmon.calibrate.plane_average import average
+from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.targets import CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper, contents_of, load_gripper

@@ -10,11 +10,11 @@ from plates import Look
 from scipy.stats import chi2
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.calibration.detection import detect
-from gripmon.calibration.plane import GivenCamera
-from gripmon.calibration.plate_pose import plate_pose
-from gripmon.calibration.sighting import Sighting
-from gripmon.calibration.targets import Target
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.plate_pose import plate_pose
+from gripmon.calibrate.sighting import Sighting
+from gripmon.calibrate.targets import Target
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.onboarding import UnknownGripper

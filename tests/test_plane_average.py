@@ -9,9 +9,9 @@ import pytest
 from plate_views import CORNERS_M, LENS, NAMES, Trial, solved, transform, trial
 from scipy.stats import chi2, kstest
 
-from gripmon.calibration.plane import Coincidence, FingerCorners, GivenCamera
-from gripmon.calibration.plane_average import PlaneCalibration, against, average
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.plane import Coincidence, FingerCorners, GivenCamera
+from gripmon.calibrate.plane_average import PlaneCalibration, against, average
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturb, perturbation_between
 
 TRUE = transform([np.radians(32.0), 0.0, 0.0], [0.0004, 0.0013, 0.115])

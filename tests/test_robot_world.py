@@ -10,8 +10,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import f
 
-from gripmon.calibration import robot_world
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate import robot_world
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.cli import main
 from gripmon.model.geometry import invert, make_transform, perturb, perturbation_between
 

@@ -12,12 +12,12 @@ import yaml
 from plates import pose, render
 from test_robot_world import columns, transform
 
-from gripmon.calibration.detection import detect
-from gripmon.calibration.documents import CameraCalibration, CameraResiduals
-from gripmon.calibration.intrinsics import plate_pose
-from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import parse_target
-from gripmon.calibration.upright import upright
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.intrinsics import plate_pose
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.targets import parse_target
+from gripmon.calibrate.upright import upright
 from gripmon.model.camera import BrownConradyLens
 from gripmon.cli import main
 from gripmon.config.yaml_file import as_yaml

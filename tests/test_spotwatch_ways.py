@@ -9,7 +9,7 @@ from pulsed_laser import calibration, drawn_world, poses, true_world
 
 from gripmon.laser.pointer.document import setup_of
 from gripmon.laser.pointer.setup import origin_axes, spots_between, spots_on_plane, spots_on_rays
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, perturb
 from gripmon.laser.watch.single import visible
 from gripmon.laser.watch.ways import INPUTS, disagreements, ways

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from simulated import STRONG_LENS
 
-from gripmon.calibration.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import builtin_config

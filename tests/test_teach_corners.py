@@ -14,7 +14,7 @@ from meters import WIDE_LENS
 from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
 from taught_by_hand import Rig, make_rig
 
-from gripmon.calibration.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.config import Settings, builtin_config, load_config

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from simulated import PAPER_LENS
 from taught_by_hand import Rig, make_rig
 
-from gripmon.calibration.plane import GivenCamera
+from gripmon.calibrate.plane import GivenCamera
 from gripmon.cli.plane_inputs import _read_rough
 from gripmon.monitor import MonitorSettings
 from gripmon.onboarding import UnknownGripper

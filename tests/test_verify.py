@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, ncx2
 
-from gripmon.calibration.lens_models import LensModel, parameter_names
-from gripmon.calibration.sighting import CalibrationError
-from gripmon.calibration.verify import (
+from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.verify import (
     CalibratedCamera,
     agreeing,
     compare_cameras,
@@ -18,7 +18,7 @@ from gripmon.calibration.verify import (
 )
 from gripmon.model.camera import FisheyeLens, PaperLens, make_camera
 from gripmon.model.geometry import perturb
-from gripmon.interchange.fitting import fit_brown_conrady
+from gripmon.calibrate.interchange.fitting import fit_brown_conrady
 
 NOMINAL = np.eye(4)
 NOMINAL[:3, :3] = Rotation.from_rotvec([0.5, 0.1, -0.2]).as_matrix()

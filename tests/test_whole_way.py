@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
-from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
+from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.cli import main
 from gripmon.config import load_config
 from gripmon.config.typed import to_settings

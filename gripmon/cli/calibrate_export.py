@@ -119,8 +119,8 @@ def _notes(source: Calibrated, arguments: argparse.Namespace) -> tuple[str, ...]
 
 
 def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.interchange.cameras import write_camera
-    from gripmon.interchange.fault import InterchangeError
+    from gripmon.calibrate.interchange.cameras import write_camera
+    from gripmon.calibrate.interchange.fault import InterchangeError
 
     if source.lens is None:
         raise common.CommandFailedError(
@@ -146,7 +146,7 @@ def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Name
 
 
 def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.interchange.hand_eye import HandEye, write_hand_eye
+    from gripmon.calibrate.interchange.hand_eye import HandEye, write_hand_eye
 
     if source.cam_T_grip is None:
         raise common.CommandFailedError(

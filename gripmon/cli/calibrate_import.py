@@ -54,10 +54,10 @@ def _size(text: str) -> tuple[int, int]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate import``."""
-    from gripmon.calibration.documents import CameraCalibration
+    from gripmon.calibrate.documents import CameraCalibration
     from gripmon.cli.calibration_sources import read_bytes
-    from gripmon.interchange.cameras import ReadOptions, format_of, read_camera
-    from gripmon.interchange.fault import InterchangeError
+    from gripmon.calibrate.interchange.cameras import ReadOptions, format_of, read_camera
+    from gripmon.calibrate.interchange.fault import InterchangeError
     from gripmon.model.provenance import provenance_of
 
     out, path = Path(arguments.out), Path(arguments.file)

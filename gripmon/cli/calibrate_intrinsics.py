@@ -15,9 +15,9 @@ from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.intrinsics import Fixed, IntrinsicsResult
-    from gripmon.calibration.sighting import Sighting
-    from gripmon.calibration.targets import Target
+    from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult
+    from gripmon.calibrate.sighting import Sighting
+    from gripmon.calibrate.targets import Target
 
 MODELS = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
 _FOLDS = 5
@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate intrinsics``."""
     import cv2
 
-    from gripmon.calibration.maps import draw_maps
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.maps import draw_maps
+    from gripmon.calibrate.sighting import CalibrationError
 
     cv2.setNumThreads(1)
     out, picture = Path(arguments.out), arguments.picture and Path(arguments.picture)
@@ -113,8 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _fixed(arguments: argparse.Namespace) -> Fixed:
     """What is held, and at which value; what can't be ends the command with exit code 2."""
-    from gripmon.calibration.lens_models import MODELS as ALL
-    from gripmon.calibration.lens_models import parameter_names
+    from gripmon.calibrate.lens_models import MODELS as ALL
+    from gripmon.calibrate.lens_models import parameter_names
 
     models = [m for m in ALL if arguments.model in (m, "auto") or (arguments.model is None and m != "fisheye")]
     known = list(dict.fromkeys(name for model in models for name in parameter_names(model)))
@@ -149,8 +149,8 @@ def _number(text: str) -> float | None:
 
 def _looked_at(paths: list[Path], target: Target) -> _Views:
     """The target in all images; ends the command where none shows it, or where they can't be of one camera."""
-    from gripmon.calibration.detection import detect
-    from gripmon.calibration.sighting import NotFound
+    from gripmon.calibrate.detection import detect
+    from gripmon.calibrate.sighting import NotFound
 
     views = _Views([], {})
     larger: list[str] = []
@@ -185,8 +185,8 @@ def _looked_at(paths: list[Path], target: Target) -> _Views:
 
 
 def _calibrated(sightings: list[Sighting], asked: str | None, fixed: Fixed) -> IntrinsicsResult:
-    from gripmon.calibration import intrinsics
-    from gripmon.calibration.lens_models import MODELS as ALL
+    from gripmon.calibrate import intrinsics
+    from gripmon.calibrate.lens_models import MODELS as ALL
 
     model: Any = "paper" if len(sightings) == 1 and asked in (None, "auto") else asked or "brown_conrady"
     if len(sightings) == 1:
@@ -204,7 +204,7 @@ def _calibrated(sightings: list[Sighting], asked: str | None, fixed: Fixed) -> I
 
 def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
     """Whether it may have been described as larger than it is: on a lattice without marks nothing else tells."""
-    from gripmon.calibration.targets import Charuco
+    from gripmon.calibrate.targets import Charuco
 
     if isinstance(target, Charuco):
         return []
@@ -226,8 +226,8 @@ def _document(
     paths: list[Path],
     arguments: argparse.Namespace,
 ) -> Any:
-    from gripmon.calibration.documents import CameraCalibration, CameraResiduals
-    from gripmon.calibration.targets import name_of
+    from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
+    from gripmon.calibrate.targets import name_of
     from gripmon.model.provenance import provenance_of
 
     options = {"--target": arguments.target, "--model": arguments.model, "--fix": arguments.fix}

@@ -11,7 +11,7 @@ from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.documents import CameraCalibration
+    from gripmon.calibrate.documents import CameraCalibration
     from gripmon.laser.pointer.calibrating import LaserResult, Spots
     from gripmon.laser.pointer.document import LaserCalibration
     from gripmon.laser.pointer.planning import Plan
@@ -156,7 +156,7 @@ def _calibrated(
     arguments: argparse.Namespace,
 ) -> LaserResult:
     from gripmon.laser.pointer.calibrating import calibrate
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.model.camera import make_camera
 
     try:
@@ -187,9 +187,9 @@ def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> Len
     """What the camera's file knows of its lens; None where it says nothing of its errors."""
     import numpy as np
 
-    from gripmon.calibration.intrinsics import lens_vector, model_of
+    from gripmon.calibrate.intrinsics import lens_vector, model_of
     from gripmon.laser.pointer.spot_problem import LensPrior
-    from gripmon.calibration.lens_models import LensModel, parameter_names
+    from gripmon.calibrate.lens_models import LensModel, parameter_names
 
     camera = calibration.camera
     count = len(calibration.parameters)
@@ -243,7 +243,7 @@ def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
 
 def _planned(result: LaserResult, arguments: argparse.Namespace) -> Plan | None:
     from gripmon.laser.pointer.planning import Arm, plan
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.sighting import CalibrationError
 
     if arguments.plan is None:
         return None

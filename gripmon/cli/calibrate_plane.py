@@ -85,8 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate plane``."""
     import cv2
 
-    from gripmon.calibration.plane_average import average
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.plane_average import average
+    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.cli import plane_inputs, plane_outputs
 
     plane_inputs.check_options(arguments)
@@ -112,7 +112,7 @@ def _looks(inputs: Inputs) -> tuple[list[Look], Image]:
     """What each image gives, and the first one that gives something; images that give nothing are said."""
     import sys
 
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.sighting import CalibrationError
 
     looks: list[Look] = []
     shown: Image | None = None
@@ -134,8 +134,8 @@ def _looks(inputs: Inputs) -> tuple[list[Look], Image]:
 
 
 def _look(method: KnownGripper | UnknownGripper, target: Any, path: Path, image: Image, rough: Rough | None) -> Look:
-    from gripmon.calibration.detection import detect
-    from gripmon.calibration.sighting import CalibrationError, NotFound
+    from gripmon.calibrate.detection import detect
+    from gripmon.calibrate.sighting import CalibrationError, NotFound
     from gripmon.onboarding import KnownGripper
 
     try:

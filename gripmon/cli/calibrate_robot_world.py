@@ -12,8 +12,8 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.laser.pointer.samples import Row
-    from gripmon.calibration.robot_world import RobotWorld
-    from gripmon.calibration.robot_world_document import RobotWorldCalibration
+    from gripmon.calibrate.robot_world import RobotWorld
+    from gripmon.calibrate.robot_world_document import RobotWorldCalibration
     from gripmon.model.records import Array
 
 _DESCRIPTION = """\
@@ -50,9 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate robot-world``."""
     import numpy as np
 
-    from gripmon.calibration import robot_world
-    from gripmon.calibration.robot_world_doubts import check_reading
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate import robot_world
+    from gripmon.calibrate.robot_world_doubts import check_reading
+    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.model.geometry import invert
 
     out = Path(arguments.out)
@@ -85,7 +85,7 @@ def _poses(arguments: argparse.Namespace) -> _Poses:
     import numpy as np
 
     from gripmon.laser.pointer.samples import check_scale, pose_of
-    from gripmon.calibration.robot_world_doubts import check_target_scale
+    from gripmon.calibrate.robot_world_doubts import check_target_scale
     from gripmon.cli.laser_tables import rows_of
 
     arm: list[Array] = []
@@ -155,11 +155,11 @@ class _Seer:
 
     def see(self, table: Path, row: Row, place: str) -> tuple[Array, Array] | None:
         """``cam_T_target`` and its covariance, None if the image doesn't show it; what is wrong ends the command."""
-        from gripmon.calibration.detection import detect
-        from gripmon.calibration.intrinsics import plate_pose
-        from gripmon.calibration.sighting import CalibrationError, NotFound, Sighting
-        from gripmon.calibration.targets import Chequerboard
-        from gripmon.calibration.upright import upright
+        from gripmon.calibrate.detection import detect
+        from gripmon.calibrate.intrinsics import plate_pose
+        from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+        from gripmon.calibrate.targets import Chequerboard
+        from gripmon.calibrate.upright import upright
         from gripmon.sources.folder import read_image
 
         if not row.get("image"):
@@ -190,7 +190,7 @@ class _Seer:
         return pose, covariance
 
     def _prepare(self) -> None:
-        from gripmon.calibration.targets import tells_its_turn
+        from gripmon.calibrate.targets import tells_its_turn
         from gripmon.config.calibrated import read_camera
         from gripmon.config.errors import ConfigError
 
@@ -215,7 +215,7 @@ class _Seer:
 def _document(found: RobotWorld, poses: _Poses, arguments: argparse.Namespace) -> RobotWorldCalibration:
     import numpy as np
 
-    from gripmon.calibration.robot_world_document import RobotWorldCalibration, RobotWorldResiduals
+    from gripmon.calibrate.robot_world_document import RobotWorldCalibration, RobotWorldResiduals
     from gripmon.model.geometry import invert, to_record
     from gripmon.model.provenance import provenance_of
 

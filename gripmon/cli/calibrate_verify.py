@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.verify import CameraDifference, HandEyeDifference
+    from gripmon.calibrate.verify import CameraDifference, HandEyeDifference
     from gripmon.cli.calibration_sources import Calibrated
 
 DEFAULT_LEVEL = 0.01
@@ -80,7 +80,7 @@ def _share(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate verify``."""
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.cli.calibration_sources import read_calibrated
 
     if (arguments.tolerance_mm is None) is not (arguments.tolerance_deg is None):
@@ -144,7 +144,7 @@ def _hand_eyes(
 ) -> dict[str, Any]:
     import numpy as np
 
-    from gripmon.calibration.verify import compare_hand_eye
+    from gripmon.calibrate.verify import compare_hand_eye
     from gripmon.model.geometry import from_record
 
     if arguments.tolerance_px is not None:
@@ -215,7 +215,7 @@ def _verdict(same: bool, within: bool, level: float, *, given: bool = True) -> s
 def _cameras(first: Calibrated, second: Calibrated, arguments: argparse.Namespace) -> dict[str, Any]:
     import numpy as np
 
-    from gripmon.calibration.verify import NEGLIGIBLE_PX, CalibratedCamera, compare_cameras
+    from gripmon.calibrate.verify import NEGLIGIBLE_PX, CalibratedCamera, compare_cameras
 
     if arguments.tolerance_mm is not None:
         raise common.CommandFailedError("--tolerance-mm: is for hand/eye calibrations; leave it out", common.EXIT_USAGE)

@@ -13,7 +13,7 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     import msgspec
 
-    from gripmon.calibration.targets import Target
+    from gripmon.calibrate.targets import Target
     from gripmon.model.records import Image
 
 
@@ -74,7 +74,7 @@ def read_images(paths: Sequence[Path]) -> list[Image]:
 
 def target_of(text: str, option: str = "--target") -> Target:
     """The target of a command line, or in the file that it names; a fault ends the command with exit code 2."""
-    from gripmon.calibration.targets import parse_target
+    from gripmon.calibrate.targets import parse_target
 
     if is_target_file(text):
         return _target_in(Path(text), option)
@@ -91,7 +91,7 @@ def is_target_file(text: str) -> bool:
 
 def _target_in(path: Path, option: str) -> Target:
     """Of a calibration that was made with it, or described by itself."""
-    from gripmon.calibration.targets import checked
+    from gripmon.calibrate.targets import checked
     from gripmon.config import ConfigError
     from gripmon.config.yaml_file import read_yaml
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.calibration.documents import CalibratedGripper
+    from gripmon.calibrate.documents import CalibratedGripper
     from gripmon.model.camera import LensSettings
     from gripmon.model.provenance import Provenance
     from gripmon.model.records import Transform

@@ -108,7 +108,7 @@ def _calibration(path: Path) -> LaserCalibration:
 
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
     """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
-    from gripmon.calibration.sighting import CalibrationError
+    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.laser.watch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
     from gripmon.laser.watch.world import calibrated
 

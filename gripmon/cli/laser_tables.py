@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from gripmon.laser.pointer.planning import Plan
     from gripmon.laser.pointer.samples import Samples
     from gripmon.laser.pointer.spots import Spot
-    from gripmon.calibration.sighting import NotFound
+    from gripmon.calibrate.sighting import NotFound
 
 _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
 
@@ -192,7 +192,7 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
 
     from gripmon.laser.pointer.calibrating import Spots
     from gripmon.laser.pointer.spots import find_spots as in_image
-    from gripmon.calibration.sighting import NotFound
+    from gripmon.calibrate.sighting import NotFound
 
     unseen = set(_unseen(samples))
     uv_px, covariances, others = samples.uv_px.copy(), np.tile(np.eye(2), (len(samples), 1, 1)), []

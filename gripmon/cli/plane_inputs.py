@@ -10,9 +10,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from gripmon.calibration.plane import GivenCamera
-from gripmon.calibration.sighting import CalibrationError
-from gripmon.calibration.targets import Target
+from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.targets import Target
 from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 from gripmon.config import Config, ConfigError, read_gripper

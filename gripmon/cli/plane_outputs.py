@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.calibration.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
-from gripmon.calibration.plane import Coincidence
-from gripmon.calibration.plane_average import PlaneCalibration
-from gripmon.calibration.sighting import CalibrationError
-from gripmon.calibration.targets import name_of
+from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.plane import Coincidence
+from gripmon.calibrate.plane_average import PlaneCalibration
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
 from gripmon.track.edges.taught import gripper_digest

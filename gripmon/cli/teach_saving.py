@@ -111,8 +111,8 @@ class FileSaving:
 
     @staticmethod
     def _check_sharp(pictures: Sequence[Picture]) -> None:
-        from gripmon.calibration.detection import BLURRED_PX
-        from gripmon.calibration.pictures import sharpest_blur_px, to_grey
+        from gripmon.calibrate.detection import BLURRED_PX
+        from gripmon.calibrate.pictures import sharpest_blur_px, to_grey
         from gripmon.teachpage import SavingRefused
 
         for picture in pictures:

@@ -96,10 +96,10 @@ def _on_plate(
     warnings: list[str],
 ) -> tuple[Array, Array]:
     """By the plane coincidence, as ``gripmon calibrate plane`` does it, with the known gripper."""
-    from gripmon.calibration.detection import detect
-    from gripmon.calibration.plane import GivenCamera
-    from gripmon.calibration.plane_average import average
-    from gripmon.calibration.sighting import CalibrationError, NotFound
+    from gripmon.calibrate.detection import detect
+    from gripmon.calibrate.plane import GivenCamera
+    from gripmon.calibrate.plane_average import average
+    from gripmon.calibrate.sighting import CalibrationError, NotFound
     from gripmon.model.geometry import from_record
     from gripmon.onboarding import KnownGripper
 
@@ -132,7 +132,7 @@ def _tracked(
     """
     import numpy as np
 
-    from gripmon.calibration.verify import agreeing, mean_of_one_scene
+    from gripmon.calibrate.verify import agreeing, mean_of_one_scene
     from gripmon.model.geometry import from_record
 
     assert first.cam_T_grip is not None

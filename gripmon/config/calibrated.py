@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from gripmon.calibration.documents import CameraCalibration, HandEyeCalibration
+from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.model.camera import LensSettings
 from gripmon.config.errors import ConfigError
 from gripmon.config.typed import Fault, SettingsError, to_settings

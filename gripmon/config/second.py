@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, make_camera
 from gripmon.config.calibrated import wrong_schema
 from gripmon.config.errors import ConfigError

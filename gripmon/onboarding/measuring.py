@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import block_diag
 
-from gripmon.calibration.free_pose import FreePose
-from gripmon.calibration.plane import FingerCorners
-from gripmon.calibration.plane_equations import FEWEST_CORNERS, stand
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.free_pose import FreePose
+from gripmon.calibrate.plane import FingerCorners
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, stand
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 from gripmon.model.gripper import Gripper

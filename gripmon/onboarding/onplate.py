@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gripmon.calibration.intrinsics import plate_pose
-from gripmon.calibration.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
-from gripmon.calibration.plane_average import PlaneCalibration, against
-from gripmon.calibration.sighting import CalibrationError, Sighting
-from gripmon.calibration.targets import Target
+from gripmon.calibrate.intrinsics import plate_pose
+from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
+from gripmon.calibrate.plane_average import PlaneCalibration, against
+from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.calibrate.targets import Target
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.onboarding.measuring import (

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import AxisMotion, EdgeModel, FingerModel, GripperModel, JawModel, PointModel
 from gripmon.model.provenance import Provenance

@@ -7,7 +7,7 @@ import itertools
 import cv2
 import numpy as np
 
-from gripmon.calibration.plane import Coincidence
+from gripmon.calibrate.plane import Coincidence
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.track.edges.profiles import full_scale
 from gripmon.model.records import Array, Image

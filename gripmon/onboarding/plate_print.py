@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.sighting import Sighting
-from gripmon.calibration.targets import Charuco, Chequerboard, Target
+from gripmon.calibrate.sighting import Sighting
+from gripmon.calibrate.targets import Charuco, Chequerboard, Target
 from gripmon.model.camera import Camera
 from gripmon.track.edges.profiles import read_profiles
 from gripmon.model.records import Array, Image

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.track.edges.prediction import ROWS
 from gripmon.track.edges.profiles import (

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibration.intrinsics import lens_vector, model_of
-from gripmon.calibration.lens_models import LensModel, parameter_names
+from gripmon.calibrate.intrinsics import lens_vector, model_of
+from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gripmon import __version__
 from gripmon.model.atomic import write_atomically
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.onboarding.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
 from gripmon.teachpage.desk import BadRequest, Picture, encoded
 from gripmon.teachpage.messages import PictureInfo, Place, Put, Reply, Saved, SaveOrder, State

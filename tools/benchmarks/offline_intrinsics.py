@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.offline_images import views
-from gripmon.calibration.detection import detect
-from gripmon.calibration.intrinsics import calibrate
-from gripmon.calibration.sighting import Sighting
-from gripmon.calibration.targets import Chequerboard
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.intrinsics import calibrate
+from gripmon.calibrate.sighting import Sighting
+from gripmon.calibrate.targets import Chequerboard
 from gripmon.model.camera import BrownConradyLens, LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation
 from gripmon.model.records import Array

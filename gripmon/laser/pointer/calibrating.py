@@ -15,7 +15,7 @@ from gripmon.laser.pointer.misreading import SUSPECT_PX, check_reading
 from gripmon.laser.pointer.refinement import Refined, refine
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 

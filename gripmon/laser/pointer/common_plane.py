@@ -27,7 +27,7 @@ from gripmon.laser.pointer.closed_form import (
 )
 from gripmon.laser.pointer.planar_start import SUBSET, planar_start
 from gripmon.laser.pointer.setup import LaserSetup, basis
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 

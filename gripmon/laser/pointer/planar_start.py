@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.laser.pointer.setup import basis
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)

@@ -18,7 +18,7 @@ from scipy.stats import f as fisher_f
 
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
 from gripmon.laser.pointer.spot_problem import SpotProblem, State
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import LensSettings
 from gripmon.model.records import Array
 

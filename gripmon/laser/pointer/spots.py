@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.sighting import NotFound
+from gripmon.calibrate.sighting import NotFound
 from gripmon.model.records import Array, Image
 
 BACKGROUND_PX = 31

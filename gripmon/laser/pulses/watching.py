@@ -11,7 +11,7 @@ import numpy as np
 
 from gripmon.laser.pointer.document import LaserCalibration, setup_of
 from gripmon.laser.pointer.spots import Spot, find_spots
-from gripmon.calibration.sighting import NotFound
+from gripmon.calibrate.sighting import NotFound
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import from_record, perturb, quaternion_xyzw, skew
 from gripmon.judge.policy import AlertBook

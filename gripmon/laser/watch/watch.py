@@ -9,7 +9,7 @@ import numpy as np
 
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.spots import Spot
-from gripmon.calibration.sighting import NotFound
+from gripmon.calibrate.sighting import NotFound
 from gripmon.judge.policy import AlertBook
 from gripmon.model.records import Alert, State, Verdict
 from gripmon.laser.watch import words
@@ -43,7 +43,7 @@ class SpotWatch:
     """
 
     def __init__(self, calibration: LaserCalibration, settings: SpotWatchSettings | None = None):
-        """Raises :class:`~gripmon.calibration.sighting.CalibrationError` for a file whose numbers make no set-up,
+        """Raises :class:`~gripmon.calibrate.sighting.CalibrationError` for a file whose numbers make no set-up,
         ValueError for a camera that can't be meant.
         """
         self.settings = settings or SpotWatchSettings()

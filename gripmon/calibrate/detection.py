@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibration import blobs, chequers, symmetry
-from gripmon.calibration.bending import bends
-from gripmon.calibration.counting import ends_all_round
-from gripmon.calibration.lattice import Index
-from gripmon.calibration.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
-from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
+from gripmon.calibrate import blobs, chequers, symmetry
+from gripmon.calibrate.bending import bends
+from gripmon.calibrate.counting import ends_all_round
+from gripmon.calibrate.lattice import Index
+from gripmon.calibrate.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.records import Array, Image
 
 _CHARUCO = cv2.aruco.CharucoParameters()

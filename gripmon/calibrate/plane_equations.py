@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb, perturbation_between, skew
 from gripmon.model.records import Array

@@ -1,6 +1,6 @@
 """``cam_T_grip`` from images of the gripper standing on a calibration plate, with what every error does to it.
 
-The method's equations stand in :mod:`gripmon.calibration.plane_equations`; here are one image with its covariance, and
+The method's equations stand in :mod:`gripmon.calibrate.plane_equations`; here are one image with its covariance, and
 several images together.  Errors are carried through the whole solution by central differences, one independent error
 at a time: of the plate's pose, of the corners, and of the camera.
 """
@@ -14,12 +14,12 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from gripmon.calibration.bundle import Bundle
-from gripmon.calibration.free_pose import FreePose, off_plate
-from gripmon.calibration.intrinsics import lens_vector, model_of, plate_pose
-from gripmon.calibration.lens_models import LensModel, parameter_names
-from gripmon.calibration.plane_equations import FEWEST_CORNERS, INFERRED_FROM, Standing, stand
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.bundle import Bundle
+from gripmon.calibrate.free_pose import FreePose, off_plate
+from gripmon.calibrate.intrinsics import lens_vector, model_of, plate_pose
+from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, Standing, stand
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array

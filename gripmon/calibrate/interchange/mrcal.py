@@ -9,7 +9,7 @@ import ast
 from collections.abc import Sequence
 
 from gripmon.model.camera import LensSettings
-from gripmon.interchange.fault import (
+from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
     numbers_of,

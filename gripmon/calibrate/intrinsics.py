@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.bundle import DEGENERATE, Bundle, BundleProblem
-from gripmon.calibration.doubts import USELESS_FOCAL, check_fit, doubts_of
-from gripmon.calibration.lens_models import LensModel, ModelName, parameter_names
-from gripmon.calibration.plate_pose import lens_vector, merit, model_of, plate_pose, plate_pose_start
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.bundle import DEGENERATE, Bundle, BundleProblem
+from gripmon.calibrate.doubts import USELESS_FOCAL, check_fit, doubts_of
+from gripmon.calibrate.lens_models import LensModel, ModelName, parameter_names
+from gripmon.calibrate.plate_pose import lens_vector, merit, model_of, plate_pose, plate_pose_start
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import log_rotation
 from gripmon.model.records import Array

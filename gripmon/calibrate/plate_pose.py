@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from gripmon.calibration.bundle import Bundle, BundleProblem
-from gripmon.calibration.lens_models import LensModel, ModelName
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.bundle import Bundle, BundleProblem
+from gripmon.calibrate.lens_models import LensModel, ModelName
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import LensSettings
 from gripmon.model.records import Array
 

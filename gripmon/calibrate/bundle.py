@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.discs import centre_offsets_px
-from gripmon.calibration.lens_models import LensModel
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.discs import centre_offsets_px
+from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Array
 

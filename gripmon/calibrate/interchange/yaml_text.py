@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from gripmon.interchange.fault import InterchangeError
+from gripmon.calibrate.interchange.fault import InterchangeError
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types

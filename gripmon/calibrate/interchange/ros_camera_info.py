@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from gripmon.model.camera import LensSettings
-from gripmon.interchange.fault import (
+from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
     fisheye,
@@ -22,7 +22,7 @@ from gripmon.interchange.fault import (
     value_at,
     whole_number_of,
 )
-from gripmon.interchange.yaml_text import read_mapping
+from gripmon.calibrate.interchange.yaml_text import read_mapping
 
 _RIGHT = "a camera_info file of ROS: image_width, camera_matrix, distortion_model, …"
 _MODELS = "plumb_bob, rational_polynomial or equidistant"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibration.lattice import Index, find_lattice, trimmed
-from gripmon.calibration.pictures import Grey, to_bytes
+from gripmon.calibrate.lattice import Index, find_lattice, trimmed
+from gripmon.calibrate.pictures import Grey, to_bytes
 from gripmon.model.records import Array
 
 SMALLEST_PX = 4.0

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gripmon.model.camera import LensSettings
-from gripmon.interchange import kalibr, mrcal, opencv_storage, ros_camera_info
-from gripmon.interchange.fault import InterchangeError
-from gripmon.interchange.fitting import fit_brown_conrady
+from gripmon.calibrate.interchange import kalibr, mrcal, opencv_storage, ros_camera_info
+from gripmon.calibrate.interchange.fault import InterchangeError
+from gripmon.calibrate.interchange.fitting import fit_brown_conrady
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gripmon.calibration import robot_world
-from gripmon.calibration.robot_world import FEWEST_POSES, RobotWorld
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate import robot_world
+from gripmon.calibrate.robot_world import FEWEST_POSES, RobotWorld
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.records import Array
 
 FARTHEST_M = 20.0

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gripmon.calibration.pictures import to_grey
-from gripmon.calibration.sighting import NotFound, Sighting
-from gripmon.calibration.targets import Chequerboard
+from gripmon.calibrate.pictures import to_grey
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.calibrate.targets import Chequerboard
 from gripmon.model.records import Image
 
 LEAST_CONTRAST = 0.2

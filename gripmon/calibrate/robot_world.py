@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from gripmon.calibration.robot_world_noise import arm_sigmas, arm_slopes, with_arm
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.robot_world_noise import arm_sigmas, arm_slopes, with_arm
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturb, skew
 from gripmon.model.records import Array
 

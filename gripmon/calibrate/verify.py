@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from gripmon.calibration.intrinsics import lens_vector, model_of
-from gripmon.calibration.lens_models import LensModel, parameter_names
-from gripmon.calibration.sighting import CalibrationError
+from gripmon.calibrate.intrinsics import lens_vector, model_of
+from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.model.camera import LensSettings
-from gripmon.interchange.fault import (
+from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
     fisheye,
@@ -16,7 +16,7 @@ from gripmon.interchange.fault import (
     value_at,
     whole_number_of,
 )
-from gripmon.interchange.yaml_text import read_mapping
+from gripmon.calibrate.interchange.yaml_text import read_mapping
 
 _RIGHT = "a camchain of Kalibr: cam0: {camera_model, intrinsics, distortion_model, …}"
 _COUNTS = {"radtan": (4,), "equidistant": (4,), "none": (0,)}

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibration.pictures import Grey
+from gripmon.calibrate.pictures import Grey
 from gripmon.model.records import Array
 
 BARE = 0.3

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from gripmon.model.camera import LensSettings
-from gripmon.interchange.fault import (
+from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
     fisheye,

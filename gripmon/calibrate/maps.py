@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gripmon.calibration.intrinsics import IntrinsicsResult
-from gripmon.calibration.sighting import Sighting
+from gripmon.calibrate.intrinsics import IntrinsicsResult
+from gripmon.calibrate.sighting import Sighting
 from gripmon.model.records import Array, Image
 
 _MAP_PX = 900

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gripmon.calibration.bundle import DEGENERATE, Bundle
-from gripmon.calibration.lens_models import LensModel
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.bundle import DEGENERATE, Bundle
+from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.records import Array
 
 if TYPE_CHECKING:
-    from gripmon.calibration.intrinsics import IntrinsicsResult
+    from gripmon.calibrate.intrinsics import IntrinsicsResult
 
 DOUBTFUL_FOCAL = 0.01
 """Relative standard deviation of the focal length from which the views are said not to support it; and the one from

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from gripmon.model.geometry import from_record, invert, to_record
-from gripmon.interchange.fault import number_text
+from gripmon.calibrate.interchange.fault import number_text
 from gripmon.model.records import Array, Transform
 
 FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")

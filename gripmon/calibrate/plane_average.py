@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from gripmon.calibration.plane import DOUBTED, Coincidence, corners_of, lengths_of
-from gripmon.calibration.plane_equations import FEWEST_CORNERS
-from gripmon.calibration.sighting import CalibrationError, Sighting
+from gripmon.calibrate.plane import DOUBTED, Coincidence, corners_of, lengths_of
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array
 
