@@ -23,7 +23,7 @@ from recorded import (
     wait_until,
 )
 
-from gripmon.recording import ProcessRecorder, open_recorder
+from gripmon.record.write import ProcessRecorder, open_recorder
 from gripmon.model.records import (
     Alert,
     AlertEvent,

@@ -15,7 +15,7 @@ import numpy as np
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, to_record
 from gripmon.model.gripper import load_gripper
-from gripmon.recording import ProcessRecorder, RecordingSettings, open_recorder
+from gripmon.record.write import ProcessRecorder, RecordingSettings, open_recorder
 from gripmon.model.records import (
     Alert,
     CornerFault,

@@ -10,7 +10,7 @@ import numpy as np
 import recorded
 
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, rotation_angle, to_record
-from gripmon.playback import FrameTable, Picture
+from gripmon.record.read import FrameTable, Picture
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -42,7 +42,7 @@ _DIFFERENT = 50
 
 @dataclass
 class Run:
-    """What :class:`gripmon.playback.Recording` has."""
+    """What :class:`gripmon.record.read.Recording` has."""
 
     records: list[FrameRecord]
     robot: str = "arm"

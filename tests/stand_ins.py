@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from loopback import frame_record, reference_record
 
-from gripmon.recording import Notes, Trace
+from gripmon.record.write import Notes, Trace
 from gripmon.model.records import (
     AlertRecord,
     Command,

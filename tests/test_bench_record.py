@@ -84,7 +84,7 @@ def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     plan = record_hour.Plan(size=SIZE, ring=6, frames=360, in_file=120, quiet=60, moving=60)
     written = record_hour.write(ring, ring, tmp_path, plan)
     assert (written["frames"], written["files"], written["images"]) == (360, 3, 60)
-    from gripmon.playback import open_recordings
+    from gripmon.record.read import open_recordings
 
     (recording,) = open_recordings([tmp_path]).recordings
     assert recording.frames.seq.tolist() == list(range(360))

@@ -21,9 +21,9 @@ import pytest
 import sample_messages
 from loopback import frame_record, reference_record, state_record
 
-from gripmon.export import SCHEMAS, Exporter
-from gripmon.export.export import ROWS_A_GROUP
-from gripmon.playback import FrameTable
+from gripmon.record.export import SCHEMAS, Exporter
+from gripmon.record.export.export import ROWS_A_GROUP
+from gripmon.record.read import FrameTable
 from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
@@ -287,7 +287,7 @@ def test_the_page_lists_every_column():
 def test_the_schema_says_units_version_and_itself(tmp_path: Path):
     export(tmp_path, Run(moving(3)))
     schema = pq.read_schema(tmp_path / "frames" / files(tmp_path)[0])
-    assert schema.metadata[b"gripmon.schema"] == b"gripmon.export.frames/1" and schema.metadata[b"gripmon.version"]
+    assert schema.metadata[b"gripmon.schema"] == b"gripmon.record.export.frames/1" and schema.metadata[b"gripmon.version"]
     units = json.loads(schema.metadata[b"gripmon.units"])
     for name in schema.names:
         for suffix in ("m", "rad", "px", "ns"):
@@ -297,7 +297,7 @@ def test_the_schema_says_units_version_and_itself(tmp_path: Path):
 
 def test_row_groups_let_readers_skip_by_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert ROWS_A_GROUP >= 10_000
-    monkeypatch.setattr("gripmon.export.export.ROWS_A_GROUP", 64)
+    monkeypatch.setattr("gripmon.record.export.export.ROWS_A_GROUP", 64)
     export(tmp_path, Run(moving(200)))
     about = pq.ParquetFile(tmp_path / "frames" / files(tmp_path)[0]).metadata
     assert [about.row_group(i).num_rows for i in range(about.num_row_groups)] == [64, 64, 64, 8]

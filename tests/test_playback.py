@@ -25,7 +25,7 @@ from playback_runs import (
 )
 from recorded import REFERENCE, frame, image, record, trace, wait_until
 
-from gripmon.playback import FrameTable, Recording, decode_image, open_recordings, recordings_below
+from gripmon.record.read import FrameTable, Recording, decode_image, open_recordings, recordings_below
 from gripmon.model.records import to_json
 
 

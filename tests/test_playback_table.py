@@ -11,7 +11,7 @@ from playback_runs import lines, records_of_a_run
 from recorded import record
 
 from gripmon.model.geometry import from_record
-from gripmon.playback import FrameTable
+from gripmon.record.read import FrameTable
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
 
 

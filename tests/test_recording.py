@@ -30,7 +30,7 @@ from recorded import (
 )
 
 from gripmon.model.geometry import rotation_from_xyzw
-from gripmon.recording import NullRecorder, RecordingSettings, open_recorder
+from gripmon.record.write import NullRecorder, RecordingSettings, open_recorder
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -20,8 +20,8 @@ from recorded import Recorded, frame, record, recorder, trace, wait_until
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
-from gripmon.recording import ProcessRecorder
-from gripmon.recording.health import SILENT_AFTER_S, Health
+from gripmon.record.write import ProcessRecorder
+from gripmon.record.write.health import SILENT_AFTER_S, Health
 from gripmon.model.records import AlertEvent, AlertKind, Severity
 
 LONG_S = 60.0

@@ -34,10 +34,10 @@ from recorded import (
 )
 
 from gripmon.model.geometry import make_transform, to_record
-from gripmon.recording import ProcessRecorder
-from gripmon.recording.files import FileSeries
-from gripmon.recording.rows import Row
-from gripmon.recording.wire import make_scene
+from gripmon.record.write import ProcessRecorder
+from gripmon.record.write.files import FileSeries
+from gripmon.record.write.rows import Row
+from gripmon.record.write.wire import make_scene
 from gripmon.model.records import ReferenceRecord
 
 HERE = Path(__file__).parent
@@ -205,8 +205,8 @@ def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(tmp_path: Path
 
 def test_space_that_the_disk_must_keep_pauses_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = [2_000_000_000]
-    monkeypatch.setattr("gripmon.recording.budget.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
-    monkeypatch.setattr("gripmon.recording.files._FIRST_RETRY_S", 0.0)
+    monkeypatch.setattr("gripmon.record.write.budget.shutil.disk_usage", lambda _: SimpleNamespace(free=free[0]))
+    monkeypatch.setattr("gripmon.record.write.files._FIRST_RETRY_S", 0.0)
     keeping = settings(min_free_bytes=1_000_000_000)
     files = FileSeries(make_scene(keeping, str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE))
     files.add_frames([Row(record(0), None, None, None)])

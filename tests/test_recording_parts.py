@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recorded import HEIGHT_PX, WIDTH_PX
 
-from gripmon.recording import palette
-from gripmon.recording.overlay import _label_places
-from gripmon.recording.wire import ImageRing, Unframer, framed
-from gripmon.recording.worker import to_8_bit
+from gripmon.record.write import palette
+from gripmon.record.write.overlay import _label_places
+from gripmon.record.write.wire import ImageRing, Unframer, framed
+from gripmon.record.write.worker import to_8_bit
 from gripmon.model.records import State, Verdict
 
 

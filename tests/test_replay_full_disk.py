@@ -12,7 +12,7 @@ from gripmon_process import GRIPMON
 from small_disks import small_disk
 
 from gripmon.cli import main
-from gripmon.playback import open_recordings
+from gripmon.record.read import open_recordings
 
 ROOT = Path(__file__).resolve().parent.parent
 DISK_BYTES = 3_000_000

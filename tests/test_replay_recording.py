@@ -25,7 +25,7 @@ from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
 from gripmon.config import load_config
 from gripmon.config.recorded import to_recorded
-from gripmon.recording import open_recorder
+from gripmon.record.write import open_recorder
 from gripmon.model.records import (
     Alert,
     AlertEvent,

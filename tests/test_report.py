@@ -14,7 +14,7 @@ from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
 from gripmon.hindsight import correct
-from gripmon.playback import Picture
+from gripmon.record.read import Picture
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,

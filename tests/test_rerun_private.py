@@ -10,10 +10,10 @@ import rerun as rr
 from recorded import frame, record, recorder
 from rerun.chunk import LazyStore
 
-from gripmon.playback import open_recordings
-from gripmon.recording import wire
-from gripmon.recording.files import FileSeries
-from gripmon.rerun_private import RerunChangedError
+from gripmon.record.read import open_recordings
+from gripmon.record.write import wire
+from gripmon.record.write.files import FileSeries
+from gripmon.record.rerun_private import RerunChangedError
 
 GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
 

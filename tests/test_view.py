@@ -29,7 +29,7 @@ from rerun.chunk import RrdReader
 
 from gripmon.cli import main
 from gripmon.config import builtin_config
-from gripmon.recording import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
+from gripmon.record.write import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"
 MAGENTA = (255, 0, 255)

@@ -233,7 +233,7 @@ def _document(
 
 
 def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
-    from gripmon.recording.laser_scene import write
+    from gripmon.record.write.laser_scene import write
 
     try:
         write(path, result.refined, base_T_ee, result.uv_px)

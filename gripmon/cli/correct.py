@@ -14,7 +14,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.hindsight import Correction
-    from gripmon.playback import Collection, Recording
+    from gripmon.record.read import Collection, Recording
 
 _DESCRIPTION = """\
 Estimate cam_T_grip for every frame of a recording once more, from all frames before and after it:
@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
     common.make_directory(out.parent)
     if out.is_dir():
         raise common.CommandFailedError(f"--out {out}: is a folder; a file", common.EXIT_USAGE)
-    from gripmon.playback import open_recordings
+    from gripmon.record.read import open_recordings
 
     found = open_recordings(paths)
     if not found.recordings:
@@ -158,7 +158,7 @@ def _corrected(found: Collection, wanted_ns: Any) -> list[CorrectedRun]:
 
 
 def correct_table(frames: Any, step: Any) -> Correction:
-    """Correct the frames of a table (:class:`gripmon.playback.FrameTable`)."""
+    """Correct the frames of a table (:class:`gripmon.record.read.FrameTable`)."""
     import numpy as np
 
     from gripmon.hindsight import correct
@@ -251,7 +251,7 @@ def _write(targets: list[Path], runs: list[CorrectedRun], inputs: list[tuple[str
             elif target.suffix.lower() == ".parquet":
                 corrected.write_parquet(part, runs, inputs)
             else:
-                from gripmon.recording.track import write_track
+                from gripmon.record.write.track import write_track
 
                 recording, about = runs[number].recording, corrected.provenance(runs, inputs)
                 write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)

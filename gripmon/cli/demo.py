@@ -127,7 +127,7 @@ def _demo_config(arguments: argparse.Namespace) -> Config:
     publish = msgspec.structs.replace(settings.publish, listen=(f"tcp/127.0.0.1:{_free_port()}",))
     view = settings.view
     if arguments.view is not None:
-        from gripmon.recording.viewer import free_port
+        from gripmon.record.write.viewer import free_port
 
         view = msgspec.structs.replace(view, port=free_port(view.port), web_port=free_port(view.web_port))
     settings = msgspec.structs.replace(settings, source=source, publish=publish, view=view)

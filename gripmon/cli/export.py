@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.export import Exporter
+    from gripmon.record.export import Exporter
 
 _DESCRIPTION = """\
 Write what recordings hold as Parquet, partitioned by robot, camera and day (UTC), so that months of
@@ -52,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon export``."""
     files = _files([Path(text) for text in arguments.recordings])
     out = common.make_directory(Path(arguments.out))
-    from gripmon.export import SCHEMAS, Exporter
+    from gripmon.record.export import SCHEMAS, Exporter
 
     exporter = Exporter(out)
     faults = _export(exporter, files)
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _files(paths: Sequence[Path]) -> list[Path]:
     """The files that are meant, each once; what isn't there ends the command."""
-    from gripmon.playback import recordings_below
+    from gripmon.record.read import recordings_below
 
     files: list[Path] = []
     for path in paths:
@@ -84,7 +84,7 @@ def _files(paths: Sequence[Path]) -> list[Path]:
 
 def _export(exporter: Exporter, files: Sequence[Path]) -> list[str]:
     """Export file by file, so that memory holds one of them; what could not be used, one line each."""
-    from gripmon.playback import open_recordings
+    from gripmon.record.read import open_recordings
 
     faults: list[str] = []
     sizes = [file.stat().st_size for file in files]

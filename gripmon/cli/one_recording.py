@@ -16,7 +16,7 @@ def keep(written: Sequence[Path], path: Path, failure: str | None, *, whole: boo
     One that isn't ``whole``, lacks its footer, or went into several files because writing failed in between, is
     removed, and the command ends with one line and exit code 3.  ``failure`` is what the recorder says of it.
     """
-    from gripmon.recording.repair import is_complete
+    from gripmon.record.write.repair import is_complete
 
     reason = failure
     try:

@@ -17,8 +17,8 @@ from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.playback.replayed import RecordedFrames
-    from gripmon.recording.compared import ComparedRecorder
+    from gripmon.record.read.replayed import RecordedFrames
+    from gripmon.record.write.compared import ComparedRecorder
     from gripmon.model.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
@@ -38,7 +38,7 @@ def is_recording(paths: list[Path]) -> bool:
 
 def recording_files(paths: list[Path]) -> list[Path]:
     """The files that are meant; a folder stands for those in it and below."""
-    from gripmon.playback import recordings_below
+    from gripmon.record.read import recordings_below
 
     files: list[Path] = []
     for path in paths:
@@ -55,7 +55,7 @@ class RecordedRun:
 
     def __init__(self, paths: list[Path], config_path: str | None, opened: contextlib.ExitStack) -> None:
         """``config_path`` None: the recorded configuration.  What is opened is closed with ``opened``."""
-        from gripmon.playback.replayed import RecordedFrames, SeveralRunsError, UnusableError
+        from gripmon.record.read.replayed import RecordedFrames, SeveralRunsError, UnusableError
 
         try:
             self.source: RecordedFrames = RecordedFrames(recording_files(paths))
@@ -100,8 +100,8 @@ class RecordedRun:
     def compared_in(self, name: str) -> Iterator[ComparedRecorder]:
         """A recorder into one file that shows what was recorded and what is replayed, overlaid."""
         from gripmon.config.recorded import to_recorded
-        from gripmon.recording.compared import ComparedRecorder
-        from gripmon.recording.wire import make_scene
+        from gripmon.record.write.compared import ComparedRecorder
+        from gripmon.record.write.wire import make_scene
 
         path, config = Path(name), self.config
         if path.is_dir():
@@ -205,7 +205,7 @@ def _limits(config: Config | None) -> Limits | None:
 
 def _holds_recordings(path: Path) -> bool:
     if path.is_dir():
-        from gripmon.playback import recordings_below
+        from gripmon.record.read import recordings_below
 
         return bool(recordings_below(path))
     return path.suffix.lower() == _ENDING

@@ -21,7 +21,7 @@ from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
-    from gripmon.recording import Recorder
+    from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord
     from gripmon.sources import Source
 
@@ -155,7 +155,7 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
 
 def _refuse_empty_folder(paths: list[Path]) -> None:
     """Before anything else is asked for, which would not help."""
-    from gripmon.playback import recordings_below
+    from gripmon.record.read import recordings_below
     from gripmon.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
 
     for path in paths:
@@ -297,7 +297,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
     import msgspec
 
     from gripmon.config.recorded import to_recorded
-    from gripmon.recording import NullRecorder, open_recorder
+    from gripmon.record.write import NullRecorder, open_recorder
 
     if name is None:
         yield NullRecorder()
@@ -347,7 +347,7 @@ def _missing(recorder: Recorder) -> str | None:
 @contextmanager
 def _told_at_the_end() -> Iterator[None]:
     """What a daemon logs of its recording while it goes on, a replay says in one line when it is over."""
-    logger = logging.getLogger("gripmon.recording")
+    logger = logging.getLogger("gripmon.record.write")
     propagates, silent = logger.propagate, logging.NullHandler()
     logger.addHandler(silent)
     logger.propagate = False

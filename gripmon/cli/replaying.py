@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
-    from gripmon.recording import Recorder
+    from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
     from gripmon.sources import Source
 

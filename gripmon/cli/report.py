@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.playback import Collection
+    from gripmon.record.read import Collection
 
 _DESCRIPTION = """\
 Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
@@ -116,7 +116,7 @@ def _write(write: Any, path: Path, data: bytes, option: str) -> None:
 
 def _read(paths: list[Path]) -> Collection:
     """All recordings; ends the command where there is none, or nothing in them."""
-    from gripmon.playback import open_recordings
+    from gripmon.record.read import open_recordings
 
     for path in paths:
         if not path.exists():

@@ -15,7 +15,7 @@ from gripmon.cli import camera_source, common, promising, second_run, viewing
 if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.monitor import Monitor
-    from gripmon.recording import Recorder
+    from gripmon.record.write import Recorder
     from gripmon.model.records import Alert, MonitorState
     from gripmon.judge.statefile import StateFile
 
@@ -234,7 +234,7 @@ def _open_recorder(
     patience_s: float,
 ) -> Recorder:
     from gripmon.config.recorded import to_recorded
-    from gripmon.recording import open_recorder
+    from gripmon.record.write import open_recorder
 
     settings = config.settings
     try:

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gripmon.config import SecondConfig
     from gripmon.daemon import Reports
     from gripmon.publish import SpotPublisher, ZenohCommands, ZenohPulses
-    from gripmon.recording import SpotRecorder
+    from gripmon.record.write import SpotRecorder
     from gripmon.wire import Link
 
 
@@ -159,7 +159,7 @@ def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublish
 def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None, patience_s: float) -> SpotRecorder:
     """The recording that the configuration wants; ends the command with exit code 2 where it can't be made."""
     from gripmon.config.recorded import second_to_recorded
-    from gripmon.recording import open_spot_recorder
+    from gripmon.record.write import open_spot_recorder
 
     settings = config.settings
     try:

@@ -17,7 +17,7 @@ from gripmon.cli import common
 from gripmon.cli.recorded_run import recording_files
 
 if TYPE_CHECKING:
-    from gripmon.recording.viewer import WebPage
+    from gripmon.record.write.viewer import WebPage
 
 _DESCRIPTION = """\
 Show recordings in rerun's viewer: in a window where there is a display, else as a page for a browser
@@ -59,7 +59,7 @@ def add_parser(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
     from gripmon.daemon import sigterm_exits
-    from gripmon.recording.viewer import NativeViewer, ViewerError, has_display
+    from gripmon.record.write.viewer import NativeViewer, ViewerError, has_display
 
     files = recording_files([Path(name) for name in arguments.recordings])
     for path in files:
@@ -81,8 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
 @contextmanager
 def _served(files: list[Path], port: int | None) -> Iterator[WebPage]:
     """The page and, from this process, the files that it shows; all of it on loopback."""
-    from gripmon.recording.view import LOOPBACK
-    from gripmon.recording.viewer import ViewerError, WebPage, free_port, is_free
+    from gripmon.record.write.view import LOOPBACK
+    from gripmon.record.write.viewer import ViewerError, WebPage, free_port, is_free
 
     if port is not None and not is_free(port):
         raise common.CommandFailedError(

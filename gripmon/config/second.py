@@ -24,7 +24,7 @@ from gripmon.metrics import MetricsSettings
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.recording import RecordingSettings, ViewSettings
+from gripmon.record.write import RecordingSettings, ViewSettings
 from gripmon.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
 from gripmon.sources.pulses import read_pulses
 from gripmon.laser.watch import SpotWatchSettings

@@ -11,7 +11,7 @@ from gripmon.model.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.metrics import MetricsSettings
 from gripmon.monitor import MonitorSettings
-from gripmon.recording import RecordingSettings, ViewSettings
+from gripmon.record.write import RecordingSettings, ViewSettings
 from gripmon.ros2 import JointOpening, Ros2Settings
 from gripmon.sources import SourceSettings
 from gripmon.judge.statefile import StateSettings

@@ -30,7 +30,7 @@ from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.recording import EventRecorder, Recorder, SpotRecorder
+from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
 from gripmon.model.records import Alert
 from gripmon.sources import Source
 

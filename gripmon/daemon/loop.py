@@ -15,7 +15,7 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import Loop, StopRequest, in_short
 from gripmon.publish import Publisher
-from gripmon.recording import Recorder
+from gripmon.record.write import Recorder
 from gripmon.model.records import (
     Alert,
     Command,

@@ -20,7 +20,7 @@ from gripmon.publish import SpotPublisher
 from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import Outcome, PulsedWatch
-from gripmon.recording import SpotRecorder
+from gripmon.record.write import SpotRecorder
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -19,7 +19,7 @@ from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.publish import StatePublisher
 from gripmon.publish.presence import in_words
-from gripmon.recording import EventRecorder
+from gripmon.record.write import EventRecorder
 from gripmon.model.records import (
     Alert,
     AlertEvent,

@@ -15,7 +15,7 @@ from gripmon.report.formats import COVERAGE
 from gripmon.report.track import Track
 
 if TYPE_CHECKING:
-    from gripmon.playback import FrameTable
+    from gripmon.record.read import FrameTable
 
 _PIECES = 1200
 _DETAIL_NS = 2 * SECOND_NS  # on either side of a motion every frame is shown

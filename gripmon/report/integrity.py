@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.report.content import Integrity, Limits
 
 if TYPE_CHECKING:
-    from gripmon.playback import FrameTable
+    from gripmon.record.read import FrameTable
 
 
 def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:

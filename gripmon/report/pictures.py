@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from gripmon.playback import Picture
+    from gripmon.record.read import Picture
 
 _WIDTH_PX = 560  # of a picture on the page
 _MARGIN = 0.18  # of the gripper's size, around it

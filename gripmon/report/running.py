@@ -17,7 +17,7 @@ from gripmon.report.source import Source
 from gripmon.report.track import Track
 
 if TYPE_CHECKING:
-    from gripmon.playback import FrameTable
+    from gripmon.record.read import FrameTable
 
 _FEWEST = 30
 _SLICES = 120

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from gripmon.playback import RecordedRun
+from gripmon.record.read import RecordedRun
 from gripmon.model.records import RecordedConfiguration
 
 if TYPE_CHECKING:
@@ -14,11 +14,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from gripmon.playback import Picture
+    from gripmon.record.read import Picture
 
 
 class Source(RecordedRun, Protocol):
-    """One run of one monitor, as :class:`gripmon.playback.Recording` is."""
+    """One run of one monitor, as :class:`gripmon.record.read.Recording` is."""
 
     @property
     def files(self) -> Sequence[Path]: ...

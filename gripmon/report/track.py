@@ -14,7 +14,7 @@ from gripmon.model.records import Array, ReferenceRecord
 from gripmon.report.content import Displacement
 
 if TYPE_CHECKING:
-    from gripmon.playback import FrameTable
+    from gripmon.record.read import FrameTable
 
 _BASE_FRAMES = 20
 _ALLOWED_SIGMA = 4.0  # as the monitor's own baseline

@@ -22,7 +22,7 @@ from gripmon import daemon
 from gripmon.config import Config
 from gripmon.monitor import Monitor
 from gripmon.publish import Publisher, ZenohPublisher
-from gripmon.recording import NullRecorder, Recorder
+from gripmon.record.write import NullRecorder, Recorder
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
 from gripmon.wire import Link, PublishSettings
 

@@ -19,10 +19,10 @@ import msgspec
 
 from benchmarks import scene
 from gripmon.monitor import Monitor
-from gripmon.recording.columns import Row
-from gripmon.recording.files import FileSeries
-from gripmon.recording.wire import Events, Scene, make_scene, pack_trace
-from gripmon.recording.worker import encode_picture
+from gripmon.record.write.columns import Row
+from gripmon.record.write.files import FileSeries
+from gripmon.record.write.wire import Events, Scene, make_scene, pack_trace
+from gripmon.record.write.worker import encode_picture
 from gripmon.model.records import StateRecord
 
 COMMANDS: dict[str, tuple[str, ...]] = {

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from benchmarks import machine, scene
 from gripmon.monitor import Monitor
-from gripmon.recording import ProcessRecorder, open_recorder
+from gripmon.record.write import ProcessRecorder, open_recorder
 from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 
 FRAMES_PER_HOUR = round(3600 * scene.FPS)
