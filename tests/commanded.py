@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from gripmon.publish.commands import ZenohCommands
+from gripmon.io.publish.commands import ZenohCommands
 from gripmon.model.records import Command, CommandReply
 
 CMD = "gripmon/arm/wrist/cmd"

@@ -16,7 +16,7 @@ from long_files import LONGEST
 from loopback import free_endpoint, plain_session
 from published import Published
 
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 # No test fails because a machine is slow.
 hypothesis.settings.register_profile("unhurried", deadline=None)

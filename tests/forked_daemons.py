@@ -17,7 +17,7 @@ if __name__ == "__main__":
 
     import gripmon.daemon
     import gripmon.monitor
-    import gripmon.publish
+    import gripmon.io.publish
     import gripmon.judge.statefile  # noqa: F401
 
     cv2.setNumThreads(1)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.publish import Presence, ZenohCommands, ZenohJaw, ZenohPublisher
-from gripmon.wire import Keys, Link, PublishSettings
+from gripmon.io.publish import Presence, ZenohCommands, ZenohJaw, ZenohPublisher
+from gripmon.io.wire import Keys, Link, PublishSettings
 
 
 class Published(ZenohPublisher):

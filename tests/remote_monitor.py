@@ -21,7 +21,7 @@ from stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
 from gripmon.model.records import FrameRecord
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 _HERE = Path(__file__).resolve().parent
 _ROUTER = """

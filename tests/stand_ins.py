@@ -26,7 +26,7 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.sources import Waiting
+from gripmon.io.sources import Waiting
 
 REFUSED = {
     "verdict": Verdict.UNKNOWN,

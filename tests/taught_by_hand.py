@@ -17,7 +17,7 @@ from gripmon.config import builtin_config
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Image
-from gripmon.sources.folder import read_image
+from gripmon.io.sources.folder import read_image
 
 SCENARIO = {
     "name": "table",

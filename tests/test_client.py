@@ -9,9 +9,9 @@ import pytest
 from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
 from published import Published
 
-from gripmon.client import Client, MonitorName, TransformClient
+from gripmon.io.client import Client, MonitorName, TransformClient
 from gripmon.model.records import FrameRecord, MessageRefused
-from gripmon.wire import PublishError, PublishSettings
+from gripmon.io.wire import PublishError, PublishSettings
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ import pytest
 from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from published import Published
 
-from gripmon.client import Policy, Reading, TransformClient, Unusable
+from gripmon.io.client import Policy, Reading, TransformClient, Unusable
 from gripmon.model.records import Verdict
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 PATIENT = Policy(max_age_s=3600.0)
 

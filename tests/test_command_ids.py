@@ -15,10 +15,10 @@ from loopback import plain_session, wait_until
 from published import Published
 
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
-from gripmon.publish.commands import ZenohCommands
+from gripmon.io.client import Client, NotCarriedOut
+from gripmon.io.publish.commands import ZenohCommands
 from gripmon.model.records import Command, CommandFault, CommandName, CommandReply
-from gripmon.wire import Keys, Link, PublishSettings
+from gripmon.io.wire import Keys, Link, PublishSettings
 
 
 def asked_with(request_id: str, argument: str = "") -> bytes:

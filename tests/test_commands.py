@@ -14,10 +14,10 @@ from loopback import WAIT_S, free_endpoint, plain_session, reference_record, wai
 from published import Published
 
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
-from gripmon.publish.commands import ZenohCommands
+from gripmon.io.client import Client, NotCarriedOut
+from gripmon.io.publish.commands import ZenohCommands
 from gripmon.model.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
-from gripmon.wire import Keys, Link, PublishSettings
+from gripmon.io.wire import Keys, Link, PublishSettings
 
 
 @pytest.mark.parametrize("name", list(CommandName))

@@ -35,7 +35,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.sources import Waiting
+from gripmon.io.sources import Waiting
 
 
 def test_every_frame_is_published_recorded_and_written_in_order(tmp_path: Path):

@@ -26,7 +26,7 @@ from gripmon.model.records import (
     RecordedCommand,
     Severity,
 )
-from gripmon.sources import Waiting
+from gripmon.io.sources import Waiting
 
 UNDO = Command(CommandName.UNDO)
 REFUSED_COMMAND = Command(CommandName.ACCEPT, "p-1")

@@ -14,8 +14,8 @@ from loopback import free_endpoint, wait_until
 
 from gripmon.cli import main
 from gripmon.model.records import Frame
-from gripmon.sources import NetworkCamera, NetworkSettings
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.sources import NetworkCamera, NetworkSettings
+from gripmon.io.wire import Link, PublishSettings
 
 SIZE_PX = (48, 32)
 KEY = "gripmon/arm/wrist/image"

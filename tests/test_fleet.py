@@ -13,10 +13,10 @@ from published import Published
 from router_process import ROOT, RouterProcess, running
 
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
+from gripmon.io.client import Client, NotCarriedOut
 from gripmon.model.records import CommandName
-from gripmon.wire import PublishSettings
-from gripmon.wire.files import load_file, said
+from gripmon.io.wire import PublishSettings
+from gripmon.io.wire.files import load_file, said
 
 PREFIX = "gripmon/arm/wrist"
 UPWARD, LOCAL = ("state", "alert", "reference"), ("transform", "jaw", "image")

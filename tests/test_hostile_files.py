@@ -12,8 +12,8 @@ from gripmon_process import gripmon
 
 from gripmon.cli import main
 from gripmon.calibrate.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
-from gripmon.sources import FolderSettings, FolderSource, SourceError
-from gripmon.sources.pulses import read_pulses
+from gripmon.io.sources import FolderSettings, FolderSource, SourceError
+from gripmon.io.sources.pulses import read_pulses
 
 DEEP = 100_000
 

@@ -13,9 +13,9 @@ import pytest
 from loopback import WAIT_S, free_endpoint, plain_session, wait_until
 from router_process import RouterProcess, plain_config, running
 
-from gripmon.client import Client
-from gripmon.wire import Link, PublishSettings
-from gripmon.wire.reach import is_at
+from gripmon.io.client import Client
+from gripmon.io.wire import Link, PublishSettings
+from gripmon.io.wire.reach import is_at
 
 HERE = Path(__file__).resolve().parent
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from gripmon.model.records import Frame
-from gripmon.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
-from gripmon.sources.live import Backoff, shown_name
+from gripmon.io.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
+from gripmon.io.sources.live import Backoff, shown_name
 
 PERIOD_S = 0.02
 
@@ -181,7 +181,7 @@ def test_a_process_ends_at_once_while_the_camera_hangs_in_the_driver():
     """A server that accepts and never answers: open() blocks for longer than the process may take to stop."""
     code = (
         "import sys, time\n"
-        "from gripmon.sources import LiveSettings, Waiting, open_source\n"
+        "from gripmon.io.sources import LiveSettings, Waiting, open_source\n"
         "camera = open_source(LiveSettings(device=sys.argv[1], open_timeout_s=60.0, read_timeout_s=60.0))\n"
         "assert isinstance(camera.read(), Waiting)\n"
         "time.sleep(0.3)\n"

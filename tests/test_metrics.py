@@ -35,7 +35,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from test_run_on_the_network import PREFIX, configured, refused, running
 
 from gripmon.cli import main
-from gripmon.metrics import LATENCY_BOUNDS_S, MetricsError, MetricsServer, MetricsSettings
+from gripmon.io.metrics import LATENCY_BOUNDS_S, MetricsError, MetricsServer, MetricsSettings
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import AlertEvent, Severity, State, StateRecord, Verdict
 
@@ -228,7 +228,7 @@ def test_a_missing_package_is_said_by_check(
 
 
 def test_without_metrics_the_package_is_not_imported():
-    code = "import sys, gripmon.config, gripmon.metrics; print('prometheus_client' in sys.modules)"
+    code = "import sys, gripmon.config, gripmon.io.metrics; print('prometheus_client' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout == "False\n"
 

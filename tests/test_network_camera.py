@@ -19,8 +19,8 @@ from network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_con
 from router_process import plain_config, running
 
 from gripmon.cli import main
-from gripmon.ros2 import COMPRESSED_IMAGE, IMAGE
-from gripmon.ros2.types import type_hash
+from gripmon.io.ros2 import COMPRESSED_IMAGE, IMAGE
+from gripmon.io.ros2.types import type_hash
 
 FEEDER = ROOT / "tests" / "frame_feeder.py"
 FRAMES = 12

@@ -12,12 +12,12 @@ import pytest
 import zenoh
 from loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.publish import ZenohJaw
-from gripmon.publish.jaw import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints
-from gripmon.ros2 import JOINT_STATE, JointOpening, subscription_key
-from gripmon.ros2.types import type_hash, typestore
-from gripmon.wire import Link, PublishSettings, malformed
-from gripmon.wire.malformed import Malformed
+from gripmon.io.publish import ZenohJaw
+from gripmon.io.publish.jaw import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints
+from gripmon.io.ros2 import JOINT_STATE, JointOpening, subscription_key
+from gripmon.io.ros2.types import type_hash, typestore
+from gripmon.io.wire import Link, PublishSettings, malformed
+from gripmon.io.wire.malformed import Malformed
 
 KEY = "gripmon/arm/wrist/jaw"
 TRAVEL_M = (0.0, 0.06)

@@ -17,9 +17,9 @@ from gripmon.config.settings import JawSettings
 from gripmon.config.typed import to_settings
 from gripmon.model.pixels import ENCODINGS
 from gripmon.model.records import Frame, FrameNote, from_json
-from gripmon.sources import NetworkCamera, NetworkSettings, SourceSettings
-from gripmon.sources.payload import raw_image
-from gripmon.wire import DEFAULT_ENDPOINT, Link, PublishSettings
+from gripmon.io.sources import NetworkCamera, NetworkSettings, SourceSettings
+from gripmon.io.sources.payload import raw_image
+from gripmon.io.wire import DEFAULT_ENDPOINT, Link, PublishSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs"

@@ -12,8 +12,8 @@ import pytest
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.model.pixels import ENCODINGS
-from gripmon.sources.network import PayloadDecoder
-from gripmon.sources.payload import PayloadError
+from gripmon.io.sources.network import PayloadDecoder
+from gripmon.io.sources.payload import PayloadError
 
 
 def decoded(

@@ -16,9 +16,9 @@ import zenoh
 from loopback import WAIT_S, free_endpoint, plain_session, wait_until
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
-from gripmon.publish.frames import FramePublisher, raw_encoding
+from gripmon.io.publish.frames import FramePublisher, raw_encoding
 from gripmon.model.records import Frame, Refusal
-from gripmon.sources import (
+from gripmon.io.sources import (
     READ_TIMEOUT_S,
     LiveSettings,
     NetworkCamera,
@@ -28,8 +28,8 @@ from gripmon.sources import (
     Waiting,
     open_source,
 )
-from gripmon.sources.network import clock_fault
-from gripmon.wire import Keys, Link, PublishSettings, malformed
+from gripmon.io.sources.network import clock_fault
+from gripmon.io.wire import Keys, Link, PublishSettings, malformed
 
 KEY = "cell/camera"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.records import Frame
-from gripmon.sources import (
+from gripmon.io.sources import (
     READ_TIMEOUT_S,
     NewestFrame,
     Waiting,

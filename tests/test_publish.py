@@ -22,9 +22,9 @@ from loopback import (
 )
 from published import Published
 
-from gripmon.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
+from gripmon.io.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
 from gripmon.model.records import Verdict
-from gripmon.wire import Keys, PublishError, PublishSettings
+from gripmon.io.wire import Keys, PublishError, PublishSettings
 
 PREFIX = "gripmon/arm/wrist"
 

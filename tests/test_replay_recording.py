@@ -38,7 +38,7 @@ from gripmon.model.records import (
     Severity,
     Verdict,
 )
-from gripmon.sources.folder import FolderSettings, FolderSource
+from gripmon.io.sources.folder import FolderSettings, FolderSource
 
 WARNED = Alert(
     AlertKind.CREEP, Cause.UNKNOWN, Severity.WARNING, "a creep", event=AlertEvent.RAISED, alert_id="1-a", since_ns=1

@@ -21,7 +21,7 @@ from gripmon.cli import main
 from gripmon.config import builtin_config, load_config
 from gripmon.report import Report
 from gripmon.simulate import Simulator
-from gripmon.sources import make_simulator
+from gripmon.io.sources import make_simulator
 
 ROOT = Path(__file__).parent.parent
 SECONDS, FPS = 12.0, 20.0

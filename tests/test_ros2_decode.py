@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from gripmon.ros2 import (
+from gripmon.io.ros2 import (
     JointOpening,
     MessageError,
     RosNameError,
@@ -23,7 +23,7 @@ from gripmon.ros2 import (
     decode_joint_state,
     subscription_key,
 )
-from gripmon.ros2.decode import MOST_JOINT_STATE_BYTES
+from gripmon.io.ros2.decode import MOST_JOINT_STATE_BYTES
 
 HEADER = idl.Header(idl.Time(1_700_000_000, 123_456_789), "wrist_optical_frame")
 STAMP_NS = 1_700_000_000_123_456_789

@@ -20,18 +20,18 @@ from loopback import (
 from ros2_graph import ON, layout, tokens
 
 from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
-from gripmon.ros2 import (
+from gripmon.io.ros2 import (
     HeardTopic,
     Listeners,
     NodeName,
     Ros2Publisher,
     Ros2Settings,
 )
-from gripmon.ros2.messages import inverse
-from gripmon.ros2.names import dds_type
-from gripmon.ros2.node import gid_of
-from gripmon.ros2.types import type_hash
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.ros2.messages import inverse
+from gripmon.io.ros2.names import dds_type
+from gripmon.io.ros2.node import gid_of
+from gripmon.io.ros2.types import type_hash
+from gripmon.io.wire import Link, PublishSettings
 
 TF_KEY = "0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 POSE_KEY = (

@@ -20,8 +20,8 @@ from stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
-from gripmon.publish import Publishers
-from gripmon.ros2 import (
+from gripmon.io.publish import Publishers
+from gripmon.io.ros2 import (
     Layout,
     NodeName,
     Ros2Fault,
@@ -31,7 +31,7 @@ from gripmon.ros2 import (
     layout_of,
     network_of,
 )
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.wire import Link, PublishSettings
 
 
 def test_one_line_turns_it_on(tmp_path: Path):

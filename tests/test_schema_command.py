@@ -37,7 +37,7 @@ from gripmon.model.records import (
     to_json,
     unmeasured_record,
 )
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

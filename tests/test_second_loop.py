@@ -33,7 +33,7 @@ from gripmon.model.records import (
     Verdict,
     from_json,
 )
-from gripmon.sources import Waiting
+from gripmon.io.sources import Waiting
 from gripmon.laser.watch import SpotWatchSettings
 
 START_NS, PERIOD_NS = 1_000_000_000_000, 400_000_000

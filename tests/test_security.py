@@ -22,11 +22,11 @@ from router_process import ROOT, running
 from sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
-from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
-from gripmon.publish import ZenohPulses, ZenohSpotPublisher
+from gripmon.io.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
+from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
 from gripmon.model.records import CommandName, CommandReply
-from gripmon.wire import Link, PublishSettings
-from gripmon.wire.files import load_file
+from gripmon.io.wire import Link, PublishSettings
+from gripmon.io.wire.files import load_file
 
 PREFIX = "gripmon/arm/wrist"
 

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.client import Policy, Reading
+from gripmon.io.client import Policy, Reading
 from gripmon.model.geometry import exp_rotation, from_record, invert, make_transform
 from gripmon.model.records import Smoothed, Transform, Verdict
 
@@ -192,7 +192,7 @@ def test_the_truth_of_the_servo_is_that_of_the_camera_it_gave_the_monitor(tmp_pa
     from servoing.feed import reference_cam_T_grip, write_config
 
     from gripmon.simulate import Simulator
-    from gripmon.sources import make_simulator
+    from gripmon.io.sources import make_simulator
 
     for number, row in enumerate(stage.ROWS):
         scenario = stage.scenario(row, np.random.default_rng(number), FPS, reference_cam_T_grip()[:3, 3])

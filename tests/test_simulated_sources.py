@@ -22,7 +22,7 @@ from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Frame
 from gripmon.simulate import make_scenario
-from gripmon.sources import (
+from gripmon.io.sources import (
     SimulatedScene,
     SimulatedSettings,
     SourceError,
@@ -31,8 +31,8 @@ from gripmon.sources import (
     make_simulator,
     open_source,
 )
-from gripmon.sources.realtime import SimulatedCamera, _Schedule
-from gripmon.sources.simulated import SimulatedSequence
+from gripmon.io.sources.realtime import SimulatedCamera, _Schedule
+from gripmon.io.sources.simulated import SimulatedSequence
 
 ROOT = Path(__file__).resolve().parent.parent
 SHAPE = (6, 8)

@@ -21,11 +21,11 @@ from test_security import own_files
 
 import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
-from gripmon.client import Client, NotCarriedOut
+from gripmon.io.client import Client, NotCarriedOut
 from gripmon.daemon import DaemonSettings, Reports, run
 from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
-from gripmon.sources import FolderSettings, FolderSource, Waiting
-from gripmon.wire import PublishSettings
+from gripmon.io.sources import FolderSettings, FolderSource, Waiting
+from gripmon.io.wire import PublishSettings
 
 
 def picture(seq: int) -> np.ndarray:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gripmon.model.records import Frame
-from gripmon.sources import (
+from gripmon.io.sources import (
     FolderSettings,
     FolderSource,
     LiveSettings,
@@ -24,7 +24,7 @@ from gripmon.sources import (
     open_source,
     settings_for_path,
 )
-from gripmon.sources.folder import natural_key
+from gripmon.io.sources.folder import natural_key
 
 
 def picture(seed: int, shape: tuple[int, ...] = (48, 64), dtype: type = np.uint8) -> np.ndarray:
@@ -86,7 +86,7 @@ def test_bad_settings_are_refused(plain: dict):
 
 
 def test_settings_need_no_opencv():
-    code = "import sys, gripmon.sources; assert not {'cv2', 'multiprocessing'} & set(sys.modules), 'heavy import'"
+    code = "import sys, gripmon.io.sources; assert not {'cv2', 'multiprocessing'} & set(sys.modules), 'heavy import'"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parent.parent)
 
 

@@ -24,7 +24,7 @@ from gripmon.cli.plane_inputs import _read_rough
 from gripmon.monitor import MonitorSettings
 from gripmon.onboarding import UnknownGripper
 from gripmon.model.records import Frame
-from gripmon.sources import Waiting
+from gripmon.io.sources import Waiting
 from gripmon.teaching.bench import Bench, Found
 from gripmon.teachpage import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
 from gripmon.teachpage.desk import BadRequest, Labels

@@ -18,8 +18,8 @@ from loopback import WAIT_S, alert_record, free_endpoint, plain_session, wait_un
 from published import Published
 from remote_monitor import remote_monitor, router
 
-from gripmon.client import Condition, Fleet
-from gripmon.wire import PublishSettings
+from gripmon.io.client import Condition, Fleet
+from gripmon.io.wire import PublishSettings
 
 ROOT = Path(__file__).resolve().parent.parent
 FAR = {"translation_m": 0.1, "rotation_rad": 0.0, "tcp_shift_m": [0.0045, 0.0, 0.0]}

@@ -23,7 +23,7 @@ from published import Published
 from sample_messages import FOLDER, SAMPLES, kept, payload
 
 from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 PAGE = wire_page.PAGE.read_text(encoding="utf-8")
 

@@ -160,7 +160,7 @@ class _Seer:
         from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
         from gripmon.calibrate.targets import Chequerboard
         from gripmon.calibrate.upright import upright
-        from gripmon.sources.folder import read_image
+        from gripmon.io.sources.folder import read_image
 
         if not row.get("image"):
             raise ValueError(f"{place}: has neither cam_tx_m … nor image; the target's pose, or an image of it")

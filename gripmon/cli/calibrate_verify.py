@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _are_images(names: list[str]) -> bool:
-    from gripmon.sources.folder import IMAGE_SUFFIXES
+    from gripmon.io.sources.folder import IMAGE_SUFFIXES
 
     return any(Path(n).is_dir() or Path(n).suffix.lower() in IMAGE_SUFFIXES for n in names)
 

@@ -21,7 +21,7 @@ def image_paths(texts: Sequence[str]) -> list[Path]:
     """The images that are meant, folders for all images in them, in natural order; what isn't there, or is there
     twice, ends the command with exit code 2.
     """
-    from gripmon.sources.folder import IMAGE_SUFFIXES, natural_key
+    from gripmon.io.sources.folder import IMAGE_SUFFIXES, natural_key
 
     paths: list[Path] = []
     for path in map(Path, texts):
@@ -42,7 +42,7 @@ def images_of(paths: Sequence[Path]) -> Iterator[tuple[Path, Image]]:
     """Each with its path, all of one size; one that can't be read, or is the same as another, ends the command with
     exit code 2.
     """
-    from gripmon.sources.folder import read_image
+    from gripmon.io.sources.folder import read_image
 
     seen: dict[bytes, Path] = {}
     size: tuple[int, ...] | None = None

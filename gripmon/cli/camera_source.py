@@ -10,8 +10,8 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
     from gripmon.model.records import Frame
-    from gripmon.sources import Source
-    from gripmon.wire import Link
+    from gripmon.io.sources import Source
+    from gripmon.io.wire import Link
 
 
 class RecordedInput(NamedTuple):
@@ -24,9 +24,9 @@ class RecordedInput(NamedTuple):
 def open_source(config: Config | SecondConfig, link: Link | None = None) -> Source:
     """Start the configured source; one that can't start ends the command with exit code 2."""
     from gripmon.config import SecondConfig
-    from gripmon.sources import FullScale, SourceError
-    from gripmon.sources import open_source as started
-    from gripmon.wire import Keys
+    from gripmon.io.sources import FullScale, SourceError
+    from gripmon.io.sources import open_source as started
+    from gripmon.io.wire import Keys
 
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
     scene = None if isinstance(config, SecondConfig) else config.scene
@@ -44,7 +44,7 @@ def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
 
     Frames that don't fit the camera end the command with exit code 2, and with 3 if none can be read.
     """
-    from gripmon.sources import FolderSettings, VideoSettings
+    from gripmon.io.sources import FolderSettings, VideoSettings
 
     if not isinstance(config.settings.source, FolderSettings | VideoSettings):
         return None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.wire.certificates import Issued
+    from gripmon.io.wire.certificates import Issued
 
 _DESCRIPTION = """\
 Make a small private certificate authority in a folder, and certificates for those who shall talk to
@@ -75,7 +75,7 @@ def add_parser(commands: Any) -> None:
 def make(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon certificates``."""
     try:
-        from gripmon.wire.certificates import Authority, read
+        from gripmon.io.wire.certificates import Authority, read
     except ImportError:
         text = (
             "certificates: the package cryptography is missing; pip install -e '.[certificates]' in gripmon's checkout"
@@ -107,7 +107,7 @@ def make(arguments: argparse.Namespace) -> int:
 
 def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
     """The names for which there shall be certificates, each with its hosts."""
-    from gripmon.wire.rules import names_of
+    from gripmon.io.wire.rules import names_of
 
     try:
         robots = [name for robot in arguments.robot for name in names_of(robot)]
@@ -122,7 +122,7 @@ def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
 def _add_rules(path: Path, robots: list[str]) -> None:
     """Put rules for the robots into a router's file."""
     from gripmon.model.atomic import write_atomically
-    from gripmon.wire.rules import with_robot
+    from gripmon.io.wire.rules import with_robot
 
     try:
         before = text = path.read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ from gripmon.cli.run import run_daemon
 
 if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
-    from gripmon.client import Client
+    from gripmon.io.client import Client
     from gripmon.config import Config
     from gripmon.model.records import Array, FrameRecord
     from gripmon.simulate import Simulator
@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
             common.EXIT_USAGE,
         )
     config = _demo_config(arguments)
-    from gripmon.sources import SimulatedSettings, SourceError, make_simulator
+    from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 
     assert isinstance(config.settings.source, SimulatedSettings), "the shipped demo.yaml has a simulated camera"
     try:
@@ -163,7 +163,7 @@ class _Receiver(AbstractContextManager["_Receiver"]):
 
     def connect(self) -> None:
         """Join the network and wait until the monitor is seen there."""
-        from gripmon.client import Client
+        from gripmon.io.client import Client
 
         settings = self._config.settings
         self._client = Client(settings.robot, settings.camera_name, connect=settings.publish.listen, depth=1024)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common, joining
 
 if TYPE_CHECKING:
-    from gripmon.publish.frames import FramePublisher
+    from gripmon.io.publish.frames import FramePublisher
     from gripmon.model.records import Frame
-    from gripmon.sources import Source
-    from gripmon.wire import Link
+    from gripmon.io.sources import Source
+    from gripmon.io.wire import Link
 
 _DESCRIPTION = """\
 Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
@@ -60,8 +60,8 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon feed``."""
-    from gripmon.wire import Keys, Link, PublishError, PublishSettings
-    from gripmon.wire.settings import check_key
+    from gripmon.io.wire import Keys, Link, PublishError, PublishSettings
+    from gripmon.io.wire.settings import check_key
 
     if wrong := joining.misuse(arguments):
         raise common.CommandFailedError(f"feed: {wrong}", common.EXIT_USAGE)
@@ -97,7 +97,7 @@ class _Feeder:
     """Sends frames when they are due."""
 
     def __init__(self, arguments: argparse.Namespace, link: Link, key: str) -> None:
-        from gripmon.publish.frames import FramePublisher
+        from gripmon.io.publish.frames import FramePublisher
 
         self.sent = self._unsent = 0
         self._reason = ""
@@ -156,7 +156,7 @@ def _paced(arguments: argparse.Namespace, source: Source) -> Iterator[tuple[Fram
 
 
 def _open(arguments: argparse.Namespace) -> Source:
-    from gripmon.sources import FolderSettings, LiveSettings, SourceError, VideoSettings, open_source
+    from gripmon.io.sources import FolderSettings, LiveSettings, SourceError, VideoSettings, open_source
 
     name: str = arguments.source
     path = Path(name)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.wire import PublishError
+    from gripmon.io.wire import PublishError
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.wire's, which is too heavy for --help
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # gripmon.io.wire's, which is too heavy for --help
 _OPTIONS = {"connect": "--connect", "zenoh_config": "--zenoh-config"}
 
 

@@ -253,7 +253,7 @@ def _check_inside(samples: Samples, k: int, origin: Path, size_px: tuple[int, in
 
 
 def _image(path: Path, size_px: tuple[int, int]) -> Any:
-    from gripmon.sources.folder import read_image
+    from gripmon.io.sources.folder import read_image
 
     image, fault = read_image(path)
     if image is None:

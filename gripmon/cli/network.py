@@ -12,10 +12,10 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
     from gripmon.daemon import JawFeed, Reports
-    from gripmon.metrics import MetricsServer
-    from gripmon.publish import Presence, Publisher, ZenohCommands
-    from gripmon.sources import Source
-    from gripmon.wire import Keys, Link
+    from gripmon.io.metrics import MetricsServer
+    from gripmon.io.publish import Presence, Publisher, ZenohCommands
+    from gripmon.io.sources import Source
+    from gripmon.io.wire import Keys, Link
 
 
 _log = logging.getLogger(__name__)
@@ -40,7 +40,7 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
     """
     from gripmon.config import ConfigError, check_network
     from gripmon.daemon import Reports
-    from gripmon.publish import NullPublisher
+    from gripmon.io.publish import NullPublisher
 
     try:
         check_network(config)
@@ -59,9 +59,9 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
 
 def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
     """Who this start of the monitor is; ends the command where another monitor has the name and keeps it."""
-    from gripmon.publish import Presence
-    from gripmon.publish.presence import in_words
-    from gripmon.wire import Keys
+    from gripmon.io.publish import Presence
+    from gripmon.io.publish.presence import in_words
+    from gripmon.io.wire import Keys
 
     presence = Presence(link, Keys(robot, camera))
     _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
@@ -74,7 +74,7 @@ def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
 
 def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
     from gripmon.daemon import Reports
-    from gripmon.publish import Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+    from gripmon.io.publish import Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
 
     settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
@@ -94,7 +94,7 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
 
 def with_metrics(config: Config, publisher: Publisher) -> Publisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
-    from gripmon.publish import Publishers
+    from gripmon.io.publish import Publishers
 
     metrics = metrics_server(config)
     return publisher if metrics is None else Publishers(publisher, {"metrics": metrics})
@@ -104,7 +104,7 @@ def metrics_server(config: Config | SecondConfig) -> MetricsServer | None:
     """The server for Prometheus where the configuration wants one; ends the command with exit code 2 where it can't
     listen.
     """
-    from gripmon.metrics import MetricsError, MetricsServer
+    from gripmon.io.metrics import MetricsError, MetricsServer
 
     settings = config.settings
     if not settings.metrics.enabled:
@@ -119,7 +119,7 @@ def metrics_server(config: Config | SecondConfig) -> MetricsServer | None:
 
 def with_source(reports: Reports, source: Source) -> Reports:
     """The reports, and what a camera on the network says beside them."""
-    from gripmon.sources import NetworkCamera
+    from gripmon.io.sources import NetworkCamera
 
     if not isinstance(source, NetworkCamera):
         return reports
@@ -132,8 +132,8 @@ def with_source(reports: Reports, source: Source) -> Reports:
 
 def _open_link(config: Config) -> Link | None:
     """The session; None if nothing is published."""
-    from gripmon.ros2 import network_of
-    from gripmon.wire import Link, PublishError
+    from gripmon.io.ros2 import network_of
+    from gripmon.io.wire import Link, PublishError
 
     if not config.settings.publish.enabled:
         return None
@@ -148,7 +148,7 @@ def _open_link(config: Config) -> Link | None:
 
 def _ros2_node(config: Config, link: Link) -> Publisher | None:
     """The monitor as a ROS 2 node, where the configuration wants one."""
-    from gripmon.ros2 import Ros2Publisher, layout_of
+    from gripmon.io.ros2 import Ros2Publisher, layout_of
 
     settings = config.settings
     if not settings.ros2.enabled:
@@ -158,8 +158,8 @@ def _ros2_node(config: Config, link: Link) -> Publisher | None:
 
 def _show_listeners(config: Config, link: Link) -> None:
     """Let ROS 2 know of the topics that frames and jaw opening come from."""
-    from gripmon.ros2 import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners, NodeName, as_token
-    from gripmon.sources import NetworkSettings
+    from gripmon.io.ros2 import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners, NodeName, as_token
+    from gripmon.io.sources import NetworkSettings
 
     settings = config.settings
     jaw, source = settings.jaw, settings.source
@@ -176,9 +176,9 @@ def _show_listeners(config: Config, link: Link) -> None:
 
 def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
     """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
-    from gripmon.publish import ZenohJaw
-    from gripmon.publish.jaw import opening_of_joints
-    from gripmon.ros2 import JOINT_STATE, subscription_key
+    from gripmon.io.publish import ZenohJaw
+    from gripmon.io.publish.jaw import opening_of_joints
+    from gripmon.io.ros2 import JOINT_STATE, subscription_key
 
     jaw = config.settings.jaw
     travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m

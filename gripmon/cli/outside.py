@@ -11,7 +11,7 @@ from gripmon.cli import camera_source, common
 
 if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
-    from gripmon.sources import LiveSettings
+    from gripmon.io.sources import LiveSettings
 
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
 _CONNECT_S = 2.0
@@ -57,8 +57,8 @@ def source_report(config: Config | SecondConfig) -> dict[str, Any]:
     """Kind, whether frames can come from it now (None: only starting it would show), and a few words; ``odd`` where
     something about it is.
     """
-    from gripmon.sources import LiveSettings, NetworkSettings, network_key
-    from gripmon.wire import Keys
+    from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
+    from gripmon.io.wire import Keys
 
     source = config.settings.source
     kind = type(source).__struct_config__.tag
@@ -75,7 +75,7 @@ def source_report(config: Config | SecondConfig) -> dict[str, Any]:
 
 
 def _live_reachable(source: LiveSettings) -> tuple[bool | None, str]:
-    from gripmon.sources.live import shown_name
+    from gripmon.io.sources.live import shown_name
 
     device = source.device
     if isinstance(device, int) or device.isdecimal():

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config, SecondConfig
     from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord
-    from gripmon.sources import Source
+    from gripmon.io.sources import Source
 
 _DESCRIPTION = """\
 Run recorded frames through the monitor and write one JSON line for every input frame, in input
@@ -156,7 +156,7 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
 def _refuse_empty_folder(paths: list[Path]) -> None:
     """Before anything else is asked for, which would not help."""
     from gripmon.record.read import recordings_below
-    from gripmon.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+    from gripmon.io.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
 
     for path in paths:
         if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():
@@ -229,7 +229,7 @@ class _Counts:
 def _open_input(path: Path, fps: float | None) -> Source:
     import msgspec
 
-    from gripmon.sources import SourceError, open_source, settings_for_path
+    from gripmon.io.sources import SourceError, open_source, settings_for_path
 
     if not path.exists():
         raise common.CommandFailedError(

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from gripmon.monitor import Monitor
     from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
-    from gripmon.sources import Source
+    from gripmon.io.sources import Source
 
 
 class Past(NamedTuple):

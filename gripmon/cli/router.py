@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.wire import Router
+    from gripmon.io.wire import Router
 
 _DESCRIPTION = """\
 Route between monitors, controllers and operators until interrupted (Ctrl-C or SIGTERM).
@@ -41,7 +41,7 @@ def add_parser(commands: Any) -> None:
 def route(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon router``."""
     from gripmon.daemon import sigterm_exits
-    from gripmon.wire import Router, ZenohFileError
+    from gripmon.io.wire import Router, ZenohFileError
 
     with sigterm_exits():
         try:

@@ -12,7 +12,7 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
     from gripmon.model.records import SpotRecord
-    from gripmon.sources import Source
+    from gripmon.io.sources import Source
 
 
 def run(config: SecondConfig, source: Source, write: Callable[[bytes], None], step: Callable[[], None]) -> int:

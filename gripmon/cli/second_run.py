@@ -13,9 +13,9 @@ from gripmon.cli.viewing import LiveView
 if TYPE_CHECKING:
     from gripmon.config import SecondConfig
     from gripmon.daemon import Reports
-    from gripmon.publish import SpotPublisher, ZenohCommands, ZenohPulses
+    from gripmon.io.publish import SpotPublisher, ZenohCommands, ZenohPulses
     from gripmon.record.write import SpotRecorder
-    from gripmon.wire import Link
+    from gripmon.io.wire import Link
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,8 +107,8 @@ def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
     """Open all of it; ends the command as :func:`gripmon.cli.network.open_network` does."""
     from gripmon.config import ConfigError, check_second_network
     from gripmon.daemon import Reports
-    from gripmon.publish import NullPublisher
-    from gripmon.wire import Link, PublishError
+    from gripmon.io.publish import NullPublisher
+    from gripmon.io.wire import Link, PublishError
 
     try:
         check_second_network(config)
@@ -129,7 +129,7 @@ def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
 def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
     from gripmon.cli.network import alone
     from gripmon.daemon import Reports
-    from gripmon.publish import ZenohCommands, ZenohPulses, ZenohSpotPublisher
+    from gripmon.io.publish import ZenohCommands, ZenohPulses, ZenohSpotPublisher
 
     settings = config.settings
     presence = alone(link, settings.robot, settings.camera_name, take_over=take_over)
@@ -150,7 +150,7 @@ def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
 def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
     from gripmon.cli.network import metrics_server
-    from gripmon.publish import SpotPublishers
+    from gripmon.io.publish import SpotPublishers
 
     metrics = metrics_server(config)
     return publisher if metrics is None else SpotPublishers(publisher, {"metrics": metrics})

@@ -19,8 +19,8 @@ _NUMBERED = re.compile(r"snapshot-([0-9]{1,9})\.(json|png|jpg)")
 
 def check_table(out: Path) -> None:
     """End the command with exit code 2, before any work, if no row can be added to the table in a folder."""
-    from gripmon.sources import SourceError
-    from gripmon.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
+    from gripmon.io.sources import SourceError
+    from gripmon.io.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
 
     path = out / TIMESTAMPS_NAME
     if not path.exists():
@@ -42,7 +42,7 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     """
     from gripmon.model.atomic import write_atomically
     from gripmon.model.records import to_json
-    from gripmon.sources.folder import TIMESTAMPS_NAME
+    from gripmon.io.sources.folder import TIMESTAMPS_NAME
 
     number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)
     files = {out / f"snapshot-{number}.json": to_json(reply) + b"\n"}
@@ -62,7 +62,7 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
 
 
 def _with_row(table: Path, name: str, stamp_ns: int, jaw_m: float | None) -> bytes:
-    from gripmon.sources.folder import COLUMNS
+    from gripmon.io.sources.folder import COLUMNS
 
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")

@@ -234,7 +234,7 @@ def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
 def _opening(path: Path, config: Config, given_m: float | None) -> float | None:
     """The jaw opening in an image; None for a gripper without jaw."""
     from gripmon.cli.teach_inputs import read_opening
-    from gripmon.sources.folder import TIMESTAMPS_NAME
+    from gripmon.io.sources.folder import TIMESTAMPS_NAME
 
     opening_m = read_opening(path, config.gripper, config, given_m)
     if opening_m is None and config.gripper.has_jaw:

@@ -34,7 +34,7 @@ def config_text(
     folder: Callable[[Path], str],
 ) -> str:
     """A whole file; ``folder`` names a path as the file does."""
-    from gripmon.sources import FolderSettings
+    from gripmon.io.sources import FolderSettings
 
     source = inputs.source
     assert source is not None
@@ -131,8 +131,8 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
 
 def _in_table(inputs: Inputs) -> bool:
     """Whether the images' own table has their openings: one given for all of them is fixed."""
-    from gripmon.sources import SourceError
-    from gripmon.sources.folder import read_table
+    from gripmon.io.sources import SourceError
+    from gripmon.io.sources.folder import read_table
 
     try:
         for picture in inputs.pictures:

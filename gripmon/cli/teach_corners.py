@@ -77,7 +77,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Teach with a gripper."""
     from gripmon.cli.teach_inputs import live_settings
     from gripmon.cli.teach_saving import FileSaving
-    from gripmon.sources import SourceError, open_source
+    from gripmon.io.sources import SourceError, open_source
     from gripmon.teachpage import Desk
 
     live = None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from gripmon.config import Config
     from gripmon.model.gripper import Gripper
     from gripmon.model.records import Image, ReferenceRecord
-    from gripmon.sources import FolderSettings, LiveSettings
+    from gripmon.io.sources import FolderSettings, LiveSettings
     from gripmon.teaching.bench import Bench
     from gripmon.teaching.corner_pose import CameraError
     from gripmon.teachpage import Picture
@@ -231,7 +231,7 @@ def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: 
     from gripmon.judge.inspection import inspect
     from gripmon.model.pixels import in_full_scale
     from gripmon.model.records import Frame
-    from gripmon.sources.folder import read_image
+    from gripmon.io.sources.folder import read_image
 
     if path.is_dir():
         raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)
@@ -258,8 +258,8 @@ def read_opening(path: Path, gripper: Gripper, config: Config | None, given_m: f
     """What is known of the jaw opening in an image: given, in its folder's table, or fixed in the configuration; None
     if nothing is.
     """
-    from gripmon.sources import SourceError
-    from gripmon.sources.folder import TIMESTAMPS_NAME, read_table
+    from gripmon.io.sources import SourceError
+    from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
 
     if not gripper.has_jaw:
         if given_m is not None:
@@ -284,7 +284,7 @@ def read_opening(path: Path, gripper: Gripper, config: Config | None, given_m: f
 
 def live_settings(device: str, camera: Camera) -> LiveSettings:
     """A camera that is asked for images of the calibration's size."""
-    from gripmon.sources import LiveSettings
+    from gripmon.io.sources import LiveSettings
 
     named = int(device) if device.isdecimal() else device
     return LiveSettings(device=named, width_px=camera.width_px, height_px=camera.height_px)
@@ -292,7 +292,7 @@ def live_settings(device: str, camera: Camera) -> LiveSettings:
 
 def _source(arguments: argparse.Namespace, camera: Camera) -> FolderSettings | LiveSettings:
     """Where the monitor will find its frames: the live camera, or the images' folder."""
-    from gripmon.sources import FolderSettings
+    from gripmon.io.sources import FolderSettings
 
     if arguments.live is not None:
         return live_settings(arguments.live, camera)

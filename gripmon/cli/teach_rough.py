@@ -24,7 +24,7 @@ def is_meant(arguments: argparse.Namespace) -> bool:
 def rough_desk(arguments: argparse.Namespace) -> RoughDesk:
     """The image, checked; a fault ends the command with exit code 2."""
     from gripmon.cli.teach_inputs import read_lens
-    from gripmon.sources.folder import read_image
+    from gripmon.io.sources.folder import read_image
     from gripmon.teachpage import Picture, RoughDesk
 
     if len(arguments.images) > 1:

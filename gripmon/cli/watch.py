@@ -14,7 +14,7 @@ from gripmon.cli import common, fleet_table, joining
 from gripmon.cli.alert_log import AlertLog
 
 if TYPE_CHECKING:
-    from gripmon.client import Fleet, MonitorStatus
+    from gripmon.io.client import Fleet, MonitorStatus
 
 _DESCRIPTION = """\
 A live table of all monitors on the network, the worst first: those that are gone, silent or have no
@@ -69,7 +69,7 @@ def add_parser(commands: Any) -> None:
 def watch(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon watch``."""
     _check(arguments)
-    logging.getLogger("gripmon.wire").setLevel(logging.ERROR)  # a connection that is missing stands in the table
+    logging.getLogger("gripmon.io.wire").setLevel(logging.ERROR)  # a connection that is missing stands in the table
     log = _open_log(arguments) if arguments.alerts else None
     with _open_fleet(arguments, log) as fleet:
         seconds = 3.0 if arguments.once and arguments.seconds is None else arguments.seconds
@@ -111,8 +111,8 @@ def _open_log(arguments: argparse.Namespace) -> AlertLog:
 
 
 def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
-    from gripmon.client import Fleet
-    from gripmon.wire import PublishError
+    from gripmon.io.client import Fleet
+    from gripmon.io.wire import PublishError
 
     try:
         return Fleet(
@@ -137,7 +137,7 @@ def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> No
 
 
 def _sorted(fleet: Fleet) -> list[MonitorStatus]:
-    from gripmon.client import trouble
+    from gripmon.io.client import trouble
 
     return sorted(fleet.monitors(), key=trouble)
 

@@ -29,10 +29,10 @@ from gripmon.track.edges.taught import mismatch
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
 from gripmon.model.records import Array, ReferenceRecord, to_json
-from gripmon.ros2 import fault_of as ros2_fault
-from gripmon.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
+from gripmon.io.ros2 import fault_of as ros2_fault
+from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
-from gripmon.wire import Joining
+from gripmon.io.wire import Joining
 
 if TYPE_CHECKING:
     from gripmon.simulate import Scenario

@@ -7,8 +7,8 @@ from pathlib import Path
 from gripmon.config.settings import JawSettings, Settings
 from gripmon.config.typed import Fault
 from gripmon.model.gripper import Gripper
-from gripmon.ros2 import JOINT_STATE, RosNameError, subscription_key
-from gripmon.sources import (
+from gripmon.io.ros2 import JOINT_STATE, RosNameError, subscription_key
+from gripmon.io.sources import (
     FolderSettings,
     LiveSettings,
     NetworkSettings,
@@ -17,8 +17,8 @@ from gripmon.sources import (
     VideoSettings,
     network_key,
 )
-from gripmon.sources.live import backend_number
-from gripmon.wire import PublishSettings
+from gripmon.io.sources.live import backend_number
+from gripmon.io.wire import PublishSettings
 
 _NETWORK_JAWS = ("zenoh", "ros2_joint_state")
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
-from gripmon.sources import LiveSettings
+from gripmon.io.sources import LiveSettings
 
 
 class _Pair(NamedTuple):

@@ -20,15 +20,15 @@ from gripmon.config.settings import Name
 from gripmon.config.typed import Fault, SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.daemon import DaemonSettings
-from gripmon.metrics import MetricsSettings
+from gripmon.io.metrics import MetricsSettings
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.record.write import RecordingSettings, ViewSettings
-from gripmon.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
-from gripmon.sources.pulses import read_pulses
+from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
+from gripmon.io.sources.pulses import read_pulses
 from gripmon.laser.watch import SpotWatchSettings
-from gripmon.wire import Joining, PublishSettings
+from gripmon.io.wire import Joining, PublishSettings
 
 SECTION = "laser"
 _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")

@@ -7,12 +7,12 @@ from pathlib import Path
 from gripmon.model.camera import Camera
 from gripmon.config.settings import Settings
 from gripmon.config.typed import Fault
-from gripmon.metrics import MetricsSettings, package_fault
-from gripmon.ros2 import Ros2Missing, network_of
-from gripmon.ros2.types import typestore
-from gripmon.sources import NetworkSettings, SourceError, SourceSettings
-from gripmon.sources.network import PayloadDecoder
-from gripmon.wire import Joining, PublishError, PublishSettings, joining
+from gripmon.io.metrics import MetricsSettings, package_fault
+from gripmon.io.ros2 import Ros2Missing, network_of
+from gripmon.io.ros2.types import typestore
+from gripmon.io.sources import NetworkSettings, SourceError, SourceSettings
+from gripmon.io.sources.network import PayloadDecoder
+from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
 
 
 def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Joining | Fault | None:

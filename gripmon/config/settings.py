@@ -9,13 +9,13 @@ from msgspec import Meta
 
 from gripmon.model.camera import LensSettings
 from gripmon.daemon import DaemonSettings
-from gripmon.metrics import MetricsSettings
+from gripmon.io.metrics import MetricsSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.record.write import RecordingSettings, ViewSettings
-from gripmon.ros2 import JointOpening, Ros2Settings
-from gripmon.sources import SourceSettings
+from gripmon.io.ros2 import JointOpening, Ros2Settings
+from gripmon.io.sources import SourceSettings
 from gripmon.judge.statefile import StateSettings
-from gripmon.wire import PublishSettings
+from gripmon.io.wire import PublishSettings
 
 Name = Annotated[
     str,

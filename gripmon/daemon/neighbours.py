@@ -44,20 +44,20 @@ class Asked(Protocol):
 
 
 class CommandFeed(Protocol):
-    """Where commands come from, e.g. :class:`gripmon.publish.ZenohCommands`; ``poll`` doesn't wait."""
+    """Where commands come from, e.g. :class:`gripmon.io.publish.ZenohCommands`; ``poll`` doesn't wait."""
 
     def poll(self) -> Asked | None: ...
 
 
 class PulseFeed(Protocol):
-    """Where a laser's pulses come from, e.g. :class:`gripmon.publish.ZenohPulses`; ``poll`` doesn't wait."""
+    """Where a laser's pulses come from, e.g. :class:`gripmon.io.publish.ZenohPulses`; ``poll`` doesn't wait."""
 
     def poll(self) -> Told | None: ...
 
 
 class JawFeed(Protocol):
     """Where the jaw opening at a frame's time comes from when the frames don't bring it, e.g.
-    :class:`gripmon.publish.ZenohJaw`.
+    :class:`gripmon.io.publish.ZenohJaw`.
     """
 
     def opening_m(self, stamp_ns: int | None = None) -> float | None: ...

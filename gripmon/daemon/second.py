@@ -16,7 +16,7 @@ from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest, in_short
 from gripmon.daemon.watch import Judged
 from gripmon.judge.policy import AlertBook
-from gripmon.publish import SpotPublisher
+from gripmon.io.publish import SpotPublisher
 from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import Outcome, PulsedWatch
@@ -37,7 +37,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.sources import Source
+from gripmon.io.sources import Source
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"

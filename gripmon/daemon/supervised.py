@@ -17,8 +17,8 @@ from gripmon.daemon.neighbours import Asked, CommandFeed, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
-from gripmon.publish import StatePublisher
-from gripmon.publish.presence import in_words
+from gripmon.io.publish import StatePublisher
+from gripmon.io.publish.presence import in_words
 from gripmon.record.write import EventRecorder
 from gripmon.model.records import (
     Alert,
@@ -40,7 +40,7 @@ from gripmon.model.records import (
     Verdict,
     accepting,
 )
-from gripmon.sources import Source, Waiting
+from gripmon.io.sources import Source, Waiting
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")

@@ -20,7 +20,7 @@ from gripmon.model.geometry import from_record, rotation_angle
 from gripmon.judge.inspection import inspect
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image
-from gripmon.sources import Source, Waiting
+from gripmon.io.sources import Source, Waiting
 from gripmon.teaching.bench import Bench, Found, rough_fault
 from gripmon.teaching.snapping import FEWEST_PUT, SnappedCorner
 from gripmon.teachpage.messages import (

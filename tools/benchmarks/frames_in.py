@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from benchmarks import machine
 
 if TYPE_CHECKING:
-    from gripmon.sources import NetworkCamera
+    from gripmon.io.sources import NetworkCamera
 
 _SIZES = {"768 × 576, grey": (768, 576, 1), "1920 × 1080, colour": (1920, 1080, 3)}
 _ENDPOINT = "tcp/127.0.0.1:17461"
@@ -63,8 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def measure(size: tuple[int, int, int], frame_format: str, *, shared: bool, frames: int) -> Row:
     """One row: a driver in another process sends, the source here reads."""
-    from gripmon.sources import NetworkCamera, NetworkSettings
-    from gripmon.wire import Link, PublishSettings
+    from gripmon.io.sources import NetworkCamera, NetworkSettings
+    from gripmon.io.wire import Link, PublishSettings
 
     with tempfile.TemporaryDirectory() as folder:
         listens, connects = Path(folder) / "listens.json5", Path(folder) / "connects.json5"

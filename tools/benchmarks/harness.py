@@ -21,10 +21,10 @@ from benchmarks.scene import FPS, Ring
 from gripmon import daemon
 from gripmon.config import Config
 from gripmon.monitor import Monitor
-from gripmon.publish import Publisher, ZenohPublisher
+from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.record.write import NullRecorder, Recorder
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.wire import Link, PublishSettings
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)

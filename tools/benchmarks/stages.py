@@ -18,7 +18,7 @@ from gripmon.judge.drift import MotionWatch
 from gripmon.monitor import Monitor, Tracker
 from gripmon.monitor.asking import Inquiry
 from gripmon.judge.policy import Policy
-from gripmon.publish import ZenohPublisher
+from gripmon.io.publish import ZenohPublisher
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamWatch
 

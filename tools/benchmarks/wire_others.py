@@ -15,7 +15,7 @@ import zenoh
 
 from benchmarks.harness import Subscriber
 from benchmarks.machine import ROOT
-from gripmon.wire import DEFAULT_ENDPOINT
+from gripmon.io.wire import DEFAULT_ENDPOINT
 
 _STALLER = Path(__file__).parent / "staller.py"
 _MATCH_S = 0.3

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from benchmarks import harness, scene
 from benchmarks.wire_others import Crowd, RouterProcess, Staller, free_endpoint
-from gripmon.publish import Publisher, ZenohPublisher
+from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.wire import Link, PublishSettings
 
 CONDITIONS = ("alone", "stopped", "blocked", "ten", "router")
 

@@ -17,10 +17,10 @@ import numpy as np
 from benchmarks.slow_link import SlowLink
 from benchmarks.wire import MAX_AGE_S
 from benchmarks.wire_others import RouterProcess, free_endpoint
-from gripmon.client import Policy, TransformClient
-from gripmon.publish import ZenohPublisher
+from gripmon.io.client import Policy, TransformClient
+from gripmon.io.publish import ZenohPublisher
 from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
-from gripmon.wire import Link, PublishSettings
+from gripmon.io.wire import Link, PublishSettings
 
 RATES_BYTES_PER_S = (100e3, 70e3, 30e3)
 POLICY = Policy(max_age_s=MAX_AGE_S)

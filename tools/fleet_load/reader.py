@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 import zenoh
 
-from gripmon.wire import Keys, PublishSettings, zenoh_config
+from gripmon.io.wire import Keys, PublishSettings, zenoh_config
 
 
 class Numbered(msgspec.Struct):

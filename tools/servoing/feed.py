@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.client import Policy, Reading, TransformClient
+from gripmon.io.client import Policy, Reading, TransformClient
 from gripmon.config import Config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array

@@ -1,0 +1,40 @@
+"""For programs that use the corrected transform, such as servo controllers.
+
+    from gripmon.io.client import TransformClient
+
+    with TransformClient("arm1", "wrist") as monitor:
+        reading = monitor.latest()  # at once, whatever the network does
+        if reading.usable:
+            move_by(reading.transform)
+        else:
+            stop(reading.reason)
+
+:class:`TransformClient` gives the newest transform and whether it may be used.  :class:`Client` reads every message as
+it is, and sends commands.  :class:`Fleet` knows how all monitors on the network are.  Nothing here waits for a monitor
+to start, and nothing needs help when a monitor or a router ends and comes again.  Neither NumPy nor OpenCV is loaded.
+"""
+
+from __future__ import annotations
+
+from gripmon.io.client.fleet import Fleet
+from gripmon.io.client.names import MonitorName
+from gripmon.io.client.reader import Ambiguous, Client, NotCarriedOut
+from gripmon.io.client.reading import NotUsable, Policy, Reading, Unusable
+from gripmon.io.client.status import Condition, MonitorStatus, trouble
+from gripmon.io.client.transforms import TransformClient
+
+__all__ = [
+    "Ambiguous",
+    "Client",
+    "Condition",
+    "Fleet",
+    "MonitorName",
+    "MonitorStatus",
+    "NotCarriedOut",
+    "NotUsable",
+    "Policy",
+    "Reading",
+    "TransformClient",
+    "Unusable",
+    "trouble",
+]

@@ -1,0 +1,235 @@
+"""All monitors on the network at once."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Self, TypeVar
+
+import msgspec
+import zenoh
+import zenoh.ext
+
+from gripmon.io.client.names import MonitorName, monitor_name, start_of
+from gripmon.io.client.network import named_as_arguments, reader_settings
+from gripmon.io.client.status import MonitorStatus
+from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
+from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
+
+_T = TypeVar("_T", bound=msgspec.Struct)
+_log = logging.getLogger(__name__)
+
+MOST_MONITORS = 50_000
+"""More names than this are not kept, so that whoever writes to the network can't fill the memory."""
+
+_RATE_OVER = 64
+_ALERTS_REMEMBERED = 64  # of each monitor: twice what its publisher repeats to whoever comes late
+
+
+_MOST_STARTS = 16  # of one name: two are too many already
+
+_Said = tuple[StateRecord | None, float]
+"""The last state message, and when it was heard by the monotonic clock, s."""
+
+
+@dataclass(slots=True)
+class _Known:
+    """What is known of one monitor; times by the monotonic clock unless they end with ``_ns``.
+
+    ``starts``: by the id of each that is there, what it said; more than one are several monitors of one name.
+    """
+
+    heard_s: float
+    present: bool = False
+    gone_since_ns: int | None = None
+    state: StateRecord | None = None
+    unreadable: str = ""
+    transforms_s: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_OVER))
+    starts: dict[str, _Said] = field(default_factory=dict)
+    alerts: deque[int] = field(default_factory=lambda: deque(maxlen=_ALERTS_REMEMBERED))
+
+
+class Fleet:
+    """Listens to every monitor's state and liveliness token, and to more if asked to.  Any thread may ask.
+
+    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  What a
+    monitor that vanished said last is kept.
+    """
+
+    def __init__(
+        self,
+        *,
+        connect: str | Sequence[str] = (DEFAULT_ENDPOINT,),
+        zenoh_config_file: str | None = None,
+        transforms: bool = False,
+        on_alert: Callable[[MonitorName, AlertRecord, bytes], None] | None = None,
+        on_presence: Callable[[MonitorStatus], None] | None = None,
+    ) -> None:
+        """``transforms``: listen to them, too, for their rate and age: every frame of every camera.
+
+        ``on_alert`` gets every alert with the payload that it came in, also the last ones from before, each once;
+        ``on_presence`` a monitor that has come (``gone_since_ns`` is None) or vanished.  Both are called in Zenoh's
+        threads: they must return soon and not raise.  Raises :class:`gripmon.io.wire.PublishError`.
+        """
+        self.unreadable = 0
+        self._transforms, self._on_alert, self._on_presence = transforms, on_alert, on_presence
+        self._known: dict[MonitorName, _Known] = {}
+        self._lock = threading.Lock()  # guards what is above against Zenoh's threads
+        self._keys = Keys("*", "*")
+        self._declared: list[object] = []  # Zenoh undeclares what nobody refers to
+        with named_as_arguments():
+            self._link = Link(reader_settings(connect, zenoh_config_file))
+        self._link.attach(self._declare)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def monitors(self) -> list[MonitorStatus]:
+        """Everyone seen since the start, in no order; of several that have one name each that is there."""
+        now_s = time.monotonic()
+        with self._lock:
+            return [status for name, known in self._known.items() for status in _statuses(name, known, now_s)]
+
+    def fault(self) -> str:
+        """Why there is no session, in a few words; empty if there is one."""
+        return self._link.fault()
+
+    def close(self) -> None:
+        """Leave the network."""
+        self._link.close()
+
+    def _declare(self, session: zenoh.Session) -> None:
+        def callback(take: Callable[[zenoh.Sample], None]) -> zenoh.handlers.Callback[zenoh.Sample]:
+            # In Zenoh's own threads: one of Python's would keep a program that forgot close() from ending.
+            return zenoh.handlers.Callback(take, indirect=False)
+
+        keys, tokens = self._keys, session.liveliness()
+        self._declared = [
+            session.declare_subscriber(keys["state"], callback(self._take_state)),
+            tokens.declare_subscriber(keys["alive"], callback(self._take_token), history=True),
+            tokens.declare_subscriber(keys["alive/*"], callback(self._take_start), history=True),
+        ]
+        if self._transforms:
+            self._declared.append(session.declare_subscriber(keys["transform"], callback(self._take_transform)))
+        if self._on_alert is not None:
+            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+            recovery = zenoh.ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
+            self._declared.append(
+                zenoh.ext.declare_advanced_subscriber(
+                    session, keys["alert"], callback(self._take_alert), history=history, recovery=recovery
+                )
+            )
+
+    def _take_state(self, sample: zenoh.Sample) -> None:
+        name = monitor_name(sample.key_expr)
+        record = self._read(name, sample, StateRecord)
+        if record is None:
+            return
+        with self._lock:
+            known = self._about(name)
+            if known is not None:
+                known.state, known.heard_s = record, time.monotonic()
+                if record.monitor_id in known.starts:
+                    known.starts[record.monitor_id] = record, known.heard_s
+
+    def _take_start(self, token: zenoh.Sample) -> None:
+        start, now_s = start_of(token.key_expr), time.monotonic()
+        with self._lock:
+            known = self._about(start.monitor)
+            if known is None:
+                return
+            if token.kind == zenoh.SampleKind.DELETE:
+                known.starts.pop(start.monitor_id, None)
+                if known.starts:  # what is left of several is not what the other one said
+                    known.state, known.heard_s = next(reversed(known.starts.values()))
+            elif len(known.starts) < _MOST_STARTS:
+                state = known.state if known.state and known.state.monitor_id == start.monitor_id else None
+                known.starts.setdefault(start.monitor_id, (state, now_s))
+
+    def _take_token(self, token: zenoh.Sample) -> None:
+        name, now_s = monitor_name(token.key_expr), time.monotonic()
+        with self._lock:
+            known = self._about(name)
+            if known is None or known.present == (token.kind == zenoh.SampleKind.PUT):
+                return
+            known.present = not known.present
+            known.gone_since_ns = None if known.present else time.time_ns()
+            if known.present:
+                known.state, known.heard_s = None, now_s  # what it said before its end says nothing of now
+                known.transforms_s.clear()
+            status = _status(name, known, now_s)
+        if self._on_presence is not None:
+            self._on_presence(status)
+
+    def _take_transform(self, sample: zenoh.Sample) -> None:
+        with self._lock:
+            known = self._about(monitor_name(sample.key_expr))
+            if known is not None:
+                known.transforms_s.append(time.monotonic())
+
+    def _take_alert(self, sample: zenoh.Sample) -> None:
+        name = monitor_name(sample.key_expr)
+        record = self._read(name, sample, AlertRecord)
+        if record is None or self._on_alert is None:
+            return
+        payload = sample.payload.to_bytes()
+        with self._lock:
+            known = self._about(name)
+            if known is None or hash(payload) in known.alerts:  # repeated after the way to it was cut
+                return
+            known.alerts.append(hash(payload))
+        self._on_alert(name, record, payload)
+
+    def _read(self, name: MonitorName, sample: zenoh.Sample, kind: type[_T]) -> _T | None:
+        """The message, or None if it is none: that is counted, and said once for each monitor and reason."""
+        try:
+            return from_json(sample.payload.to_bytes(), kind)
+        except MessageRefused as error:
+            text = str(error)
+        with self._lock:
+            self.unreadable += 1
+            known = self._about(name)
+            if known is None or known.unreadable == text:
+                return None
+            known.unreadable = text
+        _log.warning("%s: a message can't be read: %s", name, text)
+        return None
+
+    def _about(self, name: MonitorName) -> _Known | None:
+        """What is known of it, a new entry if it is new; None if there are too many.  With the lock held."""
+        known = self._known.get(name)
+        if known is None and len(self._known) < MOST_MONITORS:
+            known = self._known[name] = _Known(time.monotonic())
+            if len(self._known) == MOST_MONITORS:
+                _log.error("%d monitors; any more are not listened to", MOST_MONITORS)
+        return known
+
+
+def _statuses(name: MonitorName, known: _Known, now_s: float) -> list[MonitorStatus]:
+    if len(known.starts) < 2 or not known.present:
+        return [_status(name, known, now_s)]
+    return [
+        MonitorStatus(name=name, state=state, state_age_s=now_s - heard_s, monitor_id=monitor_id, several=True)
+        for monitor_id, (state, heard_s) in known.starts.items()
+    ]
+
+
+def _status(name: MonitorName, known: _Known, now_s: float) -> MonitorStatus:
+    times_s = known.transforms_s
+    rate = (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 and times_s[-1] > times_s[0] else None
+    return MonitorStatus(
+        name=name,
+        state=known.state,
+        state_age_s=now_s - known.heard_s,
+        gone_since_ns=known.gone_since_ns,
+        transforms_per_s=rate,
+        transform_age_s=now_s - times_s[-1] if times_s else None,
+        monitor_id=known.state.monitor_id if known.state is not None else next(iter(known.starts), ""),
+    )

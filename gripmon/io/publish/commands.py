@@ -1,0 +1,278 @@
+"""Commands from the network: Zenoh's thread takes them in, the monitor's loop carries them out between two frames."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+
+import msgspec
+import zenoh
+
+from gripmon.io.publish.answers import Answers, send_now
+from gripmon.io.publish.presence import Presence, in_words
+from gripmon.model.records import (
+    Command,
+    CommandError,
+    CommandFault,
+    CommandName,
+    CommandReply,
+    CommandRequest,
+    MessageRefused,
+    from_json,
+    largest_bytes,
+    to_json,
+)
+from gripmon.io.wire import Keys, Link
+from gripmon.io.wire.malformed import Malformed
+
+_log = logging.getLogger(__name__)
+
+TIMEOUT_S = 2.0
+"""So long the loop has for a command; then the asker is told that it has not answered."""
+
+_WAITING_MOST = 16
+_REMEMBERED_MOST = 256
+_QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
+"""They change nothing, and their answers are large: asked again they are answered anew, not from memory."""
+
+_STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
+
+
+class PendingCommand:
+    """A command, and all who wait for its answer: whoever sent it, perhaps several times under the same id.
+
+    It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
+    """
+
+    def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
+        """``monitor_id`` is that of the monitor which answers."""
+        self.command, self._monitor_id = command, monitor_id
+        self._answers = answers
+        self._timeout_s = timeout_s
+        self._lock = threading.Lock()  # guards what follows
+        self._askers: list[_Asker] = []
+        self._answer: CommandReply | CommandError | None = None
+        self._taken = self._dropped = False
+
+    @property
+    def askers(self) -> int:
+        """How many wait for the answer."""
+        return len(self._askers)
+
+    def join(self, query: zenoh.Query, key: str) -> bool:
+        """Add somebody who waits, or tell the answer that is there; False if it was given up and never carried out."""
+        with self._lock:
+            if self._dropped:
+                return False
+            answer = self._answer
+            if answer is None:
+                self._askers.append(asker := _Asker(query, key, self._answers, self._monitor_id))
+        if answer is not None:
+            self._answers.send(query, _reply(key, answer, self._monitor_id))
+        else:
+            asker.wait(self._timeout_s, lambda: self._time_is_over(asker))
+        return True
+
+    def take(self) -> bool:
+        """The loop is about to carry it out; False if all its askers were told that it won't be."""
+        with self._lock:
+            self._taken = bool(self._askers)
+            self._dropped = not self._taken
+            return self._taken
+
+    def answer(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
+        """Tell those who still wait, and whoever asks again; at once, but with an attachment it may take seconds."""
+        with self._lock:
+            self._answer = answer
+            askers, self._askers = self._askers, []
+        for asker in askers:
+            asker.tell(answer, attachment)
+
+    def _time_is_over(self, asker: _Asker) -> None:
+        with self._lock:
+            if asker not in self._askers:
+                return
+            self._askers.remove(asker)
+            lives = self._taken or bool(self._askers)
+            became = "it may still be carried out, ask for the state" if lives else "it is not carried out"
+        text = f"the monitor has not answered within {self._timeout_s:g} s; {became}"
+        asker.tell(CommandError(CommandFault.TIMEOUT, text))
+
+
+class ZenohCommands:
+    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`gripmon.model.records.CommandRequest` or none.
+
+    It replies a :class:`gripmon.model.records.CommandReply` as JSON, or as an error a :class:`gripmon.model.records.CommandError`.
+    What was carried out under an id is not carried out again: the last 256 answers are remembered.
+    """
+
+    def __init__(
+        self, link: Link, keys: Keys, presence: Presence | None = None, *, timeout_s: float = TIMEOUT_S
+    ) -> None:
+        self._keys, self._presence = keys, presence
+        self._malformed = Malformed("command", keys["cmd"])
+        self._timeout_s = timeout_s
+        self._waiting: deque[PendingCommand] = deque()
+        self._lock = threading.Lock()  # guards what is known by its id
+        self._known: OrderedDict[str, PendingCommand] = OrderedDict()
+        self._queryable: zenoh.Queryable[None] | None = None
+        self._closed = False
+        flooded = CommandError(CommandFault.BUSY, "too many requests wait already; try again later")
+        self._answers = Answers("commands", _reply("", flooded, self._monitor_id))
+        link.attach(self._attach, self.close)
+
+    @property
+    def malformed(self) -> int:
+        """Requests so far whose payload was none."""
+        return self._malformed.count
+
+    def poll(self) -> PendingCommand | None:
+        """The next command to carry out and answer, at once; None if there is none."""
+        while self._waiting:
+            pending = self._waiting.popleft()
+            if pending.take():
+                return pending
+        return None
+
+    def close(self) -> None:
+        """Tell those who still wait that the monitor stops."""
+        with self._lock:  # what is being taken in just now is told below, too
+            self._closed = True
+        while (pending := self.poll()) is not None:
+            pending.answer(_STOPPING)
+        self._answers.close()
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        answer = zenoh.handlers.Callback(self._receive, indirect=False)
+        self._queryable = session.declare_queryable(self._keys["cmd/*"], answer, complete=True)
+
+    def _receive(self, query: zenoh.Query) -> None:
+        # Zenoh swallows an exception here and the asker would see an empty result: always answer in words.
+        key = str(query.key_expr)
+        try:
+            error = self._queue(query, key)
+        except Exception as fault:  # noqa: BLE001  as just said
+            _log.debug("command on %s", key, exc_info=fault)
+            error = CommandError(CommandFault.INTERNAL, f"{type(fault).__name__}: {fault}")
+        if error is not None:
+            self._answers.send(query, _reply(key, error, self._monitor_id))
+
+    def _queue(self, query: zenoh.Query, key: str) -> CommandError | None:
+        """Let the loop answer; an error if it won't."""
+        name = _name(self._keys, key)
+        if isinstance(name, CommandError):
+            return name
+        request = _request(query.payload)
+        if isinstance(request, CommandError):
+            self._malformed.add(request.text)
+            return request
+        if wrong := self._meant_for_another(request):
+            return wrong
+        command = Command(name, request.argument)
+        with self._lock:
+            if self._closed:
+                return _STOPPING
+            known = self._known.get(request.id)
+            if known is not None and known.command != command:
+                text = f"the id {request.id} was that of another command, {known.command.name}; a new id for a new one"
+                return CommandError(CommandFault.ID_REUSED, text)
+            if known is not None and known.askers >= _WAITING_MOST:  # each costs a thread until its time is over
+                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} wait for this answer already; try again later")
+            if known is not None and known.join(query, key):
+                return None
+            if len(self._waiting) >= _WAITING_MOST:
+                return CommandError(CommandFault.BUSY, f"{_WAITING_MOST} commands wait already; try again later")
+            pending = PendingCommand(command, self._timeout_s, self._answers, self._monitor_id)
+            pending.join(query, key)
+            self._remember(request.id, pending)
+            self._waiting.append(pending)
+        return None
+
+    @property
+    def _monitor_id(self) -> str:
+        return "" if self._presence is None else self._presence.monitor_id
+
+    def _meant_for_another(self, request: CommandRequest) -> CommandError | None:
+        """Of several monitors of one name each command is carried out by the one that it names, or by none."""
+        if request.monitor_id and request.monitor_id != self._monitor_id:
+            text = f"this is the monitor {self._monitor_id or 'without id'}, and {request.monitor_id} is meant"
+            return CommandError(CommandFault.ANOTHER, text)
+        others = () if self._presence is None or request.monitor_id else self._presence.others()
+        if not others:
+            return None
+        text = f"{in_words(others)} beside {self._monitor_id}; name the one that is meant in monitor_id"
+        return CommandError(CommandFault.SEVERAL, text)
+
+    def _remember(self, request_id: str, pending: PendingCommand) -> None:
+        if request_id and pending.command.name not in _QUESTIONS:
+            self._known[request_id] = pending
+            self._known.move_to_end(request_id)
+            if len(self._known) > _REMEMBERED_MOST:
+                self._known.popitem(last=False)
+
+
+class _Asker:
+    """One query that waits for its answer."""
+
+    def __init__(self, query: zenoh.Query, key: str, answers: Answers, monitor_id: str) -> None:
+        self._query, self._key, self._answers, self._monitor_id = query, key, answers, monitor_id
+        self._timer: threading.Timer | None = None
+
+    def wait(self, timeout_s: float, is_over: Callable[[], None]) -> None:
+        self._timer = threading.Timer(timeout_s, is_over)
+        self._timer.daemon = True
+        self._timer.start()
+
+    def tell(self, answer: CommandReply | CommandError, attachment: bytes | None = None) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        reply = _reply(self._key, answer, self._monitor_id, attachment)
+        if attachment is None:
+            self._answers.send(self._query, reply)
+        else:  # large: whoever made it has a thread for that, and makes no more of them meanwhile
+            send_now(self._query, reply)
+
+
+def _name(keys: Keys, key: str) -> CommandName | CommandError:
+    """Which command is asked for on a key, or what is wrong with it."""
+    name = key.rpartition("/")[2]
+    if "*" in key or key != keys[f"cmd/{name}"]:
+        # What changes a calibration must name it: a pattern may reach more monitors than was thought of.
+        text = f"{key} is a pattern; name the monitor: {keys['cmd/<name>']}"
+        return CommandError(CommandFault.SEVERAL, text)
+    try:
+        return CommandName(name)
+    except ValueError:
+        text = f"there is no command {name}; one of {', '.join(CommandName)}"
+        return CommandError(CommandFault.UNKNOWN, text)
+
+
+def _request(payload: zenoh.ZBytes | None) -> CommandRequest | CommandError:
+    """What a payload says, or what is wrong with it."""
+    try:
+        if payload is None or not len(payload):
+            return CommandRequest()
+        if len(payload) > (most := largest_bytes(CommandRequest)):  # before a copy of it is made
+            raise MessageRefused(f"{len(payload)} bytes; at most {most}")
+        return from_json(payload.to_bytes(), CommandRequest)
+    except MessageRefused as error:
+        text = f'{error}; a payload is {{"id": "…", "argument": "…"}}, both may be left out'
+        return CommandError(CommandFault.MALFORMED, text)
+
+
+def _reply(
+    key: str, answer: CommandReply | CommandError, monitor_id: str, attachment: bytes | None = None
+) -> Callable[[zenoh.Query], None]:
+    """What sends an answer to a query, with the id of the monitor that gives it."""
+
+    def send(query: zenoh.Query) -> None:
+        payload = to_json(msgspec.structs.replace(answer, monitor_id=monitor_id))
+        if isinstance(answer, CommandReply):
+            query.reply(key, payload, encoding=zenoh.Encoding.APPLICATION_JSON, attachment=attachment)
+        else:
+            query.reply_err(payload, encoding=zenoh.Encoding.APPLICATION_JSON)
+
+    return send

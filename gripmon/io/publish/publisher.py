@@ -1,0 +1,287 @@
+"""What a monitor says on the network."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import msgspec
+import zenoh
+
+from gripmon.io.publish.answers import Answers
+from gripmon.io.publish.presence import Presence
+from gripmon.model.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
+from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
+
+_T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
+_JSON = zenoh.Encoding.APPLICATION_JSON
+_ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
+_HEARTBEAT_S = 1.0
+
+
+class StatePublisher(Protocol):
+    """Where every loop puts what it has to say.  No method waits for the network."""
+
+    def state(self, record: StateRecord) -> None: ...
+    def alert(self, record: AlertRecord) -> None: ...
+    def close(self) -> None: ...
+
+
+class Publisher(StatePublisher, Protocol):
+    """Where the loop of a wrist camera puts what it has to say."""
+
+    def transform(self, record: FrameRecord) -> None: ...
+    def reference(self, record: ReferenceRecord) -> None: ...
+
+
+class SpotPublisher(StatePublisher, Protocol):
+    """Where the loop of a second camera puts what it has to say."""
+
+    def spot(self, record: SpotRecord) -> None: ...
+
+
+class NullPublisher:
+    """Says nothing."""
+
+    def transform(self, record: FrameRecord) -> None: ...
+    def state(self, record: StateRecord) -> None: ...
+    def alert(self, record: AlertRecord) -> None: ...
+    def reference(self, record: ReferenceRecord) -> None: ...
+    def spot(self, record: SpotRecord) -> None: ...
+    def close(self) -> None: ...
+
+
+class _ZenohStates:
+    """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
+
+    def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
+        """``presence``: whose id stands in everything that is said.  Raises ValueError for a name that can't be part of
+        a key.
+        """
+        self.keys = Keys(check_name("robot", robot), check_name("camera", camera))
+        self.monitor_id = "" if presence is None else presence.monitor_id
+        self.unsent = 0
+        self._link = link
+        self._wire: _Wire | None = None
+        self._lock = threading.Lock()  # guards the kept records below against the opening thread
+        self._last: dict[str, bytes] = {}  # by key, of what late joiners get
+        self._waiting: dict[str, deque[bytes]] = {}
+        link.attach(self._adopt, self._leave)
+
+    def state(self, record: StateRecord) -> None:
+        """Send the state, and keep it for late joiners."""
+        self._put_last("state", to_json(self._signed(record)))
+
+    def alert(self, record: AlertRecord) -> None:
+        """Send an alert."""
+        self._put_each("alert", to_json(self._signed(record)))
+
+    def close(self) -> None:
+        """Withdraw the liveliness token and close the link.  Calling it twice does nothing more."""
+        self._link.close()
+
+    def _declared(self, wire: _Wire) -> None:
+        """Declare what is the subclass's own."""
+
+    def _signed(self, record: _T) -> _T:
+        """The record with the id of this start."""
+        return msgspec.structs.replace(record, monitor_id=self.monitor_id) if self.monitor_id else record
+
+    def _put_last(self, leaf: str, payload: bytes) -> None:
+        with self._lock:
+            self._last[leaf] = payload
+            if self._wire is not None:
+                self._wire.puts[leaf](payload)
+
+    def _put_each(self, leaf: str, payload: bytes) -> None:
+        with self._lock:
+            if self._wire is not None:
+                self._wire.puts[leaf](payload)
+            else:
+                self._waiting.setdefault(leaf, deque(maxlen=_ALERTS_KEPT)).append(payload)
+
+    def _adopt(self, session: zenoh.Session) -> None:
+        """Declare everything on a new session and send what was kept for it."""
+        wire = _Wire(session, self.keys, self.monitor_id)
+        self._declared(wire)
+        wire.appear()
+        with self._lock:
+            self._wire = wire
+            for leaf in sorted(self._last):  # a reference before the state that names it
+                wire.puts[leaf](self._last[leaf])
+            for leaf, payloads in self._waiting.items():
+                while payloads:
+                    wire.puts[leaf](payloads.popleft())
+
+    def _leave(self) -> None:
+        with self._lock:
+            wire, self._wire = self._wire, None
+        if wire is not None:
+            wire.close()
+
+
+class ZenohPublisher(_ZenohStates):
+    """Publishes one monitor's records over a link, which it closes in the end.
+
+    While the link is not open yet, transforms are dropped and counted in ``unsent``; the last state, the last reference
+    and the last few alerts are kept for its opening.
+    """
+
+    def transform(self, record: FrameRecord) -> None:
+        """Send one frame's record."""
+        wire = self._wire
+        if wire is None:
+            self.unsent += 1
+        else:
+            wire.puts["transform"](to_json(self._signed(record)))
+
+    def reference(self, record: ReferenceRecord) -> None:
+        """Send the reference, and keep it for late joiners."""
+        self._put_last("reference", to_json(record))
+
+    def _declared(self, wire: _Wire) -> None:
+        wire.declare_newest("transform")
+        wire.declare_kept("reference")
+
+
+class ZenohSpotPublisher(_ZenohStates):
+    """Publishes a second camera's records over a link, which it closes in the end.
+
+    While the link is not open yet, the last state, spots and alerts, the last few, are kept for its opening.
+    """
+
+    def spot(self, record: SpotRecord) -> None:
+        """Send what became of a pulse, and keep the last one for late joiners."""
+        self._put_each("spot", to_json(self._signed(record)))
+
+    def _declared(self, wire: _Wire) -> None:
+        wire.declare_kept("spot", _ALERTS_KEPT)
+
+
+def _keeping_publisher(
+    session: zenoh.Session, key: str, priority: zenoh.Priority, kept: int
+) -> zenoh.ext.AdvancedPublisher:
+    """A publisher whose last ``kept`` samples an advanced subscriber with history gets when it comes later."""
+    return zenoh.ext.declare_advanced_publisher(
+        session,
+        key,
+        encoding=_JSON,
+        congestion_control=zenoh.CongestionControl.DROP,
+        priority=priority,
+        cache=zenoh.ext.CacheConfig(kept),
+        # Sequence numbers instead of timestamps: the cache then works whatever the session's timestamping setting.
+        sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
+        publisher_detection=True,
+    )
+
+
+def _too_many_ask(query: zenoh.Query) -> None:
+    query.reply_err(b"busy: too many ask; try again later", encoding=zenoh.Encoding.TEXT_PLAIN)
+
+
+class _LastValue:
+    """A key whose last value is there for whoever asks."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        key: str,
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        answers: Answers,
+    ) -> None:
+        self._key = key
+        self._answers = answers
+        self._last: bytes | None = None
+        self._publisher = publisher
+        # Answered in Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        answer = zenoh.handlers.Callback(self._answer, indirect=False)
+        self._queryable = session.declare_queryable(key, answer, complete=True)
+
+    def put(self, payload: bytes) -> None:
+        self._last = payload
+        self._publisher.put(payload)
+
+    def _answer(self, query: zenoh.Query) -> None:
+        self._answers.send(query, self._reply)
+
+    def _reply(self, query: zenoh.Query) -> None:
+        last = self._last
+        if last is None:
+            query.reply_err(b"nothing published on this key yet", encoding=zenoh.Encoding.TEXT_PLAIN)
+        else:
+            query.reply(self._key, last, encoding=_JSON)
+
+
+class _TimedStream(_LastValue):
+    """A key whose messages say when they were sent, and which tells the time to whoever asks.
+
+    With both a reader without a clock of the same time can bound how long a message was on its way.
+    """
+
+    _clock = uuid.uuid4().hex  # of this process: after a restart, perhaps on another machine, it is another one
+
+    def put(self, payload: bytes) -> None:
+        self._last = payload
+        self._publisher.put(payload, attachment=self._now())
+
+    def _answer(self, query: zenoh.Query) -> None:
+        if query.parameters.get(CLOCK_PARAMETER) is None:
+            super()._answer(query)
+            return
+        now = self._now()  # before the reply has to wait for anything
+        self._answers.send(query, lambda asked: asked.reply(self._key, now, encoding=_JSON))
+
+    def _now(self) -> bytes:
+        return to_json(ClockReading(self._clock, steady_ns()))
+
+
+class _Wire:
+    """Everything declared on one open session; ``puts`` by the last part of the key."""
+
+    def __init__(self, session: zenoh.Session, keys: Keys, monitor_id: str) -> None:
+        self._session, self._keys = session, keys
+        # the id first: whoever sees the token without one finds the id, too
+        self._tokens = [*([keys[f"alive/{monitor_id}"]] if monitor_id else []), keys["alive"]]
+        self._answers = Answers("latest", _too_many_ask)
+        alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
+        self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
+        self.values: dict[str, _LastValue] = {}
+        self.declare_kept("state")
+        self._alive: list[zenoh.LivelinessToken] = []
+
+    def declare_newest(self, leaf: str) -> None:
+        """A key of a stream, without a cache: a message of it is worth nothing to who didn't ask for the last one."""
+        publisher = self._session.declare_publisher(
+            self._keys[leaf],
+            encoding=_JSON,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
+        self._add(leaf, publisher, _TimedStream)
+
+    def declare_kept(self, leaf: str, kept: int = 1) -> None:
+        """A key whose last ``kept`` messages are there for who comes late."""
+        publisher = _keeping_publisher(self._session, self._keys[leaf], zenoh.Priority.DATA_HIGH, kept)
+        self._add(leaf, publisher)
+
+    def appear(self) -> None:
+        """Show the liveliness tokens, when all is declared: the one that every monitor has, and that of this start."""
+        self._alive = [self._session.liveliness().declare_token(key) for key in self._tokens]
+
+    def _add(
+        self,
+        leaf: str,
+        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
+        kind: type[_LastValue] = _LastValue,
+    ) -> None:
+        self.values[leaf] = kind(self._session, self._keys[leaf], publisher, self._answers)
+        self.puts[leaf] = self.values[leaf].put
+
+    def close(self) -> None:
+        for token in reversed(self._alive):
+            token.undeclare()
+        self._answers.close()

@@ -1,0 +1,86 @@
+"""Where frames come from: a folder of images, a video file, a live camera, one on the network, a simulated one.
+
+All of them are a :class:`Source`; :func:`open_source` makes one from its settings.  Nothing heavy is imported before.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, Source, SourceError, Waiting
+from gripmon.io.sources.folder import FolderSettings, FolderSource
+from gripmon.io.sources.live import LiveCamera, LiveSettings
+from gripmon.io.sources.network import NetworkCamera, NetworkSettings, network_key
+from gripmon.io.sources.newest import NewestFrame
+from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
+from gripmon.io.sources.video import VideoSettings, VideoSource
+from gripmon.io.wire import Keys, Link
+
+SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings | NetworkSettings
+
+__all__ = [
+    "READ_TIMEOUT_S",
+    "FolderSettings",
+    "FolderSource",
+    "FullScale",
+    "LiveCamera",
+    "LiveSettings",
+    "NetworkCamera",
+    "NetworkSettings",
+    "NewestFrame",
+    "SimulatedScene",
+    "SimulatedSettings",
+    "Source",
+    "SourceError",
+    "SourceSettings",
+    "VideoSettings",
+    "VideoSource",
+    "Waiting",
+    "make_simulator",
+    "network_key",
+    "open_source",
+    "settings_for_path",
+]
+
+
+def open_source(
+    settings: SourceSettings,
+    relative_to: Path = Path(),
+    *,
+    scene: SimulatedScene | None = None,
+    size_px: tuple[int, int] | None = None,
+    link: Link | None = None,
+    keys: Keys | None = None,
+) -> Source:
+    """Start a source; paths in its settings count from ``relative_to``, the folder of the configuration file.
+
+    Only the simulator needs a whole ``scene``, and a camera on the network the session, the monitor's keys and the size
+    of the images: (width, height), by default that of the scene's camera.  The simulator's real-time camera starts
+    another Python process by ``multiprocessing``, so a script that opens one must keep its own start behind
+    ``if __name__ == "__main__"``.
+
+    Raises :class:`SourceError` for a missing or empty folder, a malformed table of time stamps, a file that is no
+    video, and a device of no known form.  A camera that is only absent at present is no error: the source waits for it.
+    """
+    match settings:
+        case SimulatedSettings():
+            if scene is None:
+                raise SourceError("kind: simulator has no scene here; a camera, a gripper and a calibration to render")
+            return open_simulated(settings, scene, relative_to)
+        case FolderSettings():
+            return FolderSource(settings, relative_to)
+        case VideoSettings():
+            return VideoSource(settings, relative_to)
+        case LiveSettings():
+            return LiveCamera(settings)
+        case NetworkSettings():
+            if size_px is None and scene is not None:
+                size_px = scene.camera.width_px, scene.camera.height_px
+            if link is None or keys is None or size_px is None:
+                raise SourceError("kind: zenoh has no session here; publish.enabled: true, and gripmon run")
+            return NetworkCamera(settings, link, keys["image"], size_px)
+
+
+def settings_for_path(path: Path) -> FolderSettings | VideoSettings:
+    """Settings for a recorded input that a person named on the command line: a folder of images, else a video file."""
+    return FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))

@@ -1,0 +1,226 @@
+"""A folder of images, in the natural order of their names."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import itertools
+import math
+import os
+import re
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import msgspec
+
+from gripmon.model.records import Frame, Image
+from gripmon.io.sources.base import SourceError
+
+if TYPE_CHECKING:
+    from _csv import Reader as _Lines
+
+_SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
+IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
+TIMESTAMPS_NAME = "timestamps.csv"
+COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
+_NS = 1_000_000_000
+
+LARGEST_BYTES = 1 << 30
+"""More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
+
+
+class FolderSettings(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="folder"
+):
+    """Images in a folder; a file ``timestamps.csv`` with ``file,stamp_ns[,jaw_opening_m]`` may lie beside them."""
+
+    path: Annotated[str, msgspec.Meta(min_length=1, description="folder with the images")]
+    fps: Annotated[
+        float, msgspec.Meta(gt=0, le=10000, description="frames a second where there are no time stamps (1/s)")
+    ] = 25.0
+    timestamps: Annotated[
+        str | None,
+        msgspec.Meta(description="file with time stamps; absent: timestamps.csv in the folder, if there is one"),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class TableRow:
+    """What a table of time stamps says of an image."""
+
+    stamp_ns: int
+    jaw_opening_m: float | None
+
+
+class FolderSource:
+    """Every image of a folder, in order: ``frame10.png`` comes after ``frame9.png``.
+
+    With a table of time stamps it decides which frames there are: a file that it names and that is missing becomes a
+    frame with a fault, an image that it doesn't name is refused at the start.  Grey files stay grey, colour becomes
+    BGR, an alpha channel is left out, 16 bits and float stay what they are.  Truncated or foreign files become frames
+    with a fault.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, settings: FolderSettings, relative_to: Path) -> None:
+        self._folder = relative_to / settings.path
+        if not self._folder.is_dir():
+            raise SourceError(f"path: there is no folder {self._folder}; a folder with images")
+        names = sorted(
+            (p.name for p in self._folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()),
+            key=natural_key,
+        )
+        table = self._folder / TIMESTAMPS_NAME if settings.timestamps is None else relative_to / settings.timestamps
+        if settings.timestamps is not None or table.exists():
+            rows = read_table(table)
+            unnamed = sorted(set(names) - rows.keys(), key=natural_key)
+            if unnamed:
+                raise SourceError(f"{table}: no row for {unnamed[0]}; a row for each image ({len(unnamed)} have none)")
+            names = sorted(rows, key=natural_key)
+            _check_order(table, names, rows)
+        else:
+            rows = {name: TableRow(round(i * _NS / settings.fps), None) for i, name in enumerate(names)}
+        if not names:
+            raise SourceError(f"path: no image in {self._folder}; files such as *.png, *.jpg, *.tif, *.pgm")
+        self._names, self._rows = names, rows
+        self._seq = 0
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def read(self) -> Frame | None:
+        if self._seq >= len(self._names):
+            return None
+        name = self._names[self._seq]
+        row = self._rows[name]
+        image, fault = read_image(self._folder / name)
+        frame = Frame(self._seq, row.stamp_ns, image, row.jaw_opening_m, name, fault)
+        self._seq += 1
+        return frame
+
+    def close(self) -> None:
+        self._seq = len(self._names)
+
+
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG_END_BYTES = 8
+"""The last chunk's name and checksum."""
+
+
+def natural_key(name: str) -> tuple[list[Any], str]:
+    """Order in which a person counts: digits as numbers, the rest as text; equal numbers by the name itself."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
+
+
+def read_image(path: Path) -> tuple[Image | None, str | None]:
+    """The image, or why there is none."""
+    import cv2
+    import numpy as np
+
+    try:
+        data = _regular_bytes(path)
+    except FileNotFoundError:
+        return None, "the file is missing"
+    except OSError as error:
+        return None, f"the file can't be read: {error.strerror}"
+    if not data:
+        return None, "the file is empty"
+    if data.startswith(_PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
+        return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
+    try:
+        # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        return None, f"not an image: {error.err}"
+    if image is None:
+        return None, "truncated, damaged or not an image"
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[:, :, 0] if image.shape[2] < 3 else image[:, :, :3])
+    return image, None
+
+
+def _regular_bytes(path: Path) -> bytes:
+    """A file's content.  OSError, too, for what is none: a pipe or a device might be waited for without end."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        if status.st_size > LARGEST_BYTES:
+            raise OSError(errno.EFBIG, f"it is larger than {LARGEST_BYTES >> 20} MiB")
+        return file.read(LARGEST_BYTES)
+
+
+def read_table(path: Path) -> dict[str, TableRow]:
+    """A table ``file,stamp_ns[,jaw_opening_m]`` by file name.  Raises :class:`SourceError`."""
+    try:
+        text = _regular_bytes(path).decode("utf-8-sig")
+    except FileNotFoundError:
+        raise SourceError(f"timestamps: there is no file {path}; a table {','.join(COLUMNS[:2])}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: can't be read ({getattr(error, 'strerror', error)}); a table in UTF-8") from None
+    lines = csv.reader(text.splitlines())
+    try:
+        return _rows(path, lines)
+    except csv.Error as error:
+        raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
+
+
+def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
+    header = tuple(cell.strip() for cell in next(lines, []))
+    if header not in (COLUMNS[:2], COLUMNS):
+        raise SourceError(f"{path}: line 1 is '{','.join(header)}'; file,stamp_ns or file,stamp_ns,jaw_opening_m")
+    rows: dict[str, TableRow] = {}
+    for cells in lines:
+        if not cells:
+            continue
+        where = f"{path}: line {lines.line_num}"
+        if len(cells) != len(header):
+            raise SourceError(f"{where} has {len(cells)} values; {len(header)}: {','.join(header)}")
+        name = cells[0].strip()
+        if not name or Path(name).name != name:
+            raise SourceError(f"{where}: '{name}' is no file name; the plain name of a file in the folder")
+        if name in rows:
+            raise SourceError(f"{where}: {name} is there twice; one row for each file")
+        rows[name] = TableRow(_stamp(cells[1], where), _opening(cells[2], where) if len(cells) == 3 else None)
+    return rows
+
+
+def _stamp(cell: str, where: str) -> int:
+    try:
+        stamp_ns = int(cell)
+    except ValueError:
+        raise SourceError(f"{where}: stamp_ns is '{cell.strip()}'; a whole number of nanoseconds") from None
+    if not 0 <= stamp_ns < 2**63:
+        raise SourceError(f"{where}: stamp_ns is {stamp_ns}; 0 or more, below 2^63")
+    return stamp_ns
+
+
+def _opening(cell: str, where: str) -> float | None:
+    if not cell.strip():
+        return None
+    try:
+        opening_m = float(cell)
+    except ValueError:
+        opening_m = math.nan
+    if not 0.0 <= opening_m <= 1.0:
+        raise SourceError(
+            f"{where}: jaw_opening_m is '{cell.strip()}'; metres, 0 to 1, or nothing where it isn't known"
+        )
+    return opening_m
+
+
+def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> None:
+    for earlier, later in itertools.pairwise(names):
+        if rows[later].stamp_ns <= rows[earlier].stamp_ns:
+            raise SourceError(
+                f"{path}: stamp_ns doesn't rise from {earlier} to {later}; stamps that rise in the files' order"
+            )

@@ -1,0 +1,332 @@
+"""A camera on the network: frames that its driver puts on a Zenoh key, or on a ROS 2 topic."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+import zenoh
+
+from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
+from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.io.sources.lateness import MOST_LATE_S, Lateness
+from gripmon.io.sources.payload import (
+    JPEG,
+    PNG,
+    PayloadError,
+    WrongSizeError,
+    check_size,
+    file_image,
+    raw_image,
+    read_note,
+)
+from gripmon.io.wire import Link
+from gripmon.io.wire.malformed import Malformed
+from gripmon.io.wire.settings import KEY_PATTERN
+
+_log = logging.getLogger(__name__)
+
+FILES = {"jpeg": JPEG, "png": PNG}
+ROS_FORMATS = ("ros2_image", "ros2_compressed")
+_PADDING_BYTES = 1 << 20
+_MOST_PIXEL_BYTES = 8  # no encoding has more
+LARGEST_ATTACHMENT_BYTES = largest_bytes(FrameNote)
+
+Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
+
+
+class NetworkSettings(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="zenoh"
+):
+    """A camera whose driver publishes its frames; ``docs/network_camera.md`` says what it has to send."""
+
+    key: (
+        Annotated[
+            str,
+            msgspec.Meta(
+                pattern=KEY_PATTERN,
+                description="Zenoh key of the frames, without wildcards; absent: gripmon/<robot>/<camera_name>/image",
+            ),
+        ]
+        | None
+    ) = None
+    topic: (
+        Annotated[str, msgspec.Meta(description="ROS 2 topic instead of a key, full name: /camera/image_raw")] | None
+    ) = None
+    domain_id: Annotated[int, msgspec.Meta(ge=0, le=232, description="ROS_DOMAIN_ID of the topic (no unit)")] = 0
+    format: Annotated[
+        Format,
+        msgspec.Meta(
+            description="auto: raw, jpeg or png, whatever comes; ros2_image, ros2_compressed: sensor_msgs/Image, "
+            "CompressedImage"
+        ),
+    ] = "auto"
+    silent_after_s: Annotated[
+        float, msgspec.Meta(gt=0.0, le=3600.0, description="no frame for so long: the camera counts as gone (s)")
+    ] = 1.0
+
+
+class Content(NamedTuple):
+    """What is in a payload; ``stamp_ns`` None where nobody says when it was captured."""
+
+    image: Image
+    stamp_ns: int | None
+    jaw_opening_m: float | None
+
+
+class PayloadDecoder:
+    """Payloads of one camera -> images.  A pure function of what it gets: no clock, no state."""
+
+    def __init__(self, frame_format: Format, size_px: tuple[int, int]) -> None:
+        """``size_px`` is (width, height) of every image.  Raises SourceError where ROS 2 isn't installed."""
+        self._format, self._size_px = frame_format, size_px
+        self.largest_bytes = _MOST_PIXEL_BYTES * size_px[0] * size_px[1] + _PADDING_BYTES
+        if frame_format in ROS_FORMATS:
+            from gripmon.io.ros2.types import Ros2Missing, typestore
+
+            try:
+                typestore()  # now, not with the first frame: it takes a while
+            except Ros2Missing as error:
+                raise SourceError(f"format: {frame_format} can't be read; {error}") from None
+
+    def decode(self, payload: bytes, encoding: str, attachment: bytes | None) -> Content:
+        """``encoding`` is Zenoh's.  Raises :class:`PayloadError` for everything that is wrong."""
+        if len(payload) > self.largest_bytes:
+            raise PayloadError(f"{len(payload)} bytes; at most {self.largest_bytes} for an image of this camera")
+        if self._format in ROS_FORMATS:
+            return self._of_ros(payload)
+        note = read_note(attachment)
+        kind = self._kind(payload, encoding, note)
+        if kind == "raw":
+            image = raw_image(payload, note, self._size_px)
+        else:
+            if not payload.startswith(FILES[kind]):
+                raise PayloadError(f"no {kind.upper()} file: it begins with {payload[:8].hex() or 'nothing'}")
+            image = file_image(payload, self._size_px)
+        return Content(image, note.stamp_ns, note.jaw_opening_m)
+
+    def _kind(self, payload: bytes, encoding: str, note: FrameNote) -> Literal["raw", "jpeg", "png"]:
+        if self._format in ("raw", "jpeg", "png"):
+            return self._format
+        said = encoding.partition(";")[0]
+        if said in ("image/jpeg", "image/png"):
+            return "jpeg" if said == "image/jpeg" else "png"
+        if note.width is None and payload.startswith(JPEG):
+            return "jpeg"
+        if note.width is None and payload.startswith(PNG):
+            return "png"
+        return "raw"
+
+    def _of_ros(self, payload: bytes) -> Content:
+        from gripmon import ros2
+
+        try:
+            if self._format == "ros2_image":
+                stamp_ns, image = ros2.decode_image(payload)
+                check_size((image.shape[1], image.shape[0]), self._size_px)
+            else:
+                stamp_ns, _, data = ros2.decode_compressed_image(payload)
+                image = file_image(data, self._size_px)
+        except ros2.MessageError as error:
+            raise PayloadError(str(error)) from None
+        return Content(image, stamp_ns or None, None)
+
+
+class _Arrival(NamedTuple):
+    sample: zenoh.Sample
+    unix_ns: int
+    monotonic_s: float
+
+
+class NetworkCamera:
+    """The newest frame that a driver published; what comes before it was asked for is counted as dropped.
+
+    Zenoh's thread only puts each sample into a slot for one; it is decoded in :meth:`read`, in the caller's thread, so
+    what is dropped costs nothing.  ``seq`` counts what arrived, without malformed payloads.
+
+    A malformed payload is counted, said once, and passed over as long as good ones come.  Where nothing else comes,
+    ``read`` gives a frame with its fault after ``READ_TIMEOUT_S``, as of a camera that delivers rubbish.
+
+    ``stamp_ns`` is what the driver says, else Zenoh's time stamp, else when it arrived here.
+    """
+
+    live = True
+
+    def __init__(self, settings: NetworkSettings, link: Link, image_key: str, size_px: tuple[int, int]) -> None:
+        """``image_key`` is where settings without key and topic listen.  Raises :class:`SourceError`."""
+        self._settings = settings
+        self.key = network_key(settings, image_key)
+        self._decoder = PayloadDecoder(settings.format, size_px)
+        self._malformed = Malformed("frame", self.key)
+        self._link = link
+        self._changed = threading.Condition()
+        self._slot: _Arrival | None = None
+        self._closed = False
+        self._dropped = self._dropped_before = self._handed_over = 0
+        self._newest: tuple[float, int] | None = None  # of the good ones: monotonic time of arrival, stamp
+        self._last_arrival_s: float | None = None
+        self._clock_fault = ""
+        self._lateness = Lateness()
+        self._subscriber: zenoh.Subscriber[None] | None = None
+        link.attach(self._attach)
+
+    @property
+    def connected(self) -> bool:
+        last_s = self._last_arrival_s
+        return not self._closed and last_s is not None and time.monotonic() - last_s < self._settings.silent_after_s
+
+    @property
+    def dropped(self) -> int:
+        return self._dropped
+
+    @property
+    def malformed(self) -> int:
+        """Payloads so far that were no frame of this camera."""
+        return self._malformed.count
+
+    def fault(self) -> str:
+        """What is wrong with payloads or stamps, in a few words for a person; empty if nothing is."""
+        return "; ".join(fault for fault in (self._malformed.fault(), self._clock_fault) if fault)
+
+    def read(self) -> Frame | Waiting | None:
+        deadline_s = time.monotonic() + READ_TIMEOUT_S
+        fault, refusal = "", Refusal.NOT_AN_IMAGE
+        while (arrival := self._take(deadline_s)) is not None:
+            try:
+                content = self._content(arrival.sample)
+            except Exception as error:  # noqa: BLE001  whatever a stranger sends, it must not end the monitor
+                if not isinstance(error, PayloadError):
+                    _log.debug("a payload on %s", self.key, exc_info=error)
+                fault = str(error) or type(error).__name__
+                refusal = Refusal.WRONG_SIZE if isinstance(error, WrongSizeError) else Refusal.NOT_AN_IMAGE
+                self._malformed.add(fault)
+                continue
+            self._malformed.good()
+            return self._frame(arrival, content)
+        if self._closed:
+            return None
+        if fault:
+            return Frame(self._next_seq(), self._stamp_now_ns(), None, None, self.key, fault, refusal)
+        return Waiting(self._why_silent())
+
+    def close(self) -> None:
+        with self._changed:
+            self._closed = True
+            self._slot = None
+            self._changed.notify_all()
+        subscriber, self._subscriber = self._subscriber, None
+        if subscriber is not None:
+            try:
+                subscriber.undeclare()
+            except zenoh.ZError:
+                return  # the session was closed before
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        self._subscriber = session.declare_subscriber(self.key, zenoh.handlers.Callback(self._receive, indirect=False))
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        arrival = _Arrival(sample, time.time_ns(), time.monotonic())
+        with self._changed:
+            if self._closed:
+                return
+            if self._slot is not None:
+                self._dropped += 1
+            self._slot = arrival
+            self._last_arrival_s = arrival.monotonic_s
+            self._changed.notify_all()
+
+    def _take(self, deadline_s: float) -> _Arrival | None:
+        """What has arrived, or arrives until the deadline."""
+        with self._changed:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:  # payloads without end may all be malformed
+                return None
+            self._changed.wait_for(lambda: self._slot is not None or self._closed, left_s)
+            arrival, self._slot = self._slot, None
+            self._dropped_before = self._dropped
+            return arrival
+
+    def _content(self, sample: zenoh.Sample) -> Content:
+        size = len(sample.payload)
+        if size > self._decoder.largest_bytes:
+            raise PayloadError(f"{size} bytes; at most {self._decoder.largest_bytes} for an image of this camera")
+        attachment = sample.attachment
+        if attachment is not None and len(attachment) > LARGEST_ATTACHMENT_BYTES:
+            raise PayloadError(f"an attachment of {len(attachment)} bytes; at most {LARGEST_ATTACHMENT_BYTES}")
+        return self._decoder.decode(
+            sample.payload.to_bytes(), str(sample.encoding), None if attachment is None else attachment.to_bytes()
+        )
+
+    def _frame(self, arrival: _Arrival, content: Content) -> Frame:
+        stamp_ns = content.stamp_ns
+        if stamp_ns is None:
+            stamped = arrival.sample.timestamp
+            stamp_ns = arrival.unix_ns if stamped is None else stamped.get_time_as_ntp64().as_nanos()
+        self._newest = arrival.monotonic_s, stamp_ns
+        self._clock_fault = clock_fault(self.key, stamp_ns, arrival.unix_ns)
+        arrived_ns = round(1e9 * arrival.monotonic_s)
+        waited_ns = self._lateness.waited_ns(stamp_ns, arrived_ns, arrival.unix_ns)
+        return Frame(
+            self._next_seq(), stamp_ns, content.image, content.jaw_opening_m, self.key,
+            arrived_ns=arrived_ns - waited_ns,
+        )  # fmt: skip
+
+    def _next_seq(self) -> int:
+        seq = self._handed_over + self._dropped_before
+        self._handed_over += 1
+        return seq
+
+    def _stamp_now_ns(self) -> int:
+        """Now, on the camera's clock: a bad payload tells no time, and another clock's would look like a jump."""
+        if self._newest is None:
+            return time.time_ns()
+        arrival_s, stamp_ns = self._newest
+        return stamp_ns + round(1e9 * (time.monotonic() - arrival_s))
+
+    def _why_silent(self) -> str:
+        network = self._link.fault()
+        said = f"{self.key} is silent" if self._last_arrival_s is not None else f"nothing on {self.key} yet"
+        return f"{said} ({network})" if network else said
+
+
+def clock_fault(key: str, stamp_ns: int, unix_ns: int) -> str:
+    """By how much a driver's stamp is off, in words that hardly ever change; empty if it may be right.
+
+    Controllers reckon a transform's age from it.
+    """
+    late_s = 1e-9 * (unix_ns - stamp_ns)
+    for limit_s, words in (
+        (86_400.0, "a day"),
+        (3_600.0, "an hour"),
+        (60.0, "a minute"),
+        (MOST_LATE_S, "some seconds"),
+    ):
+        if abs(late_s) >= limit_s:
+            return (
+                f"stamps on {key} are {words} or more {'behind' if late_s > 0.0 else 'ahead of'} this machine's clock"
+            )
+    return ""
+
+
+def network_key(settings: NetworkSettings, image_key: str) -> str:
+    """The key expression to listen on.  Raises :class:`SourceError`, the key as in the settings."""
+    ros = settings.format in ROS_FORMATS
+    if settings.topic is None:
+        return image_key if settings.key is None else settings.key
+    if settings.key is not None:
+        raise SourceError("topic: has no effect beside key; one of them")
+    if not ros:
+        raise SourceError(f"format: {settings.format} doesn't come on a ROS 2 topic; {' or '.join(ROS_FORMATS)}")
+    from gripmon import ros2
+
+    message = ros2.IMAGE if settings.format == "ros2_image" else ros2.COMPRESSED_IMAGE
+    try:
+        return ros2.subscription_key(settings.domain_id, settings.topic, message)
+    except ros2.RosNameError as error:
+        raise SourceError(f"topic: {error}") from None

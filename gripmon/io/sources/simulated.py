@@ -1,0 +1,126 @@
+"""A simulated wrist camera: in real time from a process of its own, or as a sequence as fast as it is asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from gripmon.model.records import Array, Frame
+from gripmon.io.sources.base import Source, SourceError
+
+if TYPE_CHECKING:
+    from gripmon.model.camera import Camera
+    from gripmon.model.gripper import Gripper
+    from gripmon.simulate import Scenario, Simulator
+
+
+class SimulatedSettings(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="simulator"
+):
+    """A simulated camera with the configuration's lens, gripper and calibration."""
+
+    scenario: Annotated[
+        str, msgspec.Meta(min_length=1, description="name of a scenario, or a file *.yaml with one")
+    ] = "demo"
+    duration_s: Annotated[
+        Annotated[float, msgspec.Meta(gt=0, le=1e7)] | None,
+        msgspec.Meta(description="length to which a named scenario is stretched; absent: its own (s)"),
+    ] = None
+    fps: Annotated[
+        Annotated[float, msgspec.Meta(gt=0, le=1000)] | None,
+        msgspec.Meta(description="frame rate of a named scenario; absent: its own (1/s)"),
+    ] = None
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**32, description="of everything random (no unit)")] = 0
+    realtime: Annotated[
+        bool, msgspec.Meta(description="true: a live camera; false: every frame, as fast as they are asked for")
+    ] = True
+    ends: Annotated[
+        bool, msgspec.Meta(description="with realtime: end after the scenario; false: its last state goes on for ever")
+    ] = False
+    processes: Annotated[
+        int, msgspec.Meta(ge=1, le=4, description="with realtime: processes that take turns in rendering (number)")
+    ] = 2
+
+
+@dataclass(frozen=True)
+class SimulatedScene:
+    """What the simulator needs beside its settings: ``cam_T_grip`` (4, 4) is the calibration before any disturbance."""
+
+    camera: Camera
+    gripper: Gripper
+    cam_T_grip: Array
+
+
+def make_simulator(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Simulator:
+    """The simulator of these settings, which also knows the truth; SourceError if they don't fit the scene."""
+    from gripmon.simulate import Simulator
+
+    scenario = _load_scenario(settings, relative_to)
+    try:
+        return Simulator(scene.camera, scene.gripper, scene.cam_T_grip, scenario, settings.seed)
+    except ValueError as error:
+        raise SourceError(f"scenario: {error}") from error
+
+
+def _load_scenario(settings: SimulatedSettings, relative_to: Path) -> Scenario:
+    from gripmon.simulate import Scenario, make_scenario
+
+    if not settings.scenario.endswith((".yaml", ".yml")):
+        try:
+            return make_scenario(settings.scenario, duration_s=settings.duration_s, fps=settings.fps)
+        except ValueError as error:
+            raise SourceError(str(error)) from error
+    path = relative_to / settings.scenario
+    if settings.duration_s is not None or settings.fps is not None:
+        raise SourceError(f"scenario: {path} has its own duration_s and fps; neither beside it")
+    try:
+        return msgspec.yaml.decode(path.read_bytes(), type=Scenario)
+    except (OSError, msgspec.DecodeError) as error:
+        reason = " ".join(str(error).split())
+        raise SourceError(f"scenario: {path} can't be used ({reason}); a file with the keys of a scenario") from error
+
+
+class SimulatedSequence:
+    """Every frame of a scenario in order, rendered when it is asked for; stamps are the scenario's."""
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, simulator: Simulator) -> None:
+        self._simulator = simulator
+        self._count = simulator.frame_count
+        self._seq = 0
+
+    def __len__(self) -> int:
+        return self._count
+
+    def read(self) -> Frame | None:
+        if self._seq >= self._count:
+            return None
+        frame = self._simulator.frame(self._seq)
+        self._seq += 1
+        return frame
+
+    def close(self) -> None:
+        self._count = 0
+
+
+def open_simulated(settings: SimulatedSettings, scene: SimulatedScene, relative_to: Path) -> Source:
+    """The simulated camera, live or as a sequence, as the settings say."""
+    simulator = make_simulator(settings, scene, relative_to)
+    if not settings.realtime:
+        return SimulatedSequence(simulator)
+    from gripmon.io.sources.realtime import SimulatedCamera
+
+    return SimulatedCamera(
+        simulator,
+        size_px=(scene.camera.width_px, scene.camera.height_px),
+        fps=simulator.scenario.fps,
+        name=simulator.scenario.name,
+        frame_count=simulator.frame_count if settings.ends else None,
+        processes=settings.processes,
+    )
