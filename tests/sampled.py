@@ -14,7 +14,7 @@ from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Votes
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.uncertainty import Uncertainty
 from gripmon.model.gripper import Gripper
-from gripmon.outlook import EDGE_POINT_SIGMA_PX, ForeseeingMeter
+from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
 from gripmon.model.records import Image
 
 # Floors out of the way: edge points have the assumed standard deviation and nothing beside.

@@ -17,7 +17,7 @@ from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, JawScript
-from gripmon.teaching import Taught, TeachingImage, teach
+from gripmon.teach.edges import Taught, TeachingImage, teach
 
 CAMERA = make_camera(PAPER_LENS)
 OPENING_M = 0.034

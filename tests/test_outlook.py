@@ -20,7 +20,7 @@ from gripmon.config import builtin_config
 from gripmon.track.edges import MeasurementSettings
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
-from gripmon.outlook import Outlook, expect, weakest_direction
+from gripmon.teach.forecast import Outlook, expect, weakest_direction
 
 
 def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> Outlook:

@@ -13,7 +13,7 @@ import pytest
 
 from gripmon.cli import main
 from gripmon.config import builtin_config, load_config
-from gripmon.outlook import Promise, Rig, foresee_frame, promise
+from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
 

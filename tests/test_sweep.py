@@ -17,7 +17,7 @@ from gripmon.model.camera import make_camera
 from gripmon.track.edges.prediction import lay_out
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
-from gripmon.outlook import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
+from gripmon.teach.forecast import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook
 

@@ -13,9 +13,9 @@ from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
-from gripmon.teaching.lines import EdgePoints, find_line, settle_line
-from gripmon.teaching.pooling import pool
-from gripmon.teaching.shape import slopes
+from gripmon.teach.edges.lines import EdgePoints, find_line, settle_line
+from gripmon.teach.edges.pooling import pool
+from gripmon.teach.edges.shape import slopes
 
 POSE = nominal_cam_T_grip()
 GRIPPER = box_gripper()

@@ -28,8 +28,8 @@ from gripmon.track.edges import TaughtModel
 from gripmon.track.edges.taught import TaughtEdge, gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
-from gripmon.teaching.document import to_yaml
-from gripmon.teaching.picture import Labels
+from gripmon.teach.edges.document import to_yaml
+from gripmon.teach.edges.picture import Labels
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4

@@ -25,14 +25,14 @@ from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.outlook import expect
+from gripmon.teach.forecast import expect
 from gripmon.model.provenance import Provenance
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor
-from gripmon.teaching import TeachingImage
-from gripmon.teaching.bench import Bench
-from gripmon.teaching.corner_pose import CameraError, PoseRefused, pose_from_corners
-from gripmon.teaching.placing import place, usual_view
+from gripmon.teach.edges import TeachingImage
+from gripmon.teach.edges.bench import Bench
+from gripmon.teach.edges.corner_pose import CameraError, PoseRefused, pose_from_corners
+from gripmon.teach.edges.placing import place, usual_view
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 OPENING_M = 0.034

@@ -25,7 +25,7 @@ from taught_scenes import (
 from gripmon.track.edges.taught import sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
-from gripmon.teaching import TeachingRefused
+from gripmon.teach.edges import TeachingRefused
 
 POSE = nominal_cam_T_grip()
 PX_PER_M = 8000.0  # at the gripper, to a tenth

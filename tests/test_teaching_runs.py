@@ -21,7 +21,7 @@ from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
-from gripmon.teaching import TeachingImage, teach
+from gripmon.teach.edges import TeachingImage, teach
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4

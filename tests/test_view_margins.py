@@ -20,7 +20,7 @@ from gripmon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.outlook import FEWEST_CORNERS, Rig, behind_another_finger, border, freedom, moved_camera, over_jaw, see
+from gripmon.teach.forecast import FEWEST_CORNERS, Rig, behind_another_finger, border, freedom, moved_camera, over_jaw, see
 
 NEAR = nominal_cam_T_grip(tcp_m=(0.008, -0.003, 0.046))  # so near that open jaws leave the image
 

@@ -11,7 +11,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.cli.plane_inputs import Inputs, Rough
-    from gripmon.onboarding import KnownGripper, Look, UnknownGripper
+    from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
     from gripmon.model.records import Image
 
 _DESCRIPTION = """\
@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     plane_outputs.write(inputs, result, model, arguments)
     plane_outputs.report(inputs, looks, result, arguments)
     if arguments.picture is not None:
-        from gripmon.onboarding.picture import draw
+        from gripmon.teach.onboarding.picture import draw
 
         picture = draw(shown, inputs.camera.lens, looks[0].coincidence)
         files.write_picture(picture, Path(arguments.picture))
@@ -136,7 +136,7 @@ def _looks(inputs: Inputs) -> tuple[list[Look], Image]:
 def _look(method: KnownGripper | UnknownGripper, target: Any, path: Path, image: Image, rough: Rough | None) -> Look:
     from gripmon.calibrate.detection import detect
     from gripmon.calibrate.sighting import CalibrationError, NotFound
-    from gripmon.onboarding import KnownGripper
+    from gripmon.teach.onboarding import KnownGripper
 
     try:
         sight = detect(image, target, str(path))

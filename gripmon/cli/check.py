@@ -155,7 +155,7 @@ def _reference_values(config: Config) -> dict[str, Any]:
     import numpy as np
 
     from gripmon.model.geometry import invert, rotation_angle
-    from gripmon.outlook import Mount
+    from gripmon.teach.forecast import Mount
 
     reference, cam_T_grip = config.reference, config.cam_T_grip
     return {
@@ -176,7 +176,7 @@ def _sound_as_wxyz(config: Config) -> bool:
     view of them.
     """
     from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
-    from gripmon.outlook import see
+    from gripmon.teach.forecast import see
 
     w, x, y, z = config.reference.cam_T_grip.rotation_xyzw
     cam_T_grip = make_transform(rotation_from_xyzw((x, y, z, w)), config.cam_T_grip[:3, 3])

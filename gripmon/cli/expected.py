@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.outlook import JawOutlook, Outlook
+    from gripmon.teach.forecast import JawOutlook, Outlook
     from gripmon.model.records import Array
 
 _DIRECTIONS = (
@@ -20,7 +20,7 @@ _JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given
 
 def accuracy(config: Config) -> dict[str, Any]:
     """What one frame can show, as plain values for JSON: metres, radians, px.  With too few edges only that."""
-    from gripmon.outlook import EDGE_POINT_SIGMA_PX, FEWEST_EDGES, expect
+    from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, FEWEST_EDGES, expect
 
     settings = config.settings.monitor
     outlook = expect(

@@ -9,21 +9,21 @@ from gripmon.cli.findings import past_limit
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.outlook import Rig
+    from gripmon.teach.forecast import Rig
 
 _AXES = ("x", "y", "z")
 
 
 def rig_of(config: Config) -> Rig:
     """What the configuration looks with and at."""
-    from gripmon.outlook import Rig
+    from gripmon.teach.forecast import Rig
 
     return Rig(config.camera, config.gripper, config.settings.monitor, config.taught_edges)
 
 
 def in_view(config: Config) -> dict[str, Any]:
     """What is seen, how far from the border, and how far camera and jaws may move, as plain values for JSON."""
-    from gripmon.outlook import FEWEST_CORNERS, FEWEST_EDGES, border, see
+    from gripmon.teach.forecast import FEWEST_CORNERS, FEWEST_EDGES, border, see
 
     rig, cam_T_grip = rig_of(config), config.cam_T_grip
     sight = see(rig, cam_T_grip, config.jaw_opening_m)
@@ -49,8 +49,8 @@ def in_view(config: Config) -> dict[str, Any]:
 
 def _camera_values(config: Config, rig: Rig) -> dict[str, Any]:
     """Amounts to the negative and to the positive side of each axis; None: farther than was sought."""
-    from gripmon.outlook import freedom
-    from gripmon.outlook.margins import SOUGHT_M, SOUGHT_RAD
+    from gripmon.teach.forecast import freedom
+    from gripmon.teach.forecast.margins import SOUGHT_M, SOUGHT_RAD
 
     free = freedom(rig, config.cam_T_grip, config.jaw_opening_m)
     amounts = [[None if math.isnan(v) else v for v in pair] for pair in free.limits.tolist()]
@@ -65,7 +65,7 @@ def _camera_values(config: Config, rig: Rig) -> dict[str, Any]:
 
 
 def _jaw_values(config: Config, rig: Rig) -> dict[str, Any] | None:
-    from gripmon.outlook import certainty, over_jaw
+    from gripmon.teach.forecast import certainty, over_jaw
 
     travel = over_jaw(rig, config.cam_T_grip)
     if travel is None:

@@ -20,7 +20,7 @@ from gripmon.config.calibrated import read_camera
 from gripmon.config.typed import SettingsError, to_settings
 from gripmon.config.yaml_file import read_yaml
 from gripmon.model.gripper import Gripper
-from gripmon.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
+from gripmon.teach.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
 from gripmon.model.records import Image
 
 Rough = Mapping[str, tuple[float, float]]

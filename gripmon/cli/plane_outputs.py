@@ -21,7 +21,7 @@ from gripmon.cli.plane_inputs import Inputs
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperError, GripperModel
-from gripmon.onboarding import KnownGripper, Look, UnknownGripper
+from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
 from gripmon.model.provenance import Provenance, provenance_of
 
 

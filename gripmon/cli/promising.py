@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gripmon.config import Config
-    from gripmon.outlook import Promise
+    from gripmon.teach.forecast import Promise
 
 
 def promise_of(config: Config) -> Promise | None:
     """What a frame at the configured pose and opening may promise; None where too little is in view to measure it."""
     from gripmon.cli.margins import rig_of
-    from gripmon.outlook import foresee_frame, promise, see
+    from gripmon.teach.forecast import foresee_frame, promise, see
 
     rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
     if not see(rig, cam_T_grip, opening_m).enough:

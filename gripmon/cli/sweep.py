@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from gripmon.model.camera import Camera
     from gripmon.config import Config
-    from gripmon.outlook import Grid
+    from gripmon.teach.forecast import Grid
 
 _MOST_VALUES, _MOST_MOUNTS = 100, 20000
 _NEAREST_M, _FARTHEST_M = 0.005, 5.0
@@ -86,8 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
     picture = None if arguments.picture is None else Path(arguments.picture)
     if picture is not None:
         _check_picture(picture)
-    from gripmon.outlook import Mount, tried, try_mount
-    from gripmon.outlook.picture import draw_sweep
+    from gripmon.teach.forecast import Mount, tried, try_mount
+    from gripmon.teach.forecast.picture import draw_sweep
 
     opening_m = config.jaw_opening_m
     present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m, travel_m)
@@ -118,7 +118,7 @@ def _check_picture(path: Path) -> None:
 def _write(path: Path, picture: Image) -> None:
     """Whole or not at all."""
     from gripmon.model.atomic import write_atomically
-    from gripmon.outlook.picture import encoded
+    from gripmon.teach.forecast.picture import encoded
 
     try:
         write_atomically(path, encoded(picture, path.suffix))
@@ -127,7 +127,7 @@ def _write(path: Path, picture: Image) -> None:
 
 
 def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
-    from gripmon.outlook import Grid, Mount, towards
+    from gripmon.teach.forecast import Grid, Mount, towards
 
     present, rig = Mount.of(config.cam_T_grip), rig_of(config)
     low, high, count = _DISTANCES
@@ -185,7 +185,7 @@ def _turns(option: str, text: str | None, present_rad: float) -> tuple[float, ..
 
 
 def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
-    from gripmon.outlook import with_focal
+    from gripmon.teach.forecast import with_focal
 
     if arguments.lens is not None:
         return [_calibrated(Path(name)) for name in arguments.lens]

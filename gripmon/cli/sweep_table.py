@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gripmon.model.camera import Camera
     from gripmon.config import Config
-    from gripmon.outlook import Grid, Trial
+    from gripmon.teach.forecast import Grid, Trial
 
 _SHOWN = 8
 _REASONS_SHOWN = 4
@@ -32,7 +32,7 @@ def as_json(
 
 def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
     from gripmon.model.geometry import to_record
-    from gripmon.outlook import field_of_view_rad, weakest_direction
+    from gripmon.teach.forecast import field_of_view_rad, weakest_direction
 
     transform, covariance = to_record(trial.cam_T_grip), trial.covariance
     sigma = weakest = None

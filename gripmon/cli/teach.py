@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gripmon.track.edges import TaughtModel
     from gripmon.track.edges.taught import TaughtEdge
     from gripmon.model.records import Image
-    from gripmon.teaching import Taught
+    from gripmon.teach.edges import Taught
 
 _DESCRIPTION = """\
 Measure where each edge of the gripper really shows, in images taken at the reference calibration,
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
     _check_usage(arguments)
     import cv2
 
-    from gripmon.teaching import TeachingImage, TeachingRefused, teach
+    from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
 
     config = common.load(arguments.config, check_source=False, with_taught=False)
     cv2.setNumThreads(1)
@@ -292,7 +292,7 @@ def _command(arguments: argparse.Namespace) -> str:
 
 def _write(model: TaughtModel, out: Path) -> None:
     from gripmon.model.atomic import write_atomically
-    from gripmon.teaching.document import to_yaml
+    from gripmon.teach.edges.document import to_yaml
 
     try:
         write_atomically(out, to_yaml(model).encode())
@@ -305,7 +305,7 @@ def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
 
     from gripmon.model.atomic import write_atomically
     from gripmon.track.edges import TaughtEdges
-    from gripmon.teaching.picture import draw
+    from gripmon.teach.edges.picture import draw
 
     picture = draw(
         config.camera, config.gripper, config.cam_T_grip, image, TaughtEdges.of_model(model, config.gripper), model

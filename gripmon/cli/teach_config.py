@@ -12,7 +12,7 @@ from gripmon.cli.commented import lines_of, yaml_value
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
     from gripmon.model.records import ReferenceRecord
-    from gripmon.teaching.corner_pose import CornerPose
+    from gripmon.teach.edges.corner_pose import CornerPose
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""

@@ -15,8 +15,8 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
-    from gripmon.teaching.bench import Found
-    from gripmon.teachpage import Desk, RoughDesk
+    from gripmon.teach.edges.bench import Found
+    from gripmon.teach.page import Desk, RoughDesk
 
 _LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -78,7 +78,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     from gripmon.cli.teach_inputs import live_settings
     from gripmon.cli.teach_saving import FileSaving
     from gripmon.io.sources import SourceError, open_source
-    from gripmon.teachpage import Desk
+    from gripmon.teach.page import Desk
 
     live = None
     if arguments.live is not None:
@@ -92,7 +92,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
 
 def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
     """Until the person is done."""
-    from gripmon.teachpage import PageServer
+    from gripmon.teach.page import PageServer
 
     try:
         server = PageServer(desk, arguments.port)
@@ -128,9 +128,9 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
 
     from gripmon.cli.teach_inputs import read_rough
     from gripmon.cli.teach_saving import FileSaving
-    from gripmon.teaching.snapping import FEWEST_PUT
-    from gripmon.teachpage import SavingRefused
-    from gripmon.teachpage.messages import Put, SaveOrder
+    from gripmon.teach.edges.snapping import FEWEST_PUT
+    from gripmon.teach.page import SavingRefused
+    from gripmon.teach.page.messages import Put, SaveOrder
 
     rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
     if inputs.bench.reference is None and len(rough) < FEWEST_PUT:

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from gripmon.model.gripper import Gripper
     from gripmon.model.records import Image, ReferenceRecord
     from gripmon.io.sources import FolderSettings, LiveSettings
-    from gripmon.teaching.bench import Bench
-    from gripmon.teaching.corner_pose import CameraError
-    from gripmon.teachpage import Picture
+    from gripmon.teach.edges.bench import Bench
+    from gripmon.teach.edges.corner_pose import CameraError
+    from gripmon.teach.page import Picture
 
 ROBOT, CAMERA_NAME = "robot1", "wrist"
 
@@ -48,7 +48,7 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
     import cv2
 
     from gripmon.monitor import MonitorSettings
-    from gripmon.teaching.bench import Bench
+    from gripmon.teach.edges.bench import Bench
 
     cv2.setNumThreads(1)
     config = None
@@ -84,8 +84,8 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file; a fault ends the command with exit code 2."""
     from gripmon.config.typed import to_settings
-    from gripmon.onboarding.rough import RoughCorners
-    from gripmon.teaching.bench import rough_fault
+    from gripmon.teach.onboarding.rough import RoughCorners
+    from gripmon.teach.edges.bench import rough_fault
 
     with _faults_of(path):
         rough = to_settings(_yaml(path), RoughCorners)
@@ -153,7 +153,7 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     from gripmon.model.camera import LensSettings
     from gripmon.config.calibrated import read_camera
     from gripmon.config.typed import to_settings
-    from gripmon.teaching.corner_pose import CameraError
+    from gripmon.teach.edges.corner_pose import CameraError
 
     with _faults_of(path):
         values = _yaml(path)
@@ -248,7 +248,7 @@ def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: 
 
 def _picture(path: Path, bench: Bench, config: Config | None, given_m: float | None) -> Picture:
     """An image that fits the camera; else the command ends with exit code 2."""
-    from gripmon.teachpage import Picture
+    from gripmon.teach.page import Picture
 
     image = read_fitting_image(path, bench.camera, bench.gripper, bench.settings.bit_depth)
     return Picture(path.name, image, read_opening(path, bench.gripper, config, given_m), str(path))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.teachpage import RoughDesk
+    from gripmon.teach.page import RoughDesk
 
 ROUGH = "rough.yaml"
 _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
@@ -25,7 +25,7 @@ def rough_desk(arguments: argparse.Namespace) -> RoughDesk:
     """The image, checked; a fault ends the command with exit code 2."""
     from gripmon.cli.teach_inputs import read_lens
     from gripmon.io.sources.folder import read_image
-    from gripmon.teachpage import Picture, RoughDesk
+    from gripmon.teach.page import Picture, RoughDesk
 
     if len(arguments.images) > 1:
         raise common.CommandFailedError(

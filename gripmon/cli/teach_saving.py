@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
     from gripmon.track.edges import TaughtModel
     from gripmon.model.records import ReferenceRecord
-    from gripmon.teaching import Taught
-    from gripmon.teaching.bench import Found
-    from gripmon.teachpage import Picture, Saved, SaveOrder
-    from gripmon.teachpage.desk import Labels
+    from gripmon.teach.edges import Taught
+    from gripmon.teach.edges.bench import Found
+    from gripmon.teach.page import Picture, Saved, SaveOrder
+    from gripmon.teach.page.desk import Labels
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
 
@@ -42,7 +42,7 @@ class FileSaving:
 
     def labels(self) -> Labels:
         """What the page shows."""
-        from gripmon.teachpage.desk import Labels
+        from gripmon.teach.page.desk import Labels
 
         inputs, known = self._inputs, self._inputs.bench.reference
         return Labels(
@@ -56,8 +56,8 @@ class FileSaving:
         )
 
     def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
-        """As :class:`gripmon.teachpage.Saving`."""
-        from gripmon.teachpage import Saved, SavingRefused
+        """As :class:`gripmon.teach.page.Saving`."""
+        from gripmon.teach.page import Saved, SavingRefused
 
         paths = self._paths
         notes: list[str] = []
@@ -80,7 +80,7 @@ class FileSaving:
         model = None
         if order.taught and reference is not None:
             model, notes = self._taught(order, found, reference, pictures, files)
-            from gripmon.teaching.document import to_yaml
+            from gripmon.teach.edges.document import to_yaml
 
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
@@ -113,7 +113,7 @@ class FileSaving:
     def _check_sharp(pictures: Sequence[Picture]) -> None:
         from gripmon.calibrate.detection import BLURRED_PX
         from gripmon.calibrate.pictures import sharpest_blur_px, to_grey
-        from gripmon.teachpage import SavingRefused
+        from gripmon.teach.page import SavingRefused
 
         for picture in pictures:
             blur_px = sharpest_blur_px(to_grey(picture.image))
@@ -131,8 +131,8 @@ class FileSaving:
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
     ) -> tuple[TaughtModel, list[str]]:
-        from gripmon.teaching import TeachingImage, TeachingRefused
-        from gripmon.teachpage import SavingRefused
+        from gripmon.teach.edges import TeachingImage, TeachingRefused
+        from gripmon.teach.page import SavingRefused
 
         bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
         openings = [
@@ -244,7 +244,7 @@ class FileSaving:
 
         from gripmon.config import ConfigError, load_config
         from gripmon.config.yaml_file import as_yaml, read_yaml
-        from gripmon.teachpage import SavingRefused
+        from gripmon.teach.page import SavingRefused
 
         base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
         with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
@@ -269,7 +269,7 @@ class FileSaving:
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Each whole or not at all; the configuration last, since it names the others."""
         from gripmon.model.atomic import write_atomically
-        from gripmon.teachpage import SavingRefused
+        from gripmon.teach.page import SavingRefused
 
         words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}
         written: dict[str, str] = {}

@@ -101,7 +101,7 @@ def _on_plate(
     from gripmon.calibrate.plane_average import average
     from gripmon.calibrate.sighting import CalibrationError, NotFound
     from gripmon.model.geometry import from_record
-    from gripmon.onboarding import KnownGripper
+    from gripmon.teach.onboarding import KnownGripper
 
     target = files.target_of(target_text)
     assert first.cam_T_grip is not None

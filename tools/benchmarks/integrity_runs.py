@@ -25,7 +25,7 @@ from gripmon.judge.drift import DriftSettings
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.outlook import Rig, foresee_frame
+from gripmon.teach.forecast import Rig, foresee_frame
 from gripmon.model.records import (
     Alert,
     AlertEvent,

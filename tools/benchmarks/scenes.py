@@ -28,7 +28,7 @@ from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord
 from gripmon.simulate import FrameTruth, Hidden, Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
-from gripmon.teaching import TeachingImage, TeachingRefused, teach
+from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
 
 CAMERA = PaperLens(
     width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7

@@ -1,0 +1,317 @@
+"""What the page's requests do: images, snapping, saving.  Nothing here knows HTTP.
+
+Corners put by hand stay with the page, so that two pages that are open don't disturb each other; images that were
+taken from a live camera belong to all of them.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import cv2
+import numpy as np
+
+from gripmon import __version__
+from gripmon.model.geometry import from_record, rotation_angle
+from gripmon.judge.inspection import inspect
+from gripmon.model.pixels import in_full_scale
+from gripmon.model.records import Array, Frame, Image
+from gripmon.io.sources import Source, Waiting
+from gripmon.teach.edges.bench import Bench, Found, rough_fault
+from gripmon.teach.edges.snapping import FEWEST_PUT, SnappedCorner
+from gripmon.teach.page.messages import (
+    CornerReply,
+    Expectation,
+    PictureInfo,
+    Place,
+    Put,
+    ReferenceReply,
+    Reply,
+    Saved,
+    SaveOrder,
+    State,
+)
+
+MOST_PICTURES = 50
+_LIVE_WAIT_S = 10.0
+
+
+class BadRequest(ValueError):
+    """The page asks for what can't be; one line says why."""
+
+
+class SavingRefused(Exception):
+    """Nothing was written; one line says why."""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image to teach from; ``jaw_opening_m`` None where nobody reported it.  ``path`` None: taken here, no file."""
+
+    name: str
+    image: Image
+    jaw_opening_m: float | None
+    path: str | None
+
+
+class Saving(Protocol):
+    """Writes what was taught."""
+
+    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+        """Raises :class:`SavingRefused`; a file that is in the way is told, not replaced, unless that was agreed."""
+        ...
+
+
+@dataclass(frozen=True)
+class Labels:
+    """What the page shows beside the image."""
+
+    robot: str
+    camera_name: str
+    fixed_names: bool
+    folder: str
+    files: dict[str, str]
+    reference: str | None
+    live: str | None
+
+
+class Desk:
+    """One teaching session; every method may be called from any thread."""
+
+    def __init__(
+        self, bench: Bench, pictures: Sequence[Picture], labels: Labels, saving: Saving, live: Source | None = None
+    ):
+        self._bench, self._labels, self._saving, self._live = bench, labels, saving, live
+        self._pictures = list(pictures)
+        self._newest: Picture | None = None
+        self._why_dark: str | None = None
+        self._seen_s = time.monotonic()
+        self._lock = threading.Lock()  # one reckons at a time: OpenCV and NumPy would only hinder each other
+        self._arrived = threading.Condition()
+        self._ended = False
+        self._reader: threading.Thread | None = None
+        if live is not None:
+            self._reader = threading.Thread(target=self._read, name="gripmon-teach-camera", daemon=True)
+            self._reader.start()
+
+    def close(self) -> None:
+        """Let go of the camera."""
+        with self._arrived:
+            self._ended = True
+            self._arrived.notify_all()
+        if self._live is not None:
+            self._live.close()
+        if self._reader is not None:
+            self._reader.join(10.0)
+
+    def state(self) -> State:
+        bench, gripper, labels = self._bench, self._bench.gripper, self._labels
+        opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
+        finger = gripper.point_finger[gripper.corner_points].tolist()
+        return State(
+            version=__version__,
+            width_px=bench.camera.width_px,
+            height_px=bench.camera.height_px,
+            corners=gripper.corner_ids,
+            fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
+            places={name: _place(at) for name, at in bench.first_places(opening_m).items()},
+            pictures=self._infos(),
+            live=labels.live,
+            has_jaw=gripper.has_jaw,
+            jaw_m=(gripper.jaw_min_m, gripper.jaw_nominal_m, gripper.jaw_max_m),
+            gripper=gripper.name,
+            reference=labels.reference,
+            needed=0 if bench.reference is not None else FEWEST_PUT,
+            robot=labels.robot,
+            camera_name=labels.camera_name,
+            fixed_names=labels.fixed_names,
+            folder=labels.folder,
+            files=labels.files,
+        )
+
+    def look(self, put: Put) -> Reply:
+        """Snap.  Raises :class:`BadRequest`."""
+        picture = self._picture(put.image)
+        return reply(self._found(put, picture))
+
+    def take(self) -> tuple[PictureInfo, ...]:
+        """Keep the live image.  Raises :class:`BadRequest`."""
+        picture = self._picture(None)
+        with self._arrived:
+            if len(self._pictures) >= MOST_PICTURES:
+                raise BadRequest(f"{MOST_PICTURES} images are enough")
+            name = f"live-{len(self._pictures):03d}.png"
+            self._pictures.append(Picture(name, picture.image, picture.jaw_opening_m, None))
+        return self._infos()
+
+    def save(self, order: SaveOrder) -> Saved:
+        """Write what was taught, or say why not.  Raises :class:`BadRequest`."""
+        if not self._pictures:
+            self.take()
+        number = order.put.image if order.put.image is not None else len(self._pictures) - 1
+        picture = self._picture(number)
+        found = self._found(order.put, picture)
+        with self._lock:
+            try:
+                return self._saving.save(order, found, number, tuple(self._pictures))
+            except SavingRefused as refused:
+                return Saved(refused=str(refused))
+
+    def still(self, number: int) -> bytes:
+        """An image as PNG.  Raises :class:`BadRequest`."""
+        return encoded(self._picture(number).image, ".png")
+
+    def live(self) -> bytes:
+        """The live image as JPEG.  Raises :class:`BadRequest`."""
+        return encoded(self._picture(None).image, ".jpg")
+
+    def dark(self) -> tuple[float, str]:
+        """For how long the live camera has shown nothing that can be used (s), and why; 0 without one."""
+        with self._arrived:
+            if self._live is None or self._newest is not None:
+                return 0.0, ""
+            return time.monotonic() - self._seen_s, self._why_dark or "the camera has sent nothing yet"
+
+    def _found(self, put: Put, picture: Picture) -> Found:
+        gripper = self._bench.gripper
+        fault = rough_fault(put.corners, gripper)
+        if fault is not None:
+            raise BadRequest("{}: {}; {}".format(*fault))
+        opening_m = put.jaw_opening_m if gripper.has_jaw else None
+        if opening_m is not None and not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+            low_mm, high_mm = 1e3 * gripper.jaw_min_m, 1e3 * gripper.jaw_max_m
+            raise BadRequest(f"jaw opening {1e3 * opening_m:g} mm; the gripper's {low_mm:g} to {high_mm:g} mm")
+        corners = {name: np.array(at) for name, at in put.corners.items()}
+        with self._lock:
+            return self._bench.look(picture.image, corners, put.by_hand, opening_m)
+
+    def _picture(self, number: int | None) -> Picture:
+        if number is not None:
+            if number >= len(self._pictures):
+                raise BadRequest(f"there is no image {number}; {len(self._pictures)} are there")
+            return self._pictures[number]
+        if self._live is None:
+            raise BadRequest("there is no live camera here; the number of an image")
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._newest or self._why_dark or self._ended, _LIVE_WAIT_S)
+            if self._newest is None:
+                raise BadRequest(self._why_dark or "the camera has sent nothing yet")
+            return self._newest
+
+    def _infos(self) -> tuple[PictureInfo, ...]:
+        return tuple(
+            PictureInfo(number=number, name=picture.name, jaw_opening_m=picture.jaw_opening_m)
+            for number, picture in enumerate(self._pictures)
+        )
+
+    def _read(self) -> None:
+        assert self._live is not None
+        while not self._ended:
+            try:
+                frame = self._live.read()
+            except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
+                frame = Waiting(f"{self._labels.live}: {error}; gripmon teach anew")
+                self._ended = True
+            if frame is None:
+                break
+            with self._arrived:
+                # An old image would look like a camera that stands still.
+                self._newest = None
+                if isinstance(frame, Waiting):
+                    self._why_dark = frame.reason
+                else:
+                    self._newest = self._usable(frame)
+                if self._newest is not None:
+                    self._seen_s = time.monotonic()
+                self._arrived.notify_all()
+
+    def _usable(self, frame: Frame) -> Picture | None:
+        frame = in_full_scale(frame, self._bench.settings.bit_depth)
+        fault = inspect(frame, self._bench.camera, self._bench.gripper)
+        if fault is not None:
+            self._why_dark = f"{self._labels.live}: {fault[1]}"
+            return None
+        assert frame.image is not None
+        self._why_dark = None
+        return Picture("live", frame.image, frame.jaw_opening_m, None)
+
+
+def reply(found: Found) -> Reply:
+    """As JSON has it."""
+    snapped, expected = found.snapped, found.prospects
+    return Reply(
+        corners=tuple(_corner(corner) for corner in snapped.corners),
+        outlines_px={name: _places(line) for name, line in snapped.outlines_px.items()},
+        edge_points_px=_places(snapped.edge_points_px),
+        share=snapped.share,
+        refused=snapped.refused,
+        jaw_opening_m=snapped.jaw_opening_m,
+        jaw_sigma_m=snapped.jaw_sigma_m,
+        reference=_reference(found),
+        no_reference=found.no_reference,
+        expected=None
+        if expected is None
+        else Expectation(
+            edges=expected.edges,
+            sigma=tuple(expected.sigma.tolist()),
+            weakest=tuple(expected.weakest.tolist()),
+            smallest=tuple(expected.smallest.tolist()),
+            promise=expected.promise.text(),
+            reachable=expected.promise.reachable,
+            delay_frames=expected.delay_frames,
+            recalibration=expected.recalibration,
+        ),
+    )
+
+
+def _reference(found: Found) -> ReferenceReply | None:
+    if found.reference is None:
+        return None
+    transform = found.reference.cam_T_grip
+    return ReferenceReply(
+        id=found.reference.reference_id,
+        translation_m=transform.translation_m,
+        turn_rad=rotation_angle(from_record(transform)[:3, :3]),
+        sigma=tuple(np.sqrt(np.reshape(found.reference.covariance, (6, 6)).diagonal()).tolist()),
+        corners=None if found.pose is None else len(found.pose.corners),
+        weighted_rms=None if found.pose is None else found.pose.weighted_rms,
+        rival=found.pose is not None and found.pose.rival,
+    )
+
+
+def _corner(corner: SnappedCorner) -> CornerReply:
+    covariance = corner.covariance_px
+    return CornerReply(
+        name=corner.name,
+        model_px=_place(corner.model_px),
+        uv_px=None if corner.uv_px is None else _place(corner.uv_px),
+        covariance_px2=None
+        if covariance is None
+        else (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        sigma_px=corner.sigma_px,
+        inliers=corner.inliers,
+        reason=corner.reason,
+    )
+
+
+def _place(at: Array) -> Place | None:
+    u, v = np.asarray(at, dtype=float).tolist()
+    return (round(u, 4), round(v, 4)) if np.isfinite(at).all() else None
+
+
+def _places(points: Array) -> tuple[Place, ...]:
+    return tuple((u, v) for u, v in np.round(points, 3).tolist())
+
+
+def encoded(image: Image, ending: str) -> bytes:
+    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
+    grey = image
+    if image.dtype != np.uint8:
+        low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()
+        grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1e-6)), 0.0, 255.0).astype(np.uint8)
+    _, data = cv2.imencode(ending, grey, [cv2.IMWRITE_JPEG_QUALITY, 85] if ending == ".jpg" else [])
+    return bytes(data.tobytes())

@@ -1,0 +1,214 @@
+"""The page's web server: this machine only, and only for who knows the address with its token.
+
+A page of another site that is open in the same browser can send requests here, too, or have its name resolve to
+127.0.0.1 (DNS rebinding).  So every request must name this very host, carry the token in its path, and come from this
+page where the browser says where from; no header allows other sites anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.resources
+import logging
+import secrets
+import threading
+from collections.abc import Callable
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, TypeVar
+
+import msgspec
+
+from gripmon.teach.page.desk import BadRequest, Desk
+from gripmon.teach.page.messages import Failure, Nothing, Put, SaveOrder
+from gripmon.teach.page.rough_desk import RoughDesk
+
+_log = logging.getLogger(__name__)
+_T = TypeVar("_T")
+
+ADDRESS = "127.0.0.1"
+LONGEST_REQUEST = 1_000_000
+_SILENT_S = 30.0
+_TOKEN_BYTES = 24
+_FILES = {
+    "": ("index.html", "text/html; charset=utf-8"),
+    "style.css": ("style.css", "text/css; charset=utf-8"),
+    "icon.svg": ("icon.svg", "image/svg+xml"),
+    **{
+        name: (name, "text/javascript; charset=utf-8")
+        for name in ("main.js", "stage.js", "panel.js", "history.js", "server.js")
+    },
+}
+_HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "Cache-Control": "no-store",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+
+class PageServer:
+    """Serves one desk until it is done.  OSError from the constructor if the port is taken."""
+
+    def __init__(self, desk: Desk | RoughDesk, port: int = 0):
+        self.done = threading.Event()
+        token = secrets.token_urlsafe(_TOKEN_BYTES)
+        # Not with the address itself: a look-up of its name may take seconds.
+        self._http = _Http((ADDRESS, port), _Handler)
+        self.port = int(self._http.server_address[1])
+        self._http.shop = _Shop(desk, token, frozenset({f"{ADDRESS}:{self.port}", f"localhost:{self.port}"}), self.done)
+        self.url = f"http://{ADDRESS}:{self.port}/{token}/"
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-teach-page")
+        self._thread.start()
+
+    def close(self) -> None:
+        """No more requests are taken; may be called twice."""
+        self._http.shutdown()
+        self._http.server_close()
+        self._thread.join()
+
+
+class _Shop:
+    """What the handlers share."""
+
+    def __init__(self, desk: Desk | RoughDesk, token: str, hosts: frozenset[str], done: threading.Event):
+        self.desk, self.token, self.hosts, self.done = desk, token, hosts, done
+        folder = importlib.resources.files("gripmon.teach.page") / "page"
+        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
+        self.encoder = msgspec.json.Encoder()
+
+
+class _Http(ThreadingHTTPServer):
+    daemon_threads = True
+    request_queue_size = 32
+    shop: _Shop
+
+    def server_bind(self) -> None:
+        """Without the look-up of the host's name that the base class makes."""
+        import socketserver
+
+        socketserver.TCPServer.server_bind(self)
+        self.server_name, self.server_port = ADDRESS, int(self.server_address[1])
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A browser that goes away in the middle is nothing to report."""
+        _log.debug("request of %s failed", client_address, exc_info=True)
+
+
+class _Refused(Exception):
+    def __init__(self, status: HTTPStatus, text: str):
+        super().__init__(text)
+        self.status = status
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server_version, sys_version = "gripmon", ""
+    timeout = _SILENT_S
+    server: _Http
+    _last = False
+
+    def do_GET(self) -> None:
+        self._answer(self._get)
+
+    def do_POST(self) -> None:
+        self._answer(self._post)
+
+    def _answer(self, act: Callable[[str], tuple[bytes, str]]) -> None:
+        """Every way out of a request is an answer in one line."""
+        status, kind = HTTPStatus.OK, "application/json"
+        try:
+            data, kind = act(self._checked_path())
+        except _Refused as refused:
+            status, data = refused.status, self._failure(str(refused))
+        except BadRequest as refused:
+            status, data = HTTPStatus.BAD_REQUEST, self._failure(str(refused))
+        except (ConnectionError, TimeoutError):
+            self.close_connection = True
+            return
+        except Exception as error:  # noqa: BLE001  whatever it is, the page must hear of it, and go on
+            _log.debug("request failed", exc_info=True)
+            status, data = HTTPStatus.INTERNAL_SERVER_ERROR, self._failure(f"{type(error).__name__}: {error}")
+        if status is not HTTPStatus.OK:
+            self.close_connection = True  # what is left of its body is not read
+        with contextlib.suppress(ConnectionError, TimeoutError):
+            self._send(status, data, kind)
+        if self._last:
+            self.server.shop.done.set()
+
+    def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
+        self.send_response(status)
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(data)))
+        if self.close_connection:
+            self.send_header("Connection", "close")
+        self.end_headers()
+        self.wfile.write(data)
+
+    def _failure(self, text: str) -> bytes:
+        return self.server.shop.encoder.encode(Failure(error=" ".join(text.split())))
+
+    def _checked_path(self) -> str:
+        """What is asked for, below the token."""
+        shop = self.server.shop
+        hosts = self.headers.get_all("Host") or []
+        if len(hosts) != 1 or hosts[0] not in shop.hosts:
+            raise _Refused(HTTPStatus.FORBIDDEN, "this is not the host that was asked for")
+        origin = self.headers.get("Origin")
+        if origin is not None and origin not in {f"http://{host}" for host in shop.hosts}:
+            raise _Refused(HTTPStatus.FORBIDDEN, "asked by another site")
+        _, _, path = self.path.partition("/")
+        token, slash, rest = path.partition("/")
+        if not slash or not secrets.compare_digest(token.encode(), shop.token.encode()):
+            raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon teach printed")
+        return rest
+
+    def _get(self, path: str) -> tuple[bytes, str]:
+        shop = self.server.shop
+        if path in shop.files:
+            return shop.files[path]
+        if path == "state":
+            return shop.encoder.encode(shop.desk.state()), "application/json"
+        if path.partition("?")[0] == "live.jpg":
+            return shop.desk.live(), "image/jpeg"
+        number = path.removeprefix("image/").removesuffix(".png")
+        if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
+            return shop.desk.still(int(number)), "image/png"
+        raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+
+    def _post(self, path: str) -> tuple[bytes, str]:
+        shop, desk = self.server.shop, self.server.shop.desk
+        actions: dict[str, Callable[[], object]] = {
+            "look": lambda: desk.look(self._body(Put)),
+            "take": lambda: self._body(Nothing) and desk.take(),
+            "save": lambda: desk.save(self._body(SaveOrder)),
+            "done": lambda: self._end(self._body(Nothing)),
+        }
+        if path not in actions:
+            raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
+        return shop.encoder.encode(actions[path]()), "application/json"
+
+    def _end(self, _order: Nothing) -> None:
+        """The process ends once this has been answered."""
+        self._last = self.close_connection = True
+
+    def _body(self, kind: type[_T]) -> _T:
+        if self.headers.get_content_type() != "application/json":
+            raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "application/json is understood")
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdecimal()):
+            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "a request tells its length")
+        if len(length) > 9 or int(length) > LONGEST_REQUEST:
+            raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {LONGEST_REQUEST} bytes")
+        try:
+            return msgspec.json.decode(self.rfile.read(int(length)), type=kind)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise _Refused(HTTPStatus.BAD_REQUEST, f"not understood: {error}") from None
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """The token stands in every address: nothing of it goes to a log."""
