@@ -7,8 +7,8 @@ from scipy import stats
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from gripmon.hindsight import changes, chart
-from gripmon.hindsight.smoother import MID_S, SLOW_S, UNKNOWN, Dynamics, log_likelihood, smooth
+from gripmon.analyse.smoother import changes, chart
+from gripmon.analyse.smoother.smoother import MID_S, SLOW_S, UNKNOWN, Dynamics, log_likelihood, smooth
 
 RNG = np.random.default_rng(1)
 STEPS = 30

@@ -13,7 +13,7 @@ import pytest
 from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
-from gripmon.hindsight import correct
+from gripmon.analyse.smoother import correct
 from gripmon.record.read import Picture
 from gripmon.model.records import (
     AlertEvent,
@@ -26,9 +26,9 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.model.records.recorded import RecordedFile
-from gripmon.report import Report, build
-from gripmon.report.page import page
-from gripmon.report.pictures import Looked, together
+from gripmon.analyse.report import Report, build
+from gripmon.analyse.report.page import page
+from gripmon.analyse.report.pictures import Looked, together
 
 SECOND_NS = 1_000_000_000
 

@@ -19,7 +19,7 @@ import yaml
 
 from gripmon.cli import main
 from gripmon.config import builtin_config, load_config
-from gripmon.report import Report
+from gripmon.analyse.report import Report
 from gripmon.simulate import Simulator
 from gripmon.io.sources import make_simulator
 

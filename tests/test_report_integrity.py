@@ -12,8 +12,8 @@ from reported import Run, records, stepped
 
 from gripmon.model.records import Protection, RecordedConfiguration, Verdict
 from gripmon.model.records.recorded import RecordedFile
-from gripmon.report import build
-from gripmon.report.page import page
+from gripmon.analyse.report import build
+from gripmon.analyse.report.page import page
 
 
 def test_protection_levels_stand_with_their_limits_and_shares():

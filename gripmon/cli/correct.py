@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.hindsight import Correction
+    from gripmon.analyse.smoother import Correction
     from gripmon.record.read import Collection, Recording
 
 _DESCRIPTION = """\
@@ -137,7 +137,7 @@ def _check_targets(out: Path, targets: list[Path]) -> None:
 
 def _corrected(found: Collection, wanted_ns: Any) -> list[CorrectedRun]:
     """Each run by itself: between two anything may have happened."""
-    from gripmon.hindsight import STAGES
+    from gripmon.analyse.smoother import STAGES
 
     runs: list[CorrectedRun] = []
     with common.progress_bar(STAGES * len(found.recordings), "stage") as step:
@@ -161,7 +161,7 @@ def correct_table(frames: Any, step: Any) -> Correction:
     """Correct the frames of a table (:class:`gripmon.record.read.FrameTable`)."""
     import numpy as np
 
-    from gripmon.hindsight import correct
+    from gripmon.analyse.smoother import correct
     from gripmon.model.records import Origin
 
     count = len(frames)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
-from gripmon.hindsight import SOURCES, ChangePoint, changes, correction, sample, smoother
+from gripmon.analyse.smoother import SOURCES, ChangePoint, changes, correction, sample, smoother
 from gripmon.model.records import Transform
 
 if TYPE_CHECKING:

@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     collection = _read([Path(name) for name in arguments.recordings])
     from gripmon.model.atomic import write_atomically
     from gripmon.model.records import to_json
-    from gripmon.report import build
+    from gripmon.analyse.report import build
 
     millimetres, degrees = arguments.limit_mm, arguments.limit_deg
     report, told = build(
@@ -81,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif json_path is not None:
         _write(write_atomically, json_path, to_json(report) + b"\n", "--json")
     if page_path is not None:
-        from gripmon.report.page import page
+        from gripmon.analyse.report.page import page
 
         with common.progress_bar(len(told), "recording") as step:
             data = page(report, told, step)

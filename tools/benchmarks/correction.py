@@ -175,7 +175,7 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
     from benchmarks.noise_model import NoiseModel
     from benchmarks.scene import config_for
     from gripmon.model.geometry import from_record
-    from gripmon.hindsight import chart
+    from gripmon.analyse.smoother import chart
 
     nominal_T = from_record(config_for((768, 576)).reference.cam_T_grip)
     rough = NoiseModel.load("rough").vibration
@@ -196,7 +196,7 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
 def _one(scenario: Scenario, error: Any, vibrates: Any, covariance: Any, rng: Any) -> _Run:
     import numpy as np
 
-    from gripmon.hindsight import correct
+    from gripmon.analyse.smoother import correct
 
     stamp_ns, true_T, measured_T, measured = stream(scenario, error, vibrates, rng)
     live_T, raw_T = live(measured_T, covariance, measured)
@@ -278,7 +278,7 @@ def draw(path: Path, seed: int) -> None:
     import numpy as np
 
     from benchmarks.noise_model import NoiseModel
-    from gripmon.hindsight import correct
+    from gripmon.analyse.smoother import correct
 
     wanted = [s for s in scenarios() if s.regime == "working" and s.name in ("five steps", "creep of 0.1 mm/min")]
     figure, axes = plt.subplots(len(wanted), 1, figsize=(10, 7), constrained_layout=True)

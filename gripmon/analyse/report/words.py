@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gripmon.model.records import AlertKind, Cause
-from gripmon.report.content import AffectedRange, Event, RecordingReport
-from gripmon.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, period, size, span
-from gripmon.report.limits import excess
-from gripmon.report.lives import MOTIONS
+from gripmon.analyse.report.content import AffectedRange, Event, RecordingReport
+from gripmon.analyse.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, period, size, span
+from gripmon.analyse.report.limits import excess
+from gripmon.analyse.report.lives import MOTIONS
 
 CAUSES: dict[str, str] = {
     Cause.CAMERA_MOUNT: "the camera's mount moved",

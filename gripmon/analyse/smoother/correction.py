@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.hindsight import changes, chart, motion
-from gripmon.hindsight.blocks import Blocks, Spread, at, held, with_gaps
-from gripmon.hindsight.noise import Shares, learn_shares, likeliest_dynamics
-from gripmon.hindsight.run import Bools, Ints, Run, prepare, wild_frames
-from gripmon.hindsight.smoother import Dynamics, Smoothed, smooth
+from gripmon.analyse.smoother import changes, chart, motion
+from gripmon.analyse.smoother.blocks import Blocks, Spread, at, held, with_gaps
+from gripmon.analyse.smoother.noise import Shares, learn_shares, likeliest_dynamics
+from gripmon.analyse.smoother.run import Bools, Ints, Run, prepare, wild_frames
+from gripmon.analyse.smoother.smoother import Dynamics, Smoothed, smooth
 from gripmon.model.records import Array
 
 BLOCK_S = 0.13

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Severity
-from gripmon.report.clock import Clock
+from gripmon.analyse.report.clock import Clock
 
 MOTIONS = (AlertKind.STEP, AlertKind.CREEP, AlertKind.DRIFT)
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from gripmon.report.build import Told, build
-from gripmon.report.content import RecordingReport, Report
+from gripmon.analyse.report.build import Told, build
+from gripmon.analyse.report.content import RecordingReport, Report
 
 __all__ = ["RecordingReport", "Report", "Told", "build"]

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 
 from gripmon.model.records import AlertKind, Array, Severity
-from gripmon.report.clock import SECOND_NS
-from gripmon.report.content import Displacement, Event, Moment, Onset
-from gripmon.report.hindsight import Hindsight
-from gripmon.report.lives import Life, Said, explained, probability, worst
-from gripmon.report.onsets import drift_onset, frame_noise, step_onset
-from gripmon.report.track import Track, displacement
+from gripmon.analyse.report.clock import SECOND_NS
+from gripmon.analyse.report.content import Displacement, Event, Moment, Onset
+from gripmon.analyse.report.hindsight import Hindsight
+from gripmon.analyse.report.lives import Life, Said, explained, probability, worst
+from gripmon.analyse.report.onsets import drift_onset, frame_noise, step_onset
+from gripmon.analyse.report.track import Track, displacement
 
 _SIDE_FRAMES = 15  # that a level is the median of
 _SETTLED = 0.95

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array
-from gripmon.report.clock import SECOND_NS
-from gripmon.report.content import Curve
-from gripmon.report.formats import COVERAGE
-from gripmon.report.track import Track
+from gripmon.analyse.report.clock import SECOND_NS
+from gripmon.analyse.report.content import Curve
+from gripmon.analyse.report.formats import COVERAGE
+from gripmon.analyse.report.track import Track
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

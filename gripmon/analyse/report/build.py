@@ -11,21 +11,21 @@ from numpy.typing import NDArray
 
 from gripmon import __version__
 from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
-from gripmon.report.affected import motion_ranges, verdict_ranges
-from gripmon.report.clock import straightened
-from gripmon.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
-from gripmon.report.envelope import curves_of
-from gripmon.report.formats import count
-from gripmon.report.happenings import happenings_of, pauses_of, with_reference_changes
-from gripmon.report.hindsight import look_back
-from gripmon.report.integrity import integrity_of
-from gripmon.report.limits import limits_of
-from gripmon.report.lives import MOTIONS, lives_of
-from gripmon.report.motions import motions_of
-from gripmon.report.running import dropped_of, running_of
-from gripmon.report.source import Source, main_text
-from gripmon.report.track import Track, displacement, make_track
-from gripmon.report.words import headline, paragraph
+from gripmon.analyse.report.affected import motion_ranges, verdict_ranges
+from gripmon.analyse.report.clock import straightened
+from gripmon.analyse.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
+from gripmon.analyse.report.envelope import curves_of
+from gripmon.analyse.report.formats import count
+from gripmon.analyse.report.happenings import happenings_of, pauses_of, with_reference_changes
+from gripmon.analyse.report.hindsight import look_back
+from gripmon.analyse.report.integrity import integrity_of
+from gripmon.analyse.report.limits import limits_of
+from gripmon.analyse.report.lives import MOTIONS, lives_of
+from gripmon.analyse.report.motions import motions_of
+from gripmon.analyse.report.running import dropped_of, running_of
+from gripmon.analyse.report.source import Source, main_text
+from gripmon.analyse.report.track import Track, displacement, make_track
+from gripmon.analyse.report.words import headline, paragraph
 
 _END_FRAMES = 15
 _NEIGHBOURS = 6

@@ -9,7 +9,7 @@ import msgspec
 import yaml
 
 from gripmon.judge.policy import PolicySettings
-from gripmon.report.content import Limits
+from gripmon.analyse.report.content import Limits
 
 
 def limits_of(main_text: str | None, affected_m: float | None, affected_rad: float | None) -> Limits:

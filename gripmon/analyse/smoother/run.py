@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from gripmon.hindsight import chart
+from gripmon.analyse.smoother import chart
 from gripmon.model.records import Array
 
 Bools = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.model.records import Array, ReferenceRecord
-from gripmon.report.content import Displacement
+from gripmon.analyse.report.content import Displacement
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gripmon.report.content import Integrity, Limits
+from gripmon.analyse.report.content import Integrity, Limits
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from datetime import UTC, datetime
 
-from gripmon.report.content import Displacement
+from gripmon.analyse.report.content import Displacement
 
 COVERAGE = 2.0
 """Standard deviations that a ± stands for."""

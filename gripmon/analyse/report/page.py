@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from gripmon.model.records import AlertKind, CauseWeight, Origin
-from gripmon.report import formats
-from gripmon.report.build import Told
-from gripmon.report.content import AffectedRange, Event, Noise, RecordingReport, Report
-from gripmon.report.lives import MOTIONS
-from gripmon.report.pictures import Looked, Shown, together
-from gripmon.report.words import CAUSES, cause_words
+from gripmon.analyse.report import formats
+from gripmon.analyse.report.build import Told
+from gripmon.analyse.report.content import AffectedRange, Event, Noise, RecordingReport, Report
+from gripmon.analyse.report.lives import MOTIONS
+from gripmon.analyse.report.pictures import Looked, Shown, together
+from gripmon.analyse.report.words import CAUSES, cause_words
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all that was said
 _MOST_ROWS = 400
@@ -44,7 +44,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    from gripmon.report.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
+    from gripmon.analyse.report.plots import as_json, drift_figure, overview_figure, protection_figure, running_figure
 
     shown: dict[tuple[int, int], tuple[Shown | None, ...]] = {}
     figures: dict[str, str] = {}
@@ -60,7 +60,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
             shown[n, event.number] = _pictures(each, event)
         step()
     environment = Environment(
-        loader=PackageLoader("gripmon.report", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader("gripmon.analyse.report", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
     )
     environment.globals.update(_VOCABULARY)
     environment.filters["units"] = _with_units
@@ -81,7 +81,7 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
 
 
 def _file(name: str) -> str:
-    return resources.files("gripmon.report").joinpath("page", name).read_text("utf-8")
+    return resources.files("gripmon.analyse.report").joinpath("page", name).read_text("utf-8")
 
 
 def _title(report: Report) -> str:

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from gripmon.hindsight.run import Ints, Run
-from gripmon.hindsight.smoother import Smoothed
+from gripmon.analyse.smoother.run import Ints, Run
+from gripmon.analyse.smoother.smoother import Smoothed
 from gripmon.model.records import Array
 
 GAP_BLOCKS = 4.0

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.records import Array, StateRecord
-from gripmon.report.affected import runs_of_equal
-from gripmon.report.clock import SECOND_NS, Clock
-from gripmon.report.content import Noise, Running, Share, Slice, Stretch
-from gripmon.report.onsets import robust_sigma
-from gripmon.report.source import Source
-from gripmon.report.track import Track
+from gripmon.analyse.report.affected import runs_of_equal
+from gripmon.analyse.report.clock import SECOND_NS, Clock
+from gripmon.analyse.report.content import Noise, Running, Share, Slice, Stretch
+from gripmon.analyse.report.onsets import robust_sigma
+from gripmon.analyse.report.source import Source
+from gripmon.analyse.report.track import Track
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gripmon.hindsight.smoother import MID_S, SLOW_S, UNKNOWN_RATE, Bools, Dynamics, log_likelihood
+from gripmon.analyse.smoother.smoother import MID_S, SLOW_S, UNKNOWN_RATE, Bools, Dynamics, log_likelihood
 from gripmon.model.records import Array
 
 LONGEST_LAG_S = 30.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.report.formats import clock_time
+from gripmon.analyse.report.formats import clock_time
 
 SECOND_NS = 1_000_000_000
 _LONGEST_NS = 7 * 86400 * SECOND_NS  # a pause within one run

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.hindsight import chart
-from gripmon.hindsight.correction import Correction
-from gripmon.hindsight.run import Ints
+from gripmon.analyse.smoother import chart
+from gripmon.analyse.smoother.correction import Correction
+from gripmon.analyse.smoother.run import Ints
 from gripmon.model.records import Array
 
 

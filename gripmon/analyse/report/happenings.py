@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from gripmon.model.records import AlertKind, ReferenceRecord, Severity
-from gripmon.report.clock import SECOND_NS, Clock
-from gripmon.report.content import Event, Moment, Onset
-from gripmon.report.formats import count, duration
-from gripmon.report.lives import Life, explained, probability, worst
+from gripmon.analyse.report.clock import SECOND_NS, Clock
+from gripmon.analyse.report.content import Event, Moment, Onset
+from gripmon.analyse.report.formats import count, duration
+from gripmon.analyse.report.lives import Life, explained, probability, worst
 
 TITLES = {
     AlertKind.VIBRATION: "The camera vibrated",
