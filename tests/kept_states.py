@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import yaml
 
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import MonitorState
 from gripmon.judge.references import ReferenceBook

@@ -13,7 +13,7 @@ from simulated import BOX_FINGERS, nominal_cam_T_grip
 
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Image

@@ -22,7 +22,7 @@ from gripmon.model.camera import BrownConradyLens, PaperLens
 from gripmon.cli import main
 from gripmon.cli.calibration_files import target_of
 from gripmon.cli.common import CommandFailedError
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config.yaml_file import read_yaml
 
 LENS = BrownConradyLens(
     width_px=480, height_px=360, fx_px=470.0, fy_px=471.0, cx_px=243.0, cy_px=177.0,

@@ -25,9 +25,9 @@ from gripmon.calibrate.documents import (
 )
 from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.cli import main
-from gripmon.config import load_config
-from gripmon.config.calibrated import read_camera
-from gripmon.config.yaml_file import as_yaml
+from gripmon.daemon.config import load_config
+from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import perturb, to_record
 from gripmon.model.gripper import contents_of

@@ -16,10 +16,10 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals, HandEyeCalibration
 from gripmon.cli import main
-from gripmon.config import load_config, read_gripper
-from gripmon.config.recorded import from_recorded, to_recorded
-from gripmon.config.typed import to_settings
-from gripmon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config import load_config, read_gripper
+from gripmon.daemon.config.recorded import from_recorded, to_recorded
+from gripmon.daemon.config.typed import to_settings
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 
 DEMO = builtin_config("demo.yaml")
 WXYZ = [0.963637, 0.267184, 0.003984, -0.001105]  # the demo's quaternion in the other order

@@ -15,7 +15,7 @@ from pulsed_laser import AXES, calibration, poses, pulses, true_world
 from scipy.spatial.transform import Rotation
 
 from gripmon.cli import main
-from gripmon.config.yaml_file import as_yaml
+from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.watch.world import calibrated, foresee
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.io.ros2.types import typestore
 from gripmon.io.wire.endpoints import endpoint_fault
 

@@ -20,7 +20,7 @@ import pytest
 from gripmon_process import GRIPMON, ROOT, gripmon, start
 
 from gripmon.cli import main
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.model.records import FrameRecord
 
 COMMANDS = (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"

@@ -13,8 +13,8 @@ import pytest
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.config import ConfigError, load_config
-from gripmon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper

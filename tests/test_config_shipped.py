@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripmon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
+from gripmon.daemon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.forecast import Outlook, expect

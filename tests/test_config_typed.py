@@ -9,8 +9,8 @@ import msgspec
 import pytest
 from msgspec import Meta
 
-from gripmon.config.typed import SettingsError, to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config.typed import SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from box_models import Model, cube_model, two_fingers_model
 from scipy.spatial import ConvexHull
 
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.simulate.solids import finger_solids
 

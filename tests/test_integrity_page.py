@@ -13,7 +13,7 @@ from remote_monitor import remote_monitor
 
 from gripmon.cli import main
 from gripmon.io.client import Policy, TransformClient
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
 

@@ -228,7 +228,7 @@ def test_a_missing_package_is_said_by_check(
 
 
 def test_without_metrics_the_package_is_not_imported():
-    code = "import sys, gripmon.config, gripmon.io.metrics; print('prometheus_client' in sys.modules)"
+    code = "import sys, gripmon.daemon.config, gripmon.io.metrics; print('prometheus_client' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
     assert done.stdout == "False\n"
 

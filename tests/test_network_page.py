@@ -12,9 +12,9 @@ import numpy as np
 import yaml
 from loopback import WAIT_S, free_endpoint, wait_until
 
-from gripmon.config import builtin_config, load_config
-from gripmon.config.settings import JawSettings
-from gripmon.config.typed import to_settings
+from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.config.settings import JawSettings
+from gripmon.daemon.config.typed import to_settings
 from gripmon.model.pixels import ENCODINGS
 from gripmon.model.records import Frame, FrameNote, from_json
 from gripmon.io.sources import NetworkCamera, NetworkSettings, SourceSettings

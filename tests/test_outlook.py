@@ -16,7 +16,7 @@ from watched import reference_of, watched
 
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.track.edges import MeasurementSettings
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings

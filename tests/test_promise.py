@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from gripmon.cli import main
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.cli import build_parser
-from gripmon.config.settings import Settings
+from gripmon.daemon.config.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

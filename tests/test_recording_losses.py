@@ -15,7 +15,7 @@ import yaml
 from gripmon_process import gripmon
 from recorded import Recorded, frame, image, record, recorder, trace, wait_until
 
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.record.read import open_recordings
 from gripmon.record.write import ProcessRecorder
 from gripmon.model.records import Alert, AlertKind, Cause, Severity

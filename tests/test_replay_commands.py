@@ -19,7 +19,7 @@ from loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_un
 from network_daemon import ENVIRONMENT
 from replayed import EVERY_FRAME, replayed, without_latency
 
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.judge.statefile import unpack
 
 PREFIX = "gripmon/demo/wrist"

@@ -23,8 +23,8 @@ from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds
 from gripmon.cli.replay import _recorder
 from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
-from gripmon.config import load_config
-from gripmon.config.recorded import to_recorded
+from gripmon.daemon.config import load_config
+from gripmon.daemon.config.recorded import to_recorded
 from gripmon.record.write import open_recorder
 from gripmon.model.records import (
     Alert,

@@ -18,7 +18,7 @@ import pytest
 import yaml
 
 from gripmon.cli import main
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.analyse.report import Report
 from gripmon.simulate import Simulator
 from gripmon.io.sources import make_simulator

@@ -25,7 +25,7 @@ from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, pose_of, reference_of
 
 from gripmon.model.camera import make_camera
-from gripmon.config import load_config
+from gripmon.daemon.config import load_config
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.model.records import (
     AlertEvent,

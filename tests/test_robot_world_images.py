@@ -20,7 +20,7 @@ from gripmon.calibrate.targets import parse_target
 from gripmon.calibrate.upright import upright
 from gripmon.model.camera import BrownConradyLens
 from gripmon.cli import main
-from gripmon.config.yaml_file import as_yaml
+from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
 

@@ -22,7 +22,7 @@ import zenoh
 from loopback import free_endpoint, plain_session, wait_until
 from test_ros2_names import JAZZY_HASHES
 
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 
 HERE = Path(__file__).resolve().parent
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])}

@@ -15,7 +15,7 @@ import zenoh
 from loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
 
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.model.records import CommandReply, FrameRecord, from_json
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -11,7 +11,7 @@ import yaml
 from pulsed_scenes import PULSE_NS, Cell, cell, write_config, write_folder, write_table
 
 from gripmon.cli import main
-from gripmon.config import ConfigError, builtin_config, load_config, load_second
+from gripmon.daemon.config import ConfigError, builtin_config, load_config, load_second
 
 
 @pytest.fixture(scope="module")

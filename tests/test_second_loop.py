@@ -14,7 +14,7 @@ from pulsed_scenes import PULSE_NS, cell, dark, lit
 from rubbish import broken_json
 from stand_ins import Listener, ScriptedSource
 
-from gripmon.config.second import read_laser
+from gripmon.daemon.config.second import read_laser
 from gripmon.daemon import DaemonSettings, run_second
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import LONGEST_S, Told, of_message

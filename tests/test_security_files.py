@@ -15,7 +15,7 @@ from loopback import accepts, free_endpoint
 from router_process import ROOT, plain_config, running
 
 from gripmon.cli import main
-from gripmon.config import is_second, load_config, load_second
+from gripmon.daemon.config import is_second, load_config, load_second
 from gripmon.io.wire import PublishError, PublishSettings, zenoh_config
 from gripmon.io.wire.files import ZenohFileError, load_file, said
 

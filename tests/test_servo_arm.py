@@ -116,7 +116,7 @@ def test_every_placement_can_be_reached_and_begins_at_the_stand_off():
 def scene():
     from servoing.eye import Eye, object_points_m
 
-    from gripmon.config import load_config
+    from gripmon.daemon.config import load_config
     from gripmon.model.geometry import from_record
     from gripmon.simulate.scenario import GraspedObject
 

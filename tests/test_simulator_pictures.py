@@ -19,7 +19,7 @@ from simulated import (
 )
 
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulate.background import _smear_kernel
 from gripmon.simulate.coverage import CoverageRaster

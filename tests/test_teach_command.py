@@ -21,9 +21,9 @@ from taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.model.atomic import write_atomically
 from gripmon.cli import main
-from gripmon.config import ConfigError, builtin_config, load_config
-from gripmon.config.typed import to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.config.typed import to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.track.edges import TaughtModel
 from gripmon.track.edges.taught import TaughtEdge, gripper_digest
 from gripmon.model.geometry import to_record

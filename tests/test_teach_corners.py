@@ -17,10 +17,10 @@ from taught_by_hand import Rig, make_rig
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.model.camera import make_camera
 from gripmon.cli import main
-from gripmon.config import Settings, builtin_config, load_config
-from gripmon.config.settings import JawSettings
-from gripmon.config.typed import to_settings
-from gripmon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config import Settings, builtin_config, load_config
+from gripmon.daemon.config.settings import JawSettings
+from gripmon.daemon.config.typed import to_settings
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
 from gripmon.model.gripper import load_gripper

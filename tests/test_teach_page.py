@@ -20,7 +20,7 @@ from teach_page_browser import DEADLINE_S, Visitor, browser, page
 from test_live_camera import MjpegServer
 
 from gripmon.cli import main
-from gripmon.config import load_config
+from gripmon.daemon.config import load_config
 from gripmon.model.geometry import from_record, perturbation_between
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")

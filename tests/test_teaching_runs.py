@@ -13,7 +13,7 @@ from taught_scenes import CAMERA, arrays, bevelled, image_of, reference, scene, 
 from test_teaching import silhouette_offsets_m
 from watched import pose_of, reference_of
 
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.judge.drift import DriftSettings
 from gripmon.monitor import Monitor, MonitorSettings

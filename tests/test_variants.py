@@ -11,7 +11,7 @@ from box_models import cube_model, two_fingers_model
 from simulated import BOX_FINGERS
 from watched import Watched, frames_of, new_monitor, watch
 
-from gripmon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.monitor import MonitorSettings
 from gripmon.model.records import AlertKind, CornerFault, FrameRecord

@@ -28,7 +28,7 @@ from network_daemon import ENVIRONMENT
 from rerun.chunk import RrdReader
 
 from gripmon.cli import main
-from gripmon.config import builtin_config
+from gripmon.daemon.config import builtin_config
 from gripmon.record.write import ProcessRecorder, RecordingSettings, ViewSettings, open_recorder
 
 VIEWER = Path(rerun_cli.__file__).parent / "rerun"

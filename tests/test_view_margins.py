@@ -15,8 +15,8 @@ from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
-from gripmon.config import builtin_config
-from gripmon.config.checks import FEWEST_CORNERS_IN_VIEW
+from gripmon.daemon.config import builtin_config
+from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings

@@ -23,9 +23,9 @@ from teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.cli import main
-from gripmon.config import load_config
-from gripmon.config.typed import to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config import load_config
+from gripmon.daemon.config.typed import to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Transform

@@ -120,8 +120,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _camera(name: str) -> CameraCalibration:
-    from gripmon.config.calibrated import read_camera
-    from gripmon.config.errors import ConfigError
+    from gripmon.daemon.config.calibrated import read_camera
+    from gripmon.daemon.config.errors import ConfigError
 
     try:
         return read_camera(Path(name))

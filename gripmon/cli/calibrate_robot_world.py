@@ -191,8 +191,8 @@ class _Seer:
 
     def _prepare(self) -> None:
         from gripmon.calibrate.targets import tells_its_turn
-        from gripmon.config.calibrated import read_camera
-        from gripmon.config.errors import ConfigError
+        from gripmon.daemon.config.calibrated import read_camera
+        from gripmon.daemon.config.errors import ConfigError
 
         if self._camera is not None:
             return

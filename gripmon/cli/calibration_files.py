@@ -92,8 +92,8 @@ def is_target_file(text: str) -> bool:
 def _target_in(path: Path, option: str) -> Target:
     """Of a calibration that was made with it, or described by itself."""
     from gripmon.calibrate.targets import checked
-    from gripmon.config import ConfigError
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.daemon.config import ConfigError
+    from gripmon.daemon.config.yaml_file import read_yaml
 
     right = "a file of gripmon calibrate intrinsics or plane, or one with the line target: circles:8x8:0.008:0.004"
     try:
@@ -146,7 +146,7 @@ def write_document(document: msgspec.Struct, path: Path, option: str = "--out") 
     """Write it as YAML, whole or not at all."""
     import msgspec
 
-    from gripmon.config.yaml_file import as_yaml
+    from gripmon.daemon.config.yaml_file import as_yaml
 
     _write(path, as_yaml(msgspec.to_builtins(document)).encode(), option)
 

@@ -50,8 +50,8 @@ def read_calibrated(path: Path) -> Calibrated:
         return _state(path, data)
     if head.startswith(b"{") and path.suffix != ".yaml":
         return _estimates(path, data)
-    from gripmon.config import ConfigError
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.daemon.config import ConfigError
+    from gripmon.daemon.config.yaml_file import read_yaml
 
     try:
         values = read_yaml(path)
@@ -87,7 +87,7 @@ def _of_yaml(path: Path, schema: str, values: dict[str, object]) -> Calibrated:
 
 
 def _camera(path: Path) -> Calibrated:
-    from gripmon.config.calibrated import read_camera
+    from gripmon.daemon.config.calibrated import read_camera
 
     found = read_camera(path)
     values = {**_plain(found.camera)}
@@ -114,7 +114,7 @@ def _plain(camera: LensSettings) -> dict[str, float]:
 
 
 def _hand_eye(path: Path) -> Calibrated:
-    from gripmon.config.calibrated import read_hand_eye
+    from gripmon.daemon.config.calibrated import read_hand_eye
 
     found = read_hand_eye(path)
     residuals = found.residuals

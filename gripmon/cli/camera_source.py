@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.config import Config, SecondConfig
+    from gripmon.daemon.config import Config, SecondConfig
     from gripmon.model.records import Frame
     from gripmon.io.sources import Source
     from gripmon.io.wire import Link
@@ -23,7 +23,7 @@ class RecordedInput(NamedTuple):
 
 def open_source(config: Config | SecondConfig, link: Link | None = None) -> Source:
     """Start the configured source; one that can't start ends the command with exit code 2."""
-    from gripmon.config import SecondConfig
+    from gripmon.daemon.config import SecondConfig
     from gripmon.io.sources import FullScale, SourceError
     from gripmon.io.sources import open_source as started
     from gripmon.io.wire import Keys
@@ -86,6 +86,6 @@ def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Fram
 
 def _camera_key(config: Config | SecondConfig) -> str:
     """Which key the size of an image belongs to."""
-    from gripmon.config import SecondConfig
+    from gripmon.daemon.config import SecondConfig
 
     return "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"

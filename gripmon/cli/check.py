@@ -21,8 +21,8 @@ from gripmon.cli import (
 )
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
-    from gripmon.config.checks import View
+    from gripmon.daemon.config import Config
+    from gripmon.daemon.config.checks import View
 
 _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and say of each thing that matters whether

@@ -93,8 +93,8 @@ def _settings(arguments: argparse.Namespace) -> SpotWatchSettings:
 
 
 def _calibration(path: Path) -> LaserCalibration:
-    from gripmon.config.errors import ConfigError
-    from gripmon.config.second import read_laser
+    from gripmon.daemon.config.errors import ConfigError
+    from gripmon.daemon.config.second import read_laser
 
     if not path.is_file():
         raise common.CommandFailedError(

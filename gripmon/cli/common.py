@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
 
 EXIT_DONE = 0
 EXIT_USAGE = 2
@@ -84,7 +84,7 @@ def seed(text: str) -> int:
 
 def load(path: str, *, check_source: bool = True, with_taught: bool = True) -> Config:
     """The checked configuration in a file; a fault ends the command with exit code 2."""
-    from gripmon.config import ConfigError, load_config
+    from gripmon.daemon.config import ConfigError, load_config
 
     try:
         return load_config(Path(path), check_source=check_source, with_taught=with_taught)
@@ -94,7 +94,7 @@ def load(path: str, *, check_source: bool = True, with_taught: bool = True) -> C
 
 def load_demo_or(path: str | None) -> Config:
     """The configuration in a file, or that of the demo."""
-    from gripmon.config import builtin_config
+    from gripmon.daemon.config import builtin_config
 
     return load(str(builtin_config("demo.yaml")) if path is None else path, check_source=False)
 

@@ -19,7 +19,7 @@ from gripmon.cli.run import run_daemon
 if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
     from gripmon.io.client import Client
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.model.records import Array, FrameRecord
     from gripmon.simulate import Simulator
 
@@ -215,7 +215,7 @@ def _summarise(out: Path, simulator: Simulator, received: int) -> None:
 
 
 def _as_text(summary: dict[str, Any], comparison: Comparison, out: Path) -> str:
-    from gripmon.config import builtin_config
+    from gripmon.daemon.config import builtin_config
 
     verdicts = ", ".join(f"{count} {verdict}" for verdict, count in comparison.verdicts.items() if count)
     configs = shlex.quote(str(builtin_config("live_camera.yaml").parent))

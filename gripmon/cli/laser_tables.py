@@ -126,8 +126,8 @@ def _json(path: Path) -> Any:
 
 
 def _yaml(path: Path) -> Any:
-    from gripmon.config.errors import ConfigError
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.daemon.config.errors import ConfigError
+    from gripmon.daemon.config.yaml_file import read_yaml
 
     try:
         return read_yaml(path)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli.findings import past_limit
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.teach.forecast import Rig
 
 _AXES = ("x", "y", "z")

@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 from gripmon.cli import camera_source, common
 
 if TYPE_CHECKING:
-    from gripmon.config import Config, SecondConfig
+    from gripmon.daemon.config import Config, SecondConfig
     from gripmon.io.sources import LiveSettings
 
 _PORTS = {"rtsp": 554, "http": 80, "https": 443, "rtmp": 1935}
@@ -42,7 +42,7 @@ def lines(report: dict[str, Any]) -> list[str]:
 
 def zenoh_values(config: Config | SecondConfig) -> dict[str, Any] | None:
     """How the monitor would join the network; what can't be ends the command."""
-    from gripmon.config import ConfigError, SecondConfig, check_network, check_second_network
+    from gripmon.daemon.config import ConfigError, SecondConfig, check_network, check_second_network
 
     try:
         found = check_second_network(config) if isinstance(config, SecondConfig) else check_network(config)

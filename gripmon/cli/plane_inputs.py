@@ -15,10 +15,10 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.targets import Target
 from gripmon.cli import calibration_files as files
 from gripmon.cli import common
-from gripmon.config import Config, ConfigError, read_gripper
-from gripmon.config.calibrated import read_camera
-from gripmon.config.typed import SettingsError, to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config import Config, ConfigError, read_gripper
+from gripmon.daemon.config.calibrated import read_camera
+from gripmon.daemon.config.typed import SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.gripper import Gripper
 from gripmon.teach.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
 from gripmon.model.records import Image

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.teach.forecast import Promise
 
 

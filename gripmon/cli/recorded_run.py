@@ -16,7 +16,7 @@ from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.record.read.replayed import RecordedFrames
     from gripmon.record.write.compared import ComparedRecorder
     from gripmon.model.records import FrameRecord, Limits
@@ -99,7 +99,7 @@ class RecordedRun:
     @contextlib.contextmanager
     def compared_in(self, name: str) -> Iterator[ComparedRecorder]:
         """A recorder into one file that shows what was recorded and what is replayed, overlaid."""
-        from gripmon.config.recorded import to_recorded
+        from gripmon.daemon.config.recorded import to_recorded
         from gripmon.record.write.compared import ComparedRecorder
         from gripmon.record.write.wire import make_scene
 
@@ -128,8 +128,8 @@ class RecordedRun:
             keep([part], path, recorder.failure, whole=recorder.failure is None)
 
     def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
-        from gripmon.config import ConfigError
-        from gripmon.config.recorded import from_recorded
+        from gripmon.daemon.config import ConfigError
+        from gripmon.daemon.config.recorded import from_recorded
 
         recorded = self.source.configuration
         if recorded is None:

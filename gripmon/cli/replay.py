@@ -20,7 +20,7 @@ from gripmon.cli.recorded_run import RecordedRun, is_recording
 from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
 if TYPE_CHECKING:
-    from gripmon.config import Config, SecondConfig
+    from gripmon.daemon.config import Config, SecondConfig
     from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord
     from gripmon.io.sources import Source
@@ -296,7 +296,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
     """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
     import msgspec
 
-    from gripmon.config.recorded import to_recorded
+    from gripmon.daemon.config.recorded import to_recorded
     from gripmon.record.write import NullRecorder, open_recorder
 
     if name is None:

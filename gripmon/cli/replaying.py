@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.record.write import Recorder
     from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand

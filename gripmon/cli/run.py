@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import camera_source, common, promising, second_run, viewing
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.monitor import Monitor
     from gripmon.record.write import Recorder
     from gripmon.model.records import Alert, MonitorState
@@ -233,7 +233,7 @@ def _open_recorder(
     live: viewing.LiveView | None,
     patience_s: float,
 ) -> Recorder:
-    from gripmon.config.recorded import to_recorded
+    from gripmon.daemon.config.recorded import to_recorded
     from gripmon.record.write import open_recorder
 
     settings = config.settings

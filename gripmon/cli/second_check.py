@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import check_laser, findings, outside
 
 if TYPE_CHECKING:
-    from gripmon.config import SecondConfig
+    from gripmon.daemon.config import SecondConfig
 
 
 def run(config: SecondConfig, *, as_json: bool, verbose: bool) -> int:

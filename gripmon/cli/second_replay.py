@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.config import SecondConfig
+    from gripmon.daemon.config import SecondConfig
     from gripmon.model.records import SpotRecord
     from gripmon.io.sources import Source
 

@@ -11,7 +11,7 @@ from gripmon.cli import camera_source, common
 from gripmon.cli.viewing import LiveView
 
 if TYPE_CHECKING:
-    from gripmon.config import SecondConfig
+    from gripmon.daemon.config import SecondConfig
     from gripmon.daemon import Reports
     from gripmon.io.publish import SpotPublisher, ZenohCommands, ZenohPulses
     from gripmon.record.write import SpotRecorder
@@ -31,7 +31,7 @@ class _Network:
 
 def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
     """The configuration if it is a second camera's, else None; a fault ends the command with exit code 2."""
-    from gripmon.config import ConfigError, is_second, load_second
+    from gripmon.daemon.config import ConfigError, is_second, load_second
 
     try:
         return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
@@ -41,7 +41,7 @@ def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
 
 def with_pulses(config: SecondConfig) -> SecondConfig:
     """The same with the pulses of its table, where that was left out before; ends the command if it can't be read."""
-    from gripmon.config import ConfigError, load_pulses
+    from gripmon.daemon.config import ConfigError, load_pulses
 
     try:
         return load_pulses(config)
@@ -105,7 +105,7 @@ def run_second(
 
 def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
     """Open all of it; ends the command as :func:`gripmon.cli.network.open_network` does."""
-    from gripmon.config import ConfigError, check_second_network
+    from gripmon.daemon.config import ConfigError, check_second_network
     from gripmon.daemon import Reports
     from gripmon.io.publish import NullPublisher
     from gripmon.io.wire import Link, PublishError
@@ -158,7 +158,7 @@ def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublish
 
 def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None, patience_s: float) -> SpotRecorder:
     """The recording that the configuration wants; ends the command with exit code 2 where it can't be made."""
-    from gripmon.config.recorded import second_to_recorded
+    from gripmon.daemon.config.recorded import second_to_recorded
     from gripmon.record.write import open_spot_recorder
 
     settings = config.settings

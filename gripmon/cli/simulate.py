@@ -12,7 +12,7 @@ from gripmon import __version__
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.simulate import Scenario
 
 _DESCRIPTION = """\
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
-    from gripmon.config import ConfigError, load_scenario
+    from gripmon.daemon.config import ConfigError, load_scenario
     from gripmon.simulate import make_scenario
 
     name: str = arguments.scenario

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gripmon.model.camera import Camera
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.teach.forecast import Grid, Trial
 
 _SHOWN = 8

@@ -15,7 +15,7 @@ from gripmon import __version__
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.track.edges import TaughtModel
     from gripmon.track.edges.taught import TaughtEdge
     from gripmon.model.records import Image

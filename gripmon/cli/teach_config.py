@@ -150,7 +150,7 @@ def _defaults() -> str:
     """What holds anyway, behind # signs."""
     import msgspec
 
-    from gripmon.config import Settings
+    from gripmon.daemon.config import Settings
 
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."

@@ -14,7 +14,7 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.model.camera import Camera, LensSettings
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.model.gripper import Gripper
     from gripmon.model.records import Image, ReferenceRecord
     from gripmon.io.sources import FolderSettings, LiveSettings
@@ -83,7 +83,7 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
 
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file; a fault ends the command with exit code 2."""
-    from gripmon.config.typed import to_settings
+    from gripmon.daemon.config.typed import to_settings
     from gripmon.teach.onboarding.rough import RoughCorners
     from gripmon.teach.edges.bench import rough_fault
 
@@ -98,7 +98,7 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
 
 
 def _gripper(name: str | None) -> tuple[Gripper, Path]:
-    from gripmon.config import read_gripper
+    from gripmon.daemon.config import read_gripper
 
     if name is None:
         raise common.CommandFailedError(
@@ -151,8 +151,8 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     import numpy as np
 
     from gripmon.model.camera import LensSettings
-    from gripmon.config.calibrated import read_camera
-    from gripmon.config.typed import to_settings
+    from gripmon.daemon.config.calibrated import read_camera
+    from gripmon.daemon.config.typed import to_settings
     from gripmon.teach.edges.corner_pose import CameraError
 
     with _faults_of(path):
@@ -171,7 +171,7 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
     """A file of ``gripmon calibrate plane``, made with this camera, if one was given, and this gripper."""
     import hashlib
 
-    from gripmon.config.calibrated import mismatch, read_hand_eye
+    from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
     from gripmon.model.records import ReferenceRecord, to_json
 
     with _faults_of(path):
@@ -188,9 +188,9 @@ def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[
 
 def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, name: str) -> None:
     """End the command if this reference doesn't see this gripper."""
-    from gripmon.config.checks import covariance_of, predict_view, reference_transform, view_fault
-    from gripmon.config.settings import ReferenceSettings, TransformSettings
-    from gripmon.config.typed import Fault
+    from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
+    from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
+    from gripmon.daemon.config.typed import Fault
 
     transform = reference.cam_T_grip
     settings = ReferenceSettings(
@@ -207,7 +207,7 @@ def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, na
 
 
 def _yaml(path: Path) -> dict[str, object]:
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.daemon.config.yaml_file import read_yaml
 
     return read_yaml(path)
 
@@ -215,8 +215,8 @@ def _yaml(path: Path) -> dict[str, object]:
 @contextlib.contextmanager
 def _faults_of(path: Path) -> Iterator[None]:
     """What is wrong with a file's contents ends the command with exit code 2."""
-    from gripmon.config import ConfigError
-    from gripmon.config.typed import SettingsError
+    from gripmon.daemon.config import ConfigError
+    from gripmon.daemon.config.typed import SettingsError
 
     try:
         yield

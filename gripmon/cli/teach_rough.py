@@ -72,8 +72,8 @@ def rough_desk(arguments: argparse.Namespace) -> RoughDesk:
 
 def _target_of(path: Path) -> str | None:
     """What a camera's file says it was calibrated with."""
-    from gripmon.config import ConfigError
-    from gripmon.config.yaml_file import read_yaml
+    from gripmon.daemon.config import ConfigError
+    from gripmon.daemon.config.yaml_file import read_yaml
 
     try:
         text = read_yaml(path).get("target")

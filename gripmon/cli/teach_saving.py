@@ -242,8 +242,8 @@ class FileSaving:
 
         import yaml
 
-        from gripmon.config import ConfigError, load_config
-        from gripmon.config.yaml_file import as_yaml, read_yaml
+        from gripmon.daemon.config import ConfigError, load_config
+        from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
         from gripmon.teach.page import SavingRefused
 
         base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory

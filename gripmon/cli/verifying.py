@@ -11,7 +11,7 @@ from gripmon.cli import common
 from gripmon.cli.calibration_sources import Calibrated
 
 if TYPE_CHECKING:
-    from gripmon.config import Config
+    from gripmon.daemon.config import Config
     from gripmon.model.records import Array, Image
 
 

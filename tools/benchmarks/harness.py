@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.scene import FPS, Ring
 from gripmon import daemon
-from gripmon.config import Config
+from gripmon.daemon.config import Config
 from gripmon.monitor import Monitor
 from gripmon.io.publish import Publisher, ZenohPublisher
 from gripmon.record.write import NullRecorder, Recorder

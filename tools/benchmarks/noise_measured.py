@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.scene import FPS, config_for
-from gripmon.config import Config
+from gripmon.daemon.config import Config
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.monitor import Monitor
 from gripmon.model.records import Array, Origin, Verdict

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks import rendered
 from gripmon.model.camera import Camera
-from gripmon.config import builtin_config, load_config
+from gripmon.daemon.config import builtin_config, load_config
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.track.edges.prediction import SamplingSettings
 from gripmon.track.differential import DegenerateGeometry, differential_update

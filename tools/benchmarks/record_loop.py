@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks import harness, scene, stalled_disk
 from benchmarks.switched import SwitchedRecorder
-from gripmon.config import Config
+from gripmon.daemon.config import Config
 
 CONDITIONS = ("off", "on", "stalled")
 _CAUGHT_UP_WITHIN_S = 60.0

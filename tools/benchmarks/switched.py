@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from gripmon.config import Config
+from gripmon.daemon.config import Config
 from gripmon.record.write import Notes, ProcessRecorder, Trace, open_recorder
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
 

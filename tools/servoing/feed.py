@@ -18,7 +18,7 @@ import msgspec
 import yaml
 
 from gripmon.io.client import Policy, Reading, TransformClient
-from gripmon.config import Config, load_config
+from gripmon.daemon.config import Config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array
 from gripmon.simulate import Scenario

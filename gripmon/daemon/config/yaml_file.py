@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from gripmon.config.errors import ConfigError
+from gripmon.daemon.config.errors import ConfigError
 
 _TAG = "tag:yaml.org,2002:"
 

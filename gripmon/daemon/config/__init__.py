@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING
 
 import gripmon
 from gripmon.model.camera import Camera, make_camera
-from gripmon.config.calibrated import CalibrationFiles, with_sections
-from gripmon.config.calibrated import mismatch as calibrated_mismatch
-from gripmon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
-from gripmon.config.deprecated import with_alert_limit
-from gripmon.config.errors import ConfigError
-from gripmon.config.inputs import jaw_fault, network_fault, source_fault
-from gripmon.config.order import order_fault
-from gripmon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_pulses, load_second
-from gripmon.config.session import joined_or_fault
-from gripmon.config.settings import Settings
-from gripmon.config.typed import Fault, SettingsError, to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
+from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
+from gripmon.daemon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
+from gripmon.daemon.config.deprecated import with_alert_limit
+from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.inputs import jaw_fault, network_fault, source_fault
+from gripmon.daemon.config.order import order_fault
+from gripmon.daemon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_pulses, load_second
+from gripmon.daemon.config.session import joined_or_fault
+from gripmon.daemon.config.settings import Settings
+from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.track.edges import TaughtEdges, TaughtModel
 from gripmon.track.edges.taught import mismatch
 from gripmon.model.geometry import from_record, to_record

@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from gripmon.config.settings import Settings
-from gripmon.config.typed import Fault
+from gripmon.daemon.config.settings import Settings
+from gripmon.daemon.config.typed import Fault
 
 _log = logging.getLogger(__name__)
 

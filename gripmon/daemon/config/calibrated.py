@@ -10,9 +10,9 @@ import msgspec
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.model.camera import LensSettings
-from gripmon.config.errors import ConfigError
-from gripmon.config.typed import Fault, SettingsError, to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.gripper import Gripper
 

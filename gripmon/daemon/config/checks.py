@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.config.settings import ReferenceSettings
-from gripmon.config.typed import Fault
+from gripmon.daemon.config.settings import ReferenceSettings
+from gripmon.daemon.config.typed import Fault
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings

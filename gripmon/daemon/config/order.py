@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 from typing import NamedTuple
 
-from gripmon.config.settings import Settings
-from gripmon.config.typed import Fault
+from gripmon.daemon.config.settings import Settings
+from gripmon.daemon.config.typed import Fault
 from gripmon.io.sources import LiveSettings
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from gripmon.model.camera import Camera
-from gripmon.config.settings import Settings
-from gripmon.config.typed import Fault
+from gripmon.daemon.config.settings import Settings
+from gripmon.daemon.config.typed import Fault
 from gripmon.io.metrics import MetricsSettings, package_fault
 from gripmon.io.ros2 import Ros2Missing, network_of
 from gripmon.io.ros2.types import typestore

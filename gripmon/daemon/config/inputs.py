@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.config.settings import JawSettings, Settings
-from gripmon.config.typed import Fault
+from gripmon.daemon.config.settings import JawSettings, Settings
+from gripmon.daemon.config.typed import Fault
 from gripmon.model.gripper import Gripper
 from gripmon.io.ros2 import JOINT_STATE, RosNameError, subscription_key
 from gripmon.io.sources import (

@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
-from gripmon.config import Config, SecondConfig, load_config
-from gripmon.config.errors import ConfigError
-from gripmon.config.yaml_file import as_yaml
+from gripmon.daemon.config import Config, SecondConfig, load_config
+from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.records import MonitorState, RecordedConfiguration, RecordedFile
 
 _LEFT_OUT = ("source", "publish", "ros2", "state", "view")

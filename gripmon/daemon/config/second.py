@@ -12,13 +12,13 @@ from msgspec import Meta
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, make_camera
-from gripmon.config.calibrated import wrong_schema
-from gripmon.config.errors import ConfigError
-from gripmon.config.inputs import network_fault, source_fault
-from gripmon.config.session import second_joined_or_fault
-from gripmon.config.settings import Name
-from gripmon.config.typed import Fault, SettingsError, to_settings
-from gripmon.config.yaml_file import read_yaml
+from gripmon.daemon.config.calibrated import wrong_schema
+from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.inputs import network_fault, source_fault
+from gripmon.daemon.config.session import second_joined_or_fault
+from gripmon.daemon.config.settings import Name
+from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
 from gripmon.laser.pulses.settings import PulseSettings
@@ -132,7 +132,7 @@ def load_pulses(config: SecondConfig) -> SecondConfig:
 
 
 def check_second_network(config: SecondConfig) -> Joining | None:
-    """As :func:`gripmon.config.check_network`.  Raises :class:`ConfigError`."""
+    """As :func:`gripmon.daemon.config.check_network`.  Raises :class:`ConfigError`."""
     settings = config.settings
     found = second_joined_or_fault(settings.source, settings.publish, settings.metrics, config.camera, config.directory)
     if isinstance(found, Fault):
