@@ -9,7 +9,7 @@ import pytest
 from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
 from published import Published
 
-from gripmon.io.client import Client, MonitorName, TransformClient
+from gripmon.client import Client, MonitorName, TransformClient
 from gripmon.model.records import FrameRecord, MessageRefused
 from gripmon.io.wire import PublishError, PublishSettings
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from loopback import frame_record
 from timely import clock
 
-from gripmon.io.client import MonitorName, Policy, Reading, Unusable
-from gripmon.io.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
-from gripmon.io.client.inbox import HELD_BACK_S, Entry, Inbox
-from gripmon.io.client.judging import judge
+from gripmon.client import MonitorName, Policy, Reading, Unusable
+from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
+from gripmon.client.inbox import HELD_BACK_S, Entry, Inbox
+from gripmon.client.judging import judge
 from gripmon.model.records import ClockReading, to_json
 from gripmon.io.wire import MOST_DRIFT
 

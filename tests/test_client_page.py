@@ -12,7 +12,7 @@ import pytest
 from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from remote_monitor import remote_monitor
 
-from gripmon.io.client import Policy, Unusable
+from gripmon.client import Policy, Unusable
 from gripmon.model.records import Verdict
 
 TEXT = (Path(__file__).resolve().parent.parent / "docs" / "client.md").read_text(encoding="utf-8")

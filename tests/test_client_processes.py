@@ -14,7 +14,7 @@ import pytest
 from loopback import ask, frame_record, free_endpoint, plain_session, wait_until
 from remote_monitor import remote_monitor, router
 
-from gripmon.io.client import Policy, Reading, TransformClient, Unusable
+from gripmon.client import Policy, Reading, TransformClient, Unusable
 from gripmon.model.records import Verdict, to_json
 
 PATIENT = Policy(max_age_s=3600.0)
@@ -212,7 +212,7 @@ def test_asyncio_gets_readings_and_the_end_and_a_cancelled_wait_loses_nothing(en
 
 def test_nothing_heavy_is_loaded():
     code = (
-        "import sys; from gripmon.io.client import TransformClient; c = TransformClient('arm'); c.latest(); c.close();"
+        "import sys; from gripmon.client import TransformClient; c = TransformClient('arm'); c.latest(); c.close();"
         "print(sorted({'numpy', 'scipy', 'cv2', 'rerun', 'yaml'} & set(sys.modules)))"
     )
     root = Path(__file__).resolve().parent.parent
@@ -222,7 +222,7 @@ def test_nothing_heavy_is_loaded():
 
 def test_a_program_that_forgets_to_close_its_client_ends(endpoint: str):
     code = (
-        "import sys; from gripmon.io.client import TransformClient; c = TransformClient('arm', connect=[sys.argv[1]]);"
+        "import sys; from gripmon.client import TransformClient; c = TransformClient('arm', connect=[sys.argv[1]]);"
         "c.on_transform(print); iter(c); print(c.latest().usable)"
     )
     root = Path(__file__).resolve().parent.parent

@@ -15,9 +15,9 @@ from loopback import frame_record
 from scipy.spatial.transform import Rotation
 from timely import TimelyInbox as Inbox
 
-from gripmon.io.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
-from gripmon.io.client.inbox import MOST_PRESENT
-from gripmon.io.client.judging import judge
+from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
+from gripmon.client.inbox import MOST_PRESENT
+from gripmon.client.judging import judge
 from gripmon.model.records import FrameRecord, Transform, Verdict, to_json
 
 WRIST, ELBOW = MonitorName("arm", "wrist"), MonitorName("arm", "elbow")

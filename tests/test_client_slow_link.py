@@ -19,8 +19,8 @@ import router_process
 from loopback import frame_record, free_endpoint, wait_until
 from published import Published
 
-from gripmon.io.client import Policy, Reading, TransformClient, Unusable
-from gripmon.io.client.inbox import Entry
+from gripmon.client import Policy, Reading, TransformClient, Unusable
+from gripmon.client.inbox import Entry
 from gripmon.io.wire import PublishSettings
 
 pytestmark = pytest.mark.usefixtures("tools_importable")

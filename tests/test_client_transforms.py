@@ -11,7 +11,7 @@ import pytest
 from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from published import Published
 
-from gripmon.io.client import Policy, Reading, TransformClient, Unusable
+from gripmon.client import Policy, Reading, TransformClient, Unusable
 from gripmon.model.records import Verdict
 from gripmon.io.wire import PublishSettings
 

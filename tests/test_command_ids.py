@@ -15,7 +15,7 @@ from loopback import plain_session, wait_until
 from published import Published
 
 from gripmon.cli import main
-from gripmon.io.client import Client, NotCarriedOut
+from gripmon.client import Client, NotCarriedOut
 from gripmon.io.publish.commands import ZenohCommands
 from gripmon.model.records import Command, CommandFault, CommandName, CommandReply
 from gripmon.io.wire import Keys, Link, PublishSettings

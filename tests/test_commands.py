@@ -14,7 +14,7 @@ from loopback import WAIT_S, free_endpoint, plain_session, reference_record, wai
 from published import Published
 
 from gripmon.cli import main
-from gripmon.io.client import Client, NotCarriedOut
+from gripmon.client import Client, NotCarriedOut
 from gripmon.io.publish.commands import ZenohCommands
 from gripmon.model.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
 from gripmon.io.wire import Keys, Link, PublishSettings

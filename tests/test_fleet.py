@@ -13,7 +13,7 @@ from published import Published
 from router_process import ROOT, RouterProcess, running
 
 from gripmon.cli import main
-from gripmon.io.client import Client, NotCarriedOut
+from gripmon.client import Client, NotCarriedOut
 from gripmon.model.records import CommandName
 from gripmon.io.wire import PublishSettings
 from gripmon.io.wire.files import load_file, said

@@ -12,7 +12,7 @@ from loopback import free_endpoint
 from remote_monitor import remote_monitor
 
 from gripmon.cli import main
-from gripmon.io.client import Policy, TransformClient
+from gripmon.client import Policy, TransformClient
 from gripmon.daemon.config import builtin_config
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
@@ -70,6 +70,6 @@ def test_the_example_does_what_the_bound_allows(verdict: str, bound_m: float | N
         robot="arm1", listen=[endpoint], answer={"verdict": verdict, "protection": bound and msgspec.to_builtins(bound)}
     ):
         code = EXAMPLE.replace("tcp/127.0.0.1:7447", endpoint)
-        code = code.replace("from gripmon.io.client import Policy, TransformClient", "from gripmon.io.client import Policy")
+        code = code.replace("from gripmon.client import Policy, TransformClient", "from gripmon.client import Policy")
         exec(code, names | {"TransformClient": Waiting})
     assert did == [done]

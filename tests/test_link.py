@@ -13,7 +13,7 @@ import pytest
 from loopback import WAIT_S, free_endpoint, plain_session, wait_until
 from router_process import RouterProcess, plain_config, running
 
-from gripmon.io.client import Client
+from gripmon.client import Client
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.io.wire.reach import is_at
 

@@ -12,7 +12,7 @@ from loopback import reference_record, state_record
 from stand_ins import ScriptedMonitor
 
 from gripmon.cli import fleet_table
-from gripmon.io.client import MonitorName, MonitorStatus
+from gripmon.client import MonitorName, MonitorStatus
 from gripmon.model.records import AlertKind, MonitorState, Severity, StandingAlert
 
 ROOT = Path(__file__).resolve().parent.parent

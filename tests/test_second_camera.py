@@ -19,7 +19,7 @@ from pulsed_scenes import MOVED, PREFIX, cell, write_config, write_folder
 from rerun.chunk import RrdReader
 
 from gripmon.cli import main
-from gripmon.io.client import Fleet
+from gripmon.client import Fleet
 from gripmon.model.geometry import invert, perturb
 from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, SpotRecord, State, from_json
 

@@ -22,7 +22,7 @@ from router_process import ROOT, running
 from sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
-from gripmon.io.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
+from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
 from gripmon.model.records import CommandName, CommandReply
 from gripmon.io.wire import Link, PublishSettings

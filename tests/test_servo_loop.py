@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.io.client import Policy, Reading
+from gripmon.client import Policy, Reading
 from gripmon.model.geometry import exp_rotation, from_record, invert, make_transform
 from gripmon.model.records import Smoothed, Transform, Verdict
 

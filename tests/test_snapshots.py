@@ -21,7 +21,7 @@ from test_security import own_files
 
 import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
-from gripmon.io.client import Client, NotCarriedOut
+from gripmon.client import Client, NotCarriedOut
 from gripmon.daemon import DaemonSettings, Reports, run
 from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
 from gripmon.io.sources import FolderSettings, FolderSource, Waiting

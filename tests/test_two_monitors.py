@@ -18,10 +18,10 @@ from test_run_on_the_network import configured, running
 from timely import TimelyInbox
 
 from gripmon.cli import main
-from gripmon.io.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, Policy, TransformClient, Unusable
-from gripmon.io.client.inbox import SENDS_S, Inbox
-from gripmon.io.client.judging import judge
-from gripmon.io.client.names import MonitorName, Start
+from gripmon.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, Policy, TransformClient, Unusable
+from gripmon.client.inbox import SENDS_S, Inbox
+from gripmon.client.judging import judge
+from gripmon.client.names import MonitorName, Start
 from gripmon.daemon import Reports
 from gripmon.io.publish.presence import Presence, new_monitor_id
 from gripmon.model.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json

@@ -18,7 +18,7 @@ from loopback import WAIT_S, alert_record, free_endpoint, plain_session, wait_un
 from published import Published
 from remote_monitor import remote_monitor, router
 
-from gripmon.io.client import Condition, Fleet
+from gripmon.client import Condition, Fleet
 from gripmon.io.wire import PublishSettings
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -13,7 +13,7 @@ from loopback import alert_record, state_record
 
 from gripmon.cli import fleet_table
 from gripmon.cli.alert_log import AlertLog
-from gripmon.io.client import Condition, MonitorName, MonitorStatus, trouble
+from gripmon.client import Condition, MonitorName, MonitorStatus, trouble
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
 GONE_NS = 1_700_000_000_000_000_000

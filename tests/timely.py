@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from gripmon.io.client import MonitorName
-from gripmon.io.client.age import Sent
-from gripmon.io.client.inbox import Inbox
+from gripmon.client import MonitorName
+from gripmon.client.age import Sent
+from gripmon.client.inbox import Inbox
 from gripmon.model.records import ClockReading
 
 HOUR_NS = 3600 * 10**9

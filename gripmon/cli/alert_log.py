@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from gripmon.cli.fleet_table import clock, printable
 
 if TYPE_CHECKING:
-    from gripmon.io.client import MonitorName, MonitorStatus
+    from gripmon.client import MonitorName, MonitorStatus
     from gripmon.model.records import AlertRecord
 
 _WAITING_MOST = 100_000  # lines for a file or a pipe that can't be written for a while; beyond it the oldest are lost

@@ -18,7 +18,7 @@ from gripmon.cli.run import run_daemon
 
 if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
-    from gripmon.io.client import Client
+    from gripmon.client import Client
     from gripmon.daemon.config import Config
     from gripmon.model.records import Array, FrameRecord
     from gripmon.simulate import Simulator
@@ -163,7 +163,7 @@ class _Receiver(AbstractContextManager["_Receiver"]):
 
     def connect(self) -> None:
         """Join the network and wait until the monitor is seen there."""
-        from gripmon.io.client import Client
+        from gripmon.client import Client
 
         settings = self._config.settings
         self._client = Client(settings.robot, settings.camera_name, connect=settings.publish.listen, depth=1024)

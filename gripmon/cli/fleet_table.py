@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from gripmon.io.client import MonitorStatus
+    from gripmon.client import MonitorStatus
     from gripmon.model.records import StateRecord
 
 COLUMNS = ("monitor", "state", "verdict", "drift mm", "sigma mm", "bound mm", "fps", "heard s", "reference", "alerts")
@@ -137,7 +137,7 @@ def printable(text: str) -> str:
 
 
 def _order(condition: Any) -> int:
-    from gripmon.io.client import Condition
+    from gripmon.client import Condition
 
     return list(Condition).index(condition)
 

@@ -14,7 +14,7 @@ from gripmon.cli import common, fleet_table, joining
 from gripmon.cli.alert_log import AlertLog
 
 if TYPE_CHECKING:
-    from gripmon.io.client import Fleet, MonitorStatus
+    from gripmon.client import Fleet, MonitorStatus
 
 _DESCRIPTION = """\
 A live table of all monitors on the network, the worst first: those that are gone, silent or have no
@@ -111,7 +111,7 @@ def _open_log(arguments: argparse.Namespace) -> AlertLog:
 
 
 def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
-    from gripmon.io.client import Fleet
+    from gripmon.client import Fleet
     from gripmon.io.wire import PublishError
 
     try:
@@ -137,7 +137,7 @@ def _repeat(act: Callable[[], None], period_s: float, end_s: float | None) -> No
 
 
 def _sorted(fleet: Fleet) -> list[MonitorStatus]:
-    from gripmon.io.client import trouble
+    from gripmon.client import trouble
 
     return sorted(fleet.monitors(), key=trouble)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.io.client import Reading
+from gripmon.client import Reading
 from gripmon.model.geometry import from_record, invert, make_transform
 from gripmon.model.records import Array, Transform, Verdict
 from servoing.arm import Arm, twist_to

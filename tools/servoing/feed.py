@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.io.client import Policy, Reading, TransformClient
+from gripmon.client import Policy, Reading, TransformClient
 from gripmon.daemon.config import Config, load_config
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Array

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.io.client import Policy, Reading
+from gripmon.client import Policy, Reading
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.records import Array, Verdict
 from gripmon.simulate import Simulator

@@ -7,7 +7,7 @@ import math
 
 import msgspec
 
-from gripmon.io.client.names import MonitorName
+from gripmon.client.names import MonitorName
 from gripmon.model.records import Severity, StandingAlert, StateRecord, Verdict
 
 SILENT_AFTER_S = 5.0

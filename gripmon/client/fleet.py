@@ -14,9 +14,9 @@ import msgspec
 import zenoh
 import zenoh.ext
 
-from gripmon.io.client.names import MonitorName, monitor_name, start_of
-from gripmon.io.client.network import named_as_arguments, reader_settings
-from gripmon.io.client.status import MonitorStatus
+from gripmon.client.names import MonitorName, monitor_name, start_of
+from gripmon.client.network import named_as_arguments, reader_settings
+from gripmon.client.status import MonitorStatus
 from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from gripmon.io.client.age import waited_s
-from gripmon.io.client.inbox import Entry, Heard, several
-from gripmon.io.client.reading import Policy, Reading, Unusable, largest_sigma_m
+from gripmon.client.age import waited_s
+from gripmon.client.inbox import Entry, Heard, several
+from gripmon.client.reading import Policy, Reading, Unusable, largest_sigma_m
 from gripmon.model.records import FrameRecord, Verdict
 
 _Refusal = tuple[Unusable, str]

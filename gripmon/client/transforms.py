@@ -10,14 +10,14 @@ from typing import Self
 
 import zenoh
 
-from gripmon.io.client.age import Sent
-from gripmon.io.client.asking import ClockAsker
-from gripmon.io.client.inbox import Entry, Inbox
-from gripmon.io.client.iterators import AsyncReadings, Readings
-from gripmon.io.client.judging import judge
-from gripmon.io.client.names import monitor_name, start_of
-from gripmon.io.client.network import named_as_arguments, reader_settings
-from gripmon.io.client.reading import NotUsable, Policy, Reading
+from gripmon.client.age import Sent
+from gripmon.client.asking import ClockAsker
+from gripmon.client.inbox import Entry, Inbox
+from gripmon.client.iterators import AsyncReadings, Readings
+from gripmon.client.judging import judge
+from gripmon.client.names import monitor_name, start_of
+from gripmon.client.network import named_as_arguments, reader_settings
+from gripmon.client.reading import NotUsable, Policy, Reading
 from gripmon.model.records import ClockReading, MessageRefused, from_json
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
 

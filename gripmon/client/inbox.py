@@ -8,9 +8,9 @@ import weakref
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from gripmon.io.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
-from gripmon.io.client.message import transform_message
-from gripmon.io.client.names import MonitorName, Start
+from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
+from gripmon.client.message import transform_message
+from gripmon.client.names import MonitorName, Start
 from gripmon.model.records import ClockReading, FrameRecord, MessageRefused
 
 _log = logging.getLogger(__name__)

@@ -11,8 +11,8 @@ from typing import Self, TypeVar
 import msgspec
 import zenoh
 
-from gripmon.io.client.names import MonitorName, Start, monitor_name, start_of
-from gripmon.io.client.network import named_as_arguments, reader_settings
+from gripmon.client.names import MonitorName, Start, monitor_name, start_of
+from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.model.records import (
     CommandError,
     CommandFault,

@@ -9,8 +9,8 @@ import time
 from collections import deque
 from typing import Protocol, Self
 
-from gripmon.io.client.inbox import Entry
-from gripmon.io.client.reading import Policy, Reading
+from gripmon.client.inbox import Entry
+from gripmon.client.reading import Policy, Reading
 from gripmon.model.records import Verdict
 
 _LATE_S = 1e-3  # to be past the end of a time and not just before it

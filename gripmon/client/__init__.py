@@ -1,6 +1,6 @@
 """For programs that use the corrected transform, such as servo controllers.
 
-    from gripmon.io.client import TransformClient
+    from gripmon.client import TransformClient
 
     with TransformClient("arm1", "wrist") as monitor:
         reading = monitor.latest()  # at once, whatever the network does
@@ -16,12 +16,12 @@ to start, and nothing needs help when a monitor or a router ends and comes again
 
 from __future__ import annotations
 
-from gripmon.io.client.fleet import Fleet
-from gripmon.io.client.names import MonitorName
-from gripmon.io.client.reader import Ambiguous, Client, NotCarriedOut
-from gripmon.io.client.reading import NotUsable, Policy, Reading, Unusable
-from gripmon.io.client.status import Condition, MonitorStatus, trouble
-from gripmon.io.client.transforms import TransformClient
+from gripmon.client.fleet import Fleet
+from gripmon.client.names import MonitorName
+from gripmon.client.reader import Ambiguous, Client, NotCarriedOut
+from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
+from gripmon.client.status import Condition, MonitorStatus, trouble
+from gripmon.client.transforms import TransformClient
 
 __all__ = [
     "Ambiguous",

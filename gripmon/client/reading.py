@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from gripmon.io.client.names import MonitorName
+from gripmon.client.names import MonitorName
 from gripmon.model.records import Origin, Protection, Smoothed, State, Transform, Verdict
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
 
     ``usable``: the policy allows it; else ``why`` says in a word and ``reason`` in a line why not.  ``age_s`` bounds
     the time since the monitor was handed the frame: what it needed for it, how long the message was on its way at most
-    (:mod:`gripmon.io.client.age`), and the time since it arrived; the way of the image into the monitor is not in it.
+    (:mod:`gripmon.client.age`), and the time since it arrived; the way of the image into the monitor is not in it.
     Infinite if no transform came yet, or nothing tells how long it was on its way.  ``stamp_ns`` is the capture time by
     the monitor's clock, ``monitor_id`` the start of the monitor that it is from.
     """
