@@ -12,8 +12,8 @@ from published import Published
 from stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
-from gripmon.model.geometry import make_transform, to_record
 from gripmon.io.wire import PublishSettings
+from gripmon.model.geometry import make_transform, to_record
 
 # A third of a turn about (1, 1, 1) after a turn about x: no component of its quaternion is like another.
 ROTATION = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]) @ np.array(

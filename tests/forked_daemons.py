@@ -15,11 +15,6 @@ if __name__ == "__main__":
     config = sys.argv[1]
     import cv2
 
-    import gripmon.daemon
-    import gripmon.monitor
-    import gripmon.io.publish
-    import gripmon.judge.statefile  # noqa: F401
-
     cv2.setNumThreads(1)
     for _ in sys.stdin:
         pid = os.fork()

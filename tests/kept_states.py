@@ -9,11 +9,11 @@ import numpy as np
 import yaml
 
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.judge.references import ReferenceBook
+from gripmon.judge.statefile import StateFile
 from gripmon.model.geometry import from_record
 from gripmon.model.records import MonitorState
-from gripmon.judge.references import ReferenceBook
 from gripmon.simulate import Simulator, make_scenario
-from gripmon.judge.statefile import StateFile
 
 DIFFERENT = 12
 """Pictures of one place: so many that one that comes again is not taken for a frozen camera's."""

@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 from gripmon.model.camera import Camera, FisheyeLens, LensSettings, make_camera
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Image
 from gripmon.simulate import Scenario, Simulator
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 
 FISHEYE_LENS = FisheyeLens(
     width_px=768,

@@ -1,4 +1,4 @@
-"""Images of calibration plates, by ray casting through :mod:`gripmon.model.camera`: nothing of the detection is in here."""
+"""Images of calibration plates, ray cast through :mod:`gripmon.model.camera`: nothing of the detection is in here."""
 
 from __future__ import annotations
 

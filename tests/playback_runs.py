@@ -23,7 +23,6 @@ from recorded import (
     wait_until,
 )
 
-from gripmon.record.write import ProcessRecorder, open_recorder
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -43,6 +42,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.record.write import ProcessRecorder, open_recorder
 
 FILES, FRAMES_A_BATCH = 3, 60
 MESSAGE = struct.Struct("<QQ")

@@ -11,10 +11,10 @@ from laser_scenes import paper_setup, sampled
 from gripmon.laser.pointer.calibrating import Spots, calibrate
 from gripmon.laser.pointer.document import LaserCalibration, document
 from gripmon.laser.pointer.setup import LaserSetup
-from gripmon.model.geometry import invert, perturb
-from gripmon.model.provenance import provenance_of
 from gripmon.laser.watch import SpotSeen, plain_spot
 from gripmon.laser.watch.world import Calibrated, World, calibrated, foresee
+from gripmon.model.geometry import invert, perturb
+from gripmon.model.provenance import provenance_of
 
 NOISE_PX = 0.3
 AXES = np.eye(13)

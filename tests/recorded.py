@@ -15,7 +15,6 @@ import numpy as np
 from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, to_record
 from gripmon.model.gripper import load_gripper
-from gripmon.record.write import ProcessRecorder, RecordingSettings, open_recorder
 from gripmon.model.records import (
     Alert,
     CornerFault,
@@ -31,6 +30,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
+from gripmon.record.write import ProcessRecorder, RecordingSettings, open_recorder
 
 START_NS = 1_700_000_000_123_456_789
 OVERLAY = "rig/camera/image"

@@ -20,8 +20,8 @@ from published import Published
 from stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
-from gripmon.model.records import FrameRecord
 from gripmon.io.wire import PublishSettings
+from gripmon.model.records import FrameRecord
 
 _HERE = Path(__file__).resolve().parent
 _ROUTER = """

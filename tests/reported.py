@@ -10,7 +10,6 @@ import numpy as np
 import recorded
 
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, rotation_angle, to_record
-from gripmon.record.read import FrameTable, Picture
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -30,6 +29,7 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
+from gripmon.record.read import FrameTable, Picture
 
 FPS = 50
 PERIOD_NS = 1_000_000_000 // FPS

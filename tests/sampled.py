@@ -9,13 +9,13 @@ from meters import box_gripper, difference
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Image
+from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
 from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Votes
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.uncertainty import Uncertainty
-from gripmon.model.gripper import Gripper
-from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
-from gripmon.model.records import Image
 
 # Floors out of the way: edge points have the assumed standard deviation and nothing beside.
 INDEPENDENT = MeasurementSettings(consensus=ConsensusSettings(point_floor_px=0.005, edge_floor_px=0.0))

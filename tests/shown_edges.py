@@ -12,8 +12,8 @@ from box_models import two_fingers_model
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.judge.causes import CauseJudge, CauseSettings
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Cause, EdgeEvidence
 

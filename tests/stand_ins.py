@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from loopback import frame_record, reference_record
 
-from gripmon.record.write import Notes, Trace
+from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     AlertRecord,
     Command,
@@ -26,7 +26,7 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.io.sources import Waiting
+from gripmon.record.write import Notes, Trace
 
 REFUSED = {
     "verdict": Verdict.UNKNOWN,

@@ -6,6 +6,12 @@ from pathlib import Path
 
 from test_references import book_of, configured, propose
 
+from gripmon.judge.statefile import (
+    Calibration,
+    Owner,
+    StateFile,
+    pack,
+)
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -15,12 +21,6 @@ from gripmon.model.records import (
     OpenAlert,
     Severity,
     Transform,
-)
-from gripmon.judge.statefile import (
-    Calibration,
-    Owner,
-    StateFile,
-    pack,
 )
 
 OWNER = Owner("arm", "wrist", Calibration("c", "g", "r"))

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from simulated import nominal_cam_T_grip, sharp_gripper
 
+from gripmon.judge.recalibrate import StillFrame
 from gripmon.model.geometry import perturb, skew, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.judge.recalibrate import StillFrame
 from gripmon.model.records import EdgeSums, ReferenceRecord
 
 FOCAL_PX = 962.0

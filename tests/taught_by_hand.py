@@ -11,13 +11,13 @@ import numpy as np
 import yaml
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 
-from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
+from gripmon.io.sources.folder import read_image
+from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Image
-from gripmon.io.sources.folder import read_image
 
 SCENARIO = {
     "name": "table",

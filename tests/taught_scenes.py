@@ -11,13 +11,13 @@ from meters import JAW_SIGMA_M, NARROW, USUAL_SHARE, box_gripper, difference
 from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, JawScript
 from gripmon.teach.edges import Taught, TeachingImage, teach
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
 
 CAMERA = make_camera(PAPER_LENS)
 OPENING_M = 0.034

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.track.integrity import hypotheses_of
 from gripmon.monitor.anchor import CONFIRMED, Anchor, Lasting
+from gripmon.track.integrity import hypotheses_of
 
 NAMES = ("a_out", "a_in", "a_tip", "a_side", "b_out", "b_in", "b_tip", "b_side")
 FINGER = np.array([0, 0, 0, 0, 1, 1, 1, 1])

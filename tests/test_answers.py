@@ -14,8 +14,8 @@ from published import Published
 
 from gripmon.io.publish.answers import _WAITING_MOST, Answers
 from gripmon.io.publish.commands import PendingCommand
-from gripmon.model.records import Command, CommandName, CommandReply
 from gripmon.io.wire import PublishSettings
+from gripmon.model.records import Command, CommandName, CommandReply
 
 
 class StalledQuery:

@@ -15,7 +15,6 @@ from watched import frames_of, new_monitor, reference_of, replaced
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import gripper_from_dict
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -28,6 +27,7 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.monitor import Monitor, MonitorSettings
 
 HEIGHT, WIDTH = PAPER_LENS.height_px, PAPER_LENS.width_px
 

@@ -23,18 +23,18 @@ from gripmon.calibrate.documents import (
     HandEyeCalibration,
     HandEyeResiduals,
 )
-from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.cli import main
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.judge.statefile import Calibration, Owner, pack
+from gripmon.model.camera import BrownConradyLens, LensSettings
 from gripmon.model.geometry import perturb, to_record
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
 from gripmon.model.records import Cause, MonitorState, ReferenceRecord, to_json
 from gripmon.simulate.scenario import Sensor
-from gripmon.judge.statefile import Calibration, Owner, pack
+from gripmon.track.edges.taught import gripper_digest
 
 TRUE = nominal_cam_T_grip()
 BROWN = BrownConradyLens(

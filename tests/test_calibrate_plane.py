@@ -20,10 +20,10 @@ from gripmon.daemon.config import load_config, read_gripper
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import contents_of
 from gripmon.model.provenance import provenance_of, sha256_of
+from gripmon.track.edges.taught import gripper_digest
 
 TRUE = nominal_cam_T_grip()
 TARGET = "circles:12x10:0.008:0.004"

@@ -13,8 +13,8 @@ from box_models import cube_model
 from shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_seen, knocked, told, two_fingers
 from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
-from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.judge.causes import CauseSettings
+from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Cause
 

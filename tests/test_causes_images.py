@@ -13,13 +13,13 @@ from shown_edges import OPENING_M, REFERENCE_SIGMA
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import new_monitor
 
-from gripmon.model.camera import make_camera
 from gripmon.judge.causes import CauseJudge, CauseSettings
-from gripmon.track.edges import FingertipMeter
-from gripmon.monitor import MonitorSettings
+from gripmon.model.camera import make_camera
 from gripmon.model.records import Cause, EdgeEvidence, Explanation, Image
+from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, BentFinger, Cover, Defocus, ObjectLook, Prop, Tilt
+from gripmon.track.edges import FingertipMeter
 
 FPS, WELL, AFTER = 30.0, 6, 5
 AT_S = (WELL - 0.5) / FPS

@@ -10,8 +10,8 @@ from loopback import frame_record, free_endpoint, plain_session, reference_recor
 from published import Published
 
 from gripmon.client import Client, MonitorName, TransformClient
-from gripmon.model.records import FrameRecord, MessageRefused
 from gripmon.io.wire import PublishError, PublishSettings
+from gripmon.model.records import FrameRecord, MessageRefused
 
 
 @pytest.fixture

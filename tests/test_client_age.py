@@ -14,8 +14,8 @@ from gripmon.client import MonitorName, Policy, Reading, Unusable
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted
 from gripmon.client.inbox import HELD_BACK_S, Entry, Inbox
 from gripmon.client.judging import judge
-from gripmon.model.records import ClockReading, to_json
 from gripmon.io.wire import MOST_DRIFT
+from gripmon.model.records import ClockReading, to_json
 
 WRIST = MonitorName("arm", "wrist")
 MS = 10**6

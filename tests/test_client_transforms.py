@@ -12,8 +12,8 @@ from loopback import WAIT_S, frame_record, free_endpoint, wait_until
 from published import Published
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
-from gripmon.model.records import Verdict
 from gripmon.io.wire import PublishSettings
+from gripmon.model.records import Verdict
 
 PATIENT = Policy(max_age_s=3600.0)
 

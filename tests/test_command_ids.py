@@ -17,8 +17,8 @@ from published import Published
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.io.publish.commands import ZenohCommands
-from gripmon.model.records import Command, CommandFault, CommandName, CommandReply
 from gripmon.io.wire import Keys, Link, PublishSettings
+from gripmon.model.records import Command, CommandFault, CommandName, CommandReply
 
 
 def asked_with(request_id: str, argument: str = "") -> bytes:

@@ -16,8 +16,8 @@ from published import Published
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.io.publish.commands import ZenohCommands
-from gripmon.model.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
 from gripmon.io.wire import Keys, Link, PublishSettings
+from gripmon.model.records import Command, CommandFault, CommandName, CommandReply, MonitorState, to_json
 
 
 @pytest.mark.parametrize("name", list(CommandName))

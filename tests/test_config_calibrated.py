@@ -15,11 +15,11 @@ from simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.daemon.config import ConfigError, load_config
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.judge.statefile import calibration_of
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.model.provenance import provenance_of
-from gripmon.judge.statefile import calibration_of
+from gripmon.track.edges.taught import gripper_digest
 
 ARM, CAM, HE = "arm.yaml", "camera.yaml", "hand_eye.yaml"
 COVARIANCE = tuple(np.diag([1e-10] * 3 + [1e-8] * 3).ravel().tolist())

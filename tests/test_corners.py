@@ -12,13 +12,13 @@ from scipy.spatial.transform import Rotation
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
-from gripmon.track.edges.consensus import ConsensusSettings
-from gripmon.track.edges.lines import CornerSettings
 from gripmon.model.gripper import Gripper, gripper_from_dict
 from gripmon.model.records import CornerFault
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import BentFinger, JawScript
+from gripmon.track.edges import Measurement, MeasurementSettings, agreeing_fingers, trace_of
+from gripmon.track.edges.consensus import ConsensusSettings
+from gripmon.track.edges.lines import CornerSettings
 
 PLAIN = plain_scenario()
 IDS = box_gripper().corner_ids

@@ -19,6 +19,7 @@ from loopback import frame_record, reference_record
 from stand_ins import REFUSED, ScriptedMonitor
 
 from gripmon.daemon import EstimatesFile, Reports, log_to_stderr
+from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -35,7 +36,6 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.io.sources import Waiting
 
 
 def test_every_frame_is_published_recorded_and_written_in_order(tmp_path: Path):

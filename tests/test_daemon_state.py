@@ -12,6 +12,7 @@ from loopback import frame_record, reference_record, wait_until
 from stand_ins import ScriptedMonitor
 
 from gripmon.daemon import StateKeeper, supervised
+from gripmon.io.sources import Waiting
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -26,7 +27,6 @@ from gripmon.model.records import (
     RecordedCommand,
     Severity,
 )
-from gripmon.io.sources import Waiting
 
 UNDO = Command(CommandName.UNDO)
 REFUSED_COMMAND = Command(CommandName.ACCEPT, "p-1")

@@ -21,9 +21,6 @@ import pytest
 import sample_messages
 from loopback import frame_record, reference_record, state_record
 
-from gripmon.record.export import SCHEMAS, Exporter
-from gripmon.record.export.export import ROWS_A_GROUP
-from gripmon.record.read import FrameTable
 from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
@@ -36,6 +33,9 @@ from gripmon.model.records import (
     Verdict,
 )
 from gripmon.model.records.recorded import Meta, RecordedCommand
+from gripmon.record.export import SCHEMAS, Exporter
+from gripmon.record.export.export import ROWS_A_GROUP
+from gripmon.record.read import FrameTable
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
 DUCKDB, POLARS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -287,7 +287,7 @@ def test_the_page_lists_every_column():
 def test_the_schema_says_units_version_and_itself(tmp_path: Path):
     export(tmp_path, Run(moving(3)))
     schema = pq.read_schema(tmp_path / "frames" / files(tmp_path)[0])
-    assert schema.metadata[b"gripmon.schema"] == b"gripmon.record.export.frames/1" and schema.metadata[b"gripmon.version"]
+    assert schema.metadata[b"gripmon.schema"] == b"gripmon.export.frames/1" and schema.metadata[b"gripmon.version"]
     units = json.loads(schema.metadata[b"gripmon.units"])
     for name in schema.names:
         for suffix in ("m", "rad", "px", "ns"):

@@ -16,8 +16,8 @@ from loopback import WAIT_S, state_record
 from recorded import INTERVAL_NS, frame, record, recorder, trace, wait_until
 
 from gripmon.cli import main
-from gripmon.record.read import open_recordings
 from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, Severity, State, to_json
+from gripmon.record.read import open_recordings
 
 ROOT = Path(__file__).resolve().parent.parent
 COUNT = 400

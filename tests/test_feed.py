@@ -13,9 +13,9 @@ import pytest
 from loopback import free_endpoint, wait_until
 
 from gripmon.cli import main
-from gripmon.model.records import Frame
 from gripmon.io.sources import NetworkCamera, NetworkSettings
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.records import Frame
 
 SIZE_PX = (48, 32)
 KEY = "gripmon/arm/wrist/image"

@@ -12,11 +12,11 @@ from meters import NARROW, box_gripper, measure, meter, picture
 from simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import make_camera
-from gripmon.track.edges import FingerEndsSeen, Measurement
-from gripmon.track.edges.ends import along_fingers
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.simulate import Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, FingerMark, ObjectLook, Prop
+from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.edges.ends import along_fingers
 
 PLAIN = plain_scenario()
 CUBE = Path(__file__).parent.parent / "configs" / "grippers" / "visp_cube.yaml"

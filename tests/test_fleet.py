@@ -14,9 +14,9 @@ from router_process import ROOT, RouterProcess, running
 
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
-from gripmon.model.records import CommandName
 from gripmon.io.wire import PublishSettings
 from gripmon.io.wire.files import load_file, said
+from gripmon.model.records import CommandName
 
 PREFIX = "gripmon/arm/wrist"
 UPWARD, LOCAL = ("state", "alert", "reference"), ("transform", "jaw", "image")

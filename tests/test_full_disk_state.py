@@ -19,10 +19,10 @@ from small_disks import fill, small_disk
 from test_killed import PREFIX, Witness
 from watched import frames_of, reference_of
 
-from gripmon.model.camera import make_camera
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.model.camera import make_camera
 from gripmon.model.records import AlertEvent, AlertKind, CommandReply, Origin, ReferenceRecord, from_json
+from gripmon.monitor import Monitor, MonitorSettings
 
 KNOCKED = {
     "policy": {"limit_m": 0.001, "settle_frames": 4, "confirm_frames": 1},

@@ -17,12 +17,12 @@ from rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, ima
 
 from gripmon.io.publish.commands import _name, _request
 from gripmon.io.publish.jaw import JawError, opening_of_joints, opening_of_json
-from gripmon.model.records import CommandError, CommandFault, CommandRequest
 from gripmon.io.ros2 import JointOpening
 from gripmon.io.ros2.types import typestore
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError
 from gripmon.io.wire import Keys
+from gripmon.model.records import CommandError, CommandFault, CommandRequest
 
 MOST_GROWTH_BYTES = 48 << 20
 """Of the resident memory; one frame that is kept of each hundred would be more."""

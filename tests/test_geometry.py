@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import RigidTransform, Rotation
 
-from gripmon import geometry
+from gripmon.model import geometry
 from gripmon.model.records import Array
 
 ANGLES_RAD = [0.0, 1e-300, 1e-17, 1e-12, 9e-9, 1.1e-8, 1e-6, 1e-3, 0.5, 2.0, 3.0]

@@ -13,10 +13,10 @@ from meters import box_gripper, difference, picture
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 from watched import pose_of, reference_of
 
-from gripmon.model.camera import make_camera
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.policy import PolicySettings
+from gripmon.model.camera import make_camera
 from gripmon.model.records import AlertEvent, AlertKind, CornerFault, Frame, FrameRecord, Origin, State, Verdict
+from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate.scenario import Sensor
 
 SCENE = plain_scenario(sensor=Sensor())

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gripmon_process import gripmon
 
-from gripmon.cli import main
 from gripmon.calibrate.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
+from gripmon.cli import main
 from gripmon.io.sources import FolderSettings, FolderSource, SourceError
 from gripmon.io.sources.pulses import read_pulses
 

@@ -7,9 +7,9 @@ import pytest
 from box_models import cube_model
 from simulated import PAPER_LENS, sharp_gripper
 
+from gripmon.judge.inspection import inspect
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import gripper_from_dict
-from gripmon.judge.inspection import inspect
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Frame, Refusal
 

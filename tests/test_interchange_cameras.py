@@ -14,10 +14,10 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.calibrate.interchange.cameras import FORMATS, ReadOptions, format_of, read_camera, write_camera
 from gripmon.calibrate.interchange.fault import InterchangeError
 from gripmon.calibrate.interchange.fitting import fit_brown_conrady
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 
 SIZE = {"width_px": 1280, "height_px": 962}
 PINHOLE = {"fx_px": 1203.0 + 1.0 / 3.0, "fy_px": 1199.5, "cx_px": 641.0000000000001, "cy_px": 470.7, **SIZE}

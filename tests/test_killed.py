@@ -18,9 +18,9 @@ import zenoh
 from kept_states import configuration, keep, make_pictures
 from loopback import free_endpoint, plain_session, wait_until
 
-from gripmon.model.records import CommandReply, FrameRecord, MonitorState, ReferenceRecord
 from gripmon.judge.references import state_fault
 from gripmon.judge.statefile import unpack
+from gripmon.model.records import CommandReply, FrameRecord, MonitorState, ReferenceRecord
 
 HERE = Path(__file__).resolve().parent
 PREFIX = "gripmon/demo/wrist"

@@ -7,6 +7,7 @@ import pytest
 from laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import closed_form, common_plane
 from gripmon.laser.pointer.planar_start import planar_start
 from gripmon.laser.pointer.refinement import refine
@@ -21,7 +22,6 @@ from gripmon.laser.pointer.setup import (
     spots_on_rays,
 )
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturb
 
 

@@ -16,9 +16,9 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
+from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.model.geometry import invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
 

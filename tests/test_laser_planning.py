@@ -9,11 +9,11 @@ import pytest
 from laser_scenes import paper_setup, sampled
 from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # noqa: F401 - camera is a fixture
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.planning import Arm, candidates, plan
 from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.setup import spots_on_plane
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturbation_between
 
 

@@ -7,6 +7,8 @@ import pytest
 from laser_scenes import PAPER_LENS, assert_same, numeric, scene
 from scipy.stats import f as fisher_f
 
+from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane, refinement
 from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions
 from gripmon.laser.pointer.held_lens import with_held_lens
@@ -16,8 +18,6 @@ from gripmon.laser.pointer.setup import (
     LaserSetup,
 )
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
-from gripmon.calibrate.lens_models import LensModel
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturb, perturbation_between
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from laser_images import cluttered, spot_image
 
-from gripmon.laser.pointer.spots import find_spots
 from gripmon.calibrate.sighting import NotFound
+from gripmon.laser.pointer.spots import find_spots
 
 
 def errors(trials=30, *, off=False, **options):

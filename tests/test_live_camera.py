@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gripmon.model.records import Frame
 from gripmon.io.sources import LiveCamera, LiveSettings, SourceError, Waiting, open_source
 from gripmon.io.sources.live import Backoff, shown_name
+from gripmon.model.records import Frame
 
 PERIOD_S = 0.02
 

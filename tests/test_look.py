@@ -11,8 +11,6 @@ from simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, load_gripper
-from gripmon.track.look import GripperLook, LookAgreement, LookRefused
-from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
 from gripmon.model.records import LookRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import (
@@ -27,6 +25,8 @@ from gripmon.simulate.scenario import (
     LightStep,
     Shadow,
 )
+from gripmon.track.look import GripperLook, LookAgreement, LookRefused
+from gripmon.track.look.core import FEWEST_VIEWS, FORGET_S, LAY_OUT_AGAIN_S
 
 RISK = 1e-5
 LEARNT = 16

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from simulated import nominal_cam_T_grip
 from watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, watch, watched
 
-from gripmon.model.geometry import invert
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.model.geometry import invert
 from gripmon.model.records import AlertEvent, AlertKind, Cause, CornerFault, Origin, State, Verdict, to_json
+from gripmon.monitor import Monitor, MonitorSettings
 
 MICROMETRES = 1e-6
 

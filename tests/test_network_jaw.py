@@ -62,7 +62,7 @@ def test_a_message_or_a_number_of_metres():
         arm.says(json.dumps({"stamp_ns": 1, "opening_m": 0.02}), 0.02)
         arm.says(" 3.5e-2\n", 0.035)
         arm.says("0", 0.0)
-        arm.says(b'\n {"schema": "gripmon.track.jaw/1", "opening_m": 0.01, "stamp_ns": 0, "more": [1]}', 0.01)
+        arm.says(b'\n {"schema": "gripmon.jaw/1", "opening_m": 0.01, "stamp_ns": 0, "more": [1]}', 0.01)
         assert arm.jaw.malformed == 0 and arm.jaw.fault() == ""
 
 
@@ -72,7 +72,7 @@ def test_no_opening_of_this_gripper_is_refused_and_the_last_one_stays():
         arm.says("0.034", 0.034)
         wrong = ["34", "-0.002", "0.0611", "1e308", "NaN", "Infinity", "1e999", "nan", "", "[0.03]", '"0.03"', "null"]
         wrong += ["true", '{"opening_m": 0.03}', '{"stamp_ns": 1, "opening_m": 34}', "0.03 0.03", "9" * 5000]
-        wrong += ['{"stamp_ns": 1, "opening_m": 0.02, "schema": "gripmon.track.jaw/2"}', "[" * 3000]
+        wrong += ['{"stamp_ns": 1, "opening_m": 0.02, "schema": "gripmon.jaw/2"}', "[" * 3000]
         for payload in wrong:
             arm.errs(payload)
         assert arm.jaw.opening_m() == 0.034

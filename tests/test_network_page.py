@@ -15,11 +15,11 @@ from loopback import WAIT_S, free_endpoint, wait_until
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.config.settings import JawSettings
 from gripmon.daemon.config.typed import to_settings
-from gripmon.model.pixels import ENCODINGS
-from gripmon.model.records import Frame, FrameNote, from_json
 from gripmon.io.sources import NetworkCamera, NetworkSettings, SourceSettings
 from gripmon.io.sources.payload import raw_image
 from gripmon.io.wire import DEFAULT_ENDPOINT, Link, PublishSettings
+from gripmon.model.pixels import ENCODINGS
+from gripmon.model.records import Frame, FrameNote, from_json
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs"

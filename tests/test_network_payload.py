@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
-from gripmon.model.pixels import ENCODINGS
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError
+from gripmon.model.pixels import ENCODINGS
 
 
 def decoded(

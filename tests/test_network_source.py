@@ -17,7 +17,6 @@ from loopback import WAIT_S, free_endpoint, plain_session, wait_until
 from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.io.publish.frames import FramePublisher, raw_encoding
-from gripmon.model.records import Frame, Refusal
 from gripmon.io.sources import (
     READ_TIMEOUT_S,
     LiveSettings,
@@ -30,6 +29,7 @@ from gripmon.io.sources import (
 )
 from gripmon.io.sources.network import clock_fault
 from gripmon.io.wire import Keys, Link, PublishSettings, malformed
+from gripmon.model.records import Frame, Refusal
 
 KEY = "cell/camera"
 

@@ -8,12 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from gripmon.model.records import Frame
 from gripmon.io.sources import (
     READ_TIMEOUT_S,
     NewestFrame,
     Waiting,
 )
+from gripmon.model.records import Frame
 
 
 class ScriptedReader:

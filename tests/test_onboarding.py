@@ -31,11 +31,11 @@ from gripmon.calibrate.targets import CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper, contents_of, load_gripper
-from gripmon.teach.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of
-from gripmon.teach.onboarding.outlines import inferred_model, points_in_gripper
 from gripmon.model.records import Image
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.background import _TILE_PX
+from gripmon.teach.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of
+from gripmon.teach.onboarding.outlines import inferred_model, points_in_gripper
 
 TRUE = nominal_cam_T_grip()
 TARGETS: dict[str, Target] = {"discs": DISCS, "chequerboard": CHEQUERBOARD, "charuco": CHARUCO}

@@ -14,13 +14,13 @@ from sampled import INDEPENDENT, OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
 from watched import reference_of, watched
 
-from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.track.edges import MeasurementSettings
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.forecast import Outlook, expect, weakest_direction
+from gripmon.track.edges import MeasurementSettings
 
 
 def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> Outlook:

@@ -25,8 +25,8 @@ from playback_runs import (
 )
 from recorded import REFERENCE, frame, image, record, trace, wait_until
 
-from gripmon.record.read import FrameTable, Recording, decode_image, open_recordings, recordings_below
 from gripmon.model.records import to_json
+from gripmon.record.read import FrameTable, Recording, decode_image, open_recordings, recordings_below
 
 
 @pytest.fixture(scope="module")

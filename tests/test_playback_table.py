@@ -11,8 +11,8 @@ from playback_runs import lines, records_of_a_run
 from recorded import record
 
 from gripmon.model.geometry import from_record
-from gripmon.record.read import FrameTable
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json
+from gripmon.record.read import FrameTable
 
 
 @pytest.fixture(scope="module")

@@ -10,10 +10,10 @@ from meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import Camera, LensSettings, make_camera
+from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 from gripmon.track.edges.lines import CornerGeometry, CornerSettings
 from gripmon.track.edges.prediction import FEWEST_SAMPLES, Prediction, SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
-from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
 
 LENSES = [PAPER_LENS, STRONG_LENS, FISHEYE_LENS]
 LENS_NAMES = ["paper", "brown_conrady", "fisheye"]

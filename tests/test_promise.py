@@ -13,9 +13,9 @@ import pytest
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
+from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
 
 DEMO = builtin_config("demo.yaml")
 

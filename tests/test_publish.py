@@ -23,8 +23,8 @@ from loopback import (
 from published import Published
 
 from gripmon.io.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
-from gripmon.model.records import Verdict
 from gripmon.io.wire import Keys, PublishError, PublishSettings
+from gripmon.model.records import Verdict
 
 PREFIX = "gripmon/arm/wrist"
 

@@ -10,13 +10,13 @@ import pytest
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 from still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.gripper import load_gripper
 from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool
 from gripmon.judge.recalibrate.recalibrator import UNLIKELY
 from gripmon.judge.recalibrate.stills import LASTING as LASTING_PART
 from gripmon.judge.recalibrate.stills import NEIGHBOURS, average, averaged_covariance, mean_corners
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import load_gripper
 
 SURE = RecalibrationSettings(sure_sigma_m=1e-4)
 CUBE = Path(BOX_FINGERS).parent / "visp_cube.yaml"

@@ -30,7 +30,6 @@ from recorded import (
 )
 
 from gripmon.model.geometry import rotation_from_xyzw
-from gripmon.record.write import NullRecorder, RecordingSettings, open_recorder
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -41,6 +40,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
+from gripmon.record.write import NullRecorder, RecordingSettings, open_recorder
 
 COUNT = 24
 JUMP = Alert(AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.ERROR, "moved by 4.5 mm")

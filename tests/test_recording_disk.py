@@ -20,9 +20,9 @@ from recorded import Recorded, frame, record, recorder, trace, wait_until
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
+from gripmon.model.records import AlertEvent, AlertKind, Severity
 from gripmon.record.write import ProcessRecorder
 from gripmon.record.write.health import SILENT_AFTER_S, Health
-from gripmon.model.records import AlertEvent, AlertKind, Severity
 
 LONG_S = 60.0
 

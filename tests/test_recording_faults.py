@@ -34,11 +34,11 @@ from recorded import (
 )
 
 from gripmon.model.geometry import make_transform, to_record
+from gripmon.model.records import ReferenceRecord
 from gripmon.record.write import ProcessRecorder
 from gripmon.record.write.files import FileSeries
 from gripmon.record.write.rows import Row
 from gripmon.record.write.wire import make_scene
-from gripmon.model.records import ReferenceRecord
 
 HERE = Path(__file__).parent
 

@@ -28,6 +28,7 @@ from recorded import (
     wait_until,
 )
 
+from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
 from gripmon.record.write import ProcessRecorder, RecordingSettings
 from gripmon.record.write.budget import claim
 from gripmon.record.write.columns import Picture, Row
@@ -35,7 +36,6 @@ from gripmon.record.write.files import FileSeries
 from gripmon.record.write.pins import Pinned, is_pinned, pin_path, pinned_by
 from gripmon.record.write.ring import Moments, PictureRing, Trigger
 from gripmon.record.write.wire import make_scene
-from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Cause, Severity, State
 
 BUMP = Alert(
     AlertKind.STEP, Cause.CAMERA_MOUNT, Severity.WARNING, "moved by 4.5 mm", AlertEvent.RAISED, "1-abc", since_ns=1

@@ -16,9 +16,9 @@ from gripmon_process import gripmon
 from recorded import Recorded, frame, image, record, recorder, trace, wait_until
 
 from gripmon.daemon.config import builtin_config
+from gripmon.model.records import Alert, AlertKind, Cause, Severity
 from gripmon.record.read import open_recordings
 from gripmon.record.write import ProcessRecorder
-from gripmon.model.records import Alert, AlertKind, Cause, Severity
 
 DRIFT = Alert(AlertKind.DRIFT, Cause.UNKNOWN, Severity.WARNING, "off")
 PICTURE = image(0)

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from recorded import HEIGHT_PX, WIDTH_PX
 
+from gripmon.model.records import State, Verdict
 from gripmon.record.write import palette
 from gripmon.record.write.overlay import _label_places
 from gripmon.record.write.wire import ImageRing, Unframer, framed
 from gripmon.record.write.worker import to_8_bit
-from gripmon.model.records import State, Verdict
 
 
 @given(st.lists(st.binary(max_size=300), max_size=20), st.integers(1, 64))

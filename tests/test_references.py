@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gripmon.model.records import Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform
 from gripmon.judge.references import KEPT, CommandRefused, ReferenceBook, chain_fault, state_fault
+from gripmon.model.records import Cause, MonitorState, ReferenceInputs, ReferenceRecord, Transform
 
 COVARIANCE = np.diag([1e-10, 2e-10, 9e-10, 1e-8, 2e-8, 3e-8])
 INPUTS = ReferenceInputs(10, 40, 31, ("L_in_near",), 0.98, 0.0045, 0.002)

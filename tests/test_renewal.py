@@ -9,8 +9,6 @@ from policy_runs import explained
 from simulated import nominal_cam_T_grip
 from watched import reference_of
 
-from gripmon.monitor import MonitorSettings
-from gripmon.monitor.renewal import Renewal
 from gripmon.judge.policy import Policy
 from gripmon.judge.recalibrate import Proposal, Refusal
 from gripmon.judge.recalibrate.recalibrator import RefusalReason
@@ -25,6 +23,8 @@ from gripmon.model.records import (
     Explanation,
     ReferenceInputs,
 )
+from gripmon.monitor import MonitorSettings
+from gripmon.monitor.renewal import Renewal
 
 K, RAISED, CLEARED, NOTED = AlertKind, AlertEvent.RAISED, AlertEvent.CLEARED, AlertEvent.NOTED
 DRIFT = Drift(0.003, 0.0, (0.003, 0.0, 0.0))

@@ -20,8 +20,8 @@ from loopback import frame_record
 
 from gripmon.cli import main
 from gripmon.cli.replay import _Counts
-from gripmon.monitor import Monitor
 from gripmon.model.records import Frame, FrameRecord, Origin, Refusal
+from gripmon.monitor import Monitor
 
 ROOT = Path(__file__).resolve().parent.parent
 CONTRACT = {

@@ -25,7 +25,7 @@ from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
-from gripmon.record.write import open_recorder
+from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -38,7 +38,7 @@ from gripmon.model.records import (
     Severity,
     Verdict,
 )
-from gripmon.io.sources.folder import FolderSettings, FolderSource
+from gripmon.record.write import open_recorder
 
 WARNED = Alert(
     AlertKind.CREEP, Cause.UNKNOWN, Severity.WARNING, "a creep", event=AlertEvent.RAISED, alert_id="1-a", since_ns=1

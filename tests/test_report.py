@@ -13,8 +13,10 @@ import pytest
 from loopback import state_record
 from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
+from gripmon.analyse.report import Report, build
+from gripmon.analyse.report.page import page
+from gripmon.analyse.report.pictures import Looked, together
 from gripmon.analyse.smoother import correct
-from gripmon.record.read import Picture
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -26,9 +28,7 @@ from gripmon.model.records import (
     to_json,
 )
 from gripmon.model.records.recorded import RecordedFile
-from gripmon.analyse.report import Report, build
-from gripmon.analyse.report.page import page
-from gripmon.analyse.report.pictures import Looked, together
+from gripmon.record.read import Picture
 
 SECOND_NS = 1_000_000_000
 

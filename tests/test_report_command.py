@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 import yaml
 
+from gripmon.analyse.report import Report
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.analyse.report import Report
-from gripmon.simulate import Simulator
 from gripmon.io.sources import make_simulator
+from gripmon.simulate import Simulator
 
 ROOT = Path(__file__).parent.parent
 SECONDS, FPS = 12.0, 20.0

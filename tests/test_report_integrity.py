@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from reported import Run, records, stepped
 
-from gripmon.model.records import Protection, RecordedConfiguration, Verdict
-from gripmon.model.records.recorded import RecordedFile
 from gripmon.analyse.report import build
 from gripmon.analyse.report.page import page
+from gripmon.model.records import Protection, RecordedConfiguration, Verdict
+from gripmon.model.records.recorded import RecordedFile
 
 
 def test_protection_levels_stand_with_their_limits_and_shares():

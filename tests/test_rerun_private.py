@@ -11,9 +11,9 @@ from recorded import frame, record, recorder
 from rerun.chunk import LazyStore
 
 from gripmon.record.read import open_recordings
+from gripmon.record.rerun_private import RerunChangedError
 from gripmon.record.write import wire
 from gripmon.record.write.files import FileSeries
-from gripmon.record.rerun_private import RerunChangedError
 
 GRIPMON = Path(__file__).resolve().parent.parent / "gripmon"
 

@@ -24,9 +24,9 @@ from meters import box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import frames_of, new_monitor, pose_of, reference_of
 
-from gripmon.model.camera import make_camera
 from gripmon.daemon.config import load_config
-from gripmon.monitor import Monitor, MonitorSettings
+from gripmon.judge.references import ReferenceBook
+from gripmon.model.camera import make_camera
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -38,7 +38,7 @@ from gripmon.model.records import (
     Severity,
     Verdict,
 )
-from gripmon.judge.references import ReferenceBook
+from gripmon.monitor import Monitor, MonitorSettings
 
 HERE = Path(__file__).resolve().parent
 ROBOT = "gripmon/demo/wrist"

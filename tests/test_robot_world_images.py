@@ -18,9 +18,9 @@ from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.calibrate.targets import parse_target
 from gripmon.calibrate.upright import upright
-from gripmon.model.camera import BrownConradyLens
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
+from gripmon.model.camera import BrownConradyLens
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
 

@@ -9,9 +9,9 @@ import ros2_idl as idl
 from loopback import frame_record, state_record
 from scipy.spatial.transform import Rotation
 
-from gripmon.model.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
 from gripmon.io.ros2.messages import ERROR, OK, STALE, WARN, Messages, inverse
 from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF, typestore
+from gripmon.model.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
 
 STAMP_NS = 1_700_000_000_123_456_789
 ROTATION = Rotation.from_euler("xyz", [0.3, -0.7, 1.9])

@@ -19,7 +19,6 @@ from loopback import (
 )
 from ros2_graph import ON, layout, tokens
 
-from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 from gripmon.io.ros2 import (
     HeardTopic,
     Listeners,
@@ -32,6 +31,7 @@ from gripmon.io.ros2.names import dds_type
 from gripmon.io.ros2.node import gid_of
 from gripmon.io.ros2.types import type_hash
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 
 TF_KEY = "0/tf/tf2_msgs::msg::dds_::TFMessage_/RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 POSE_KEY = (

@@ -18,8 +18,8 @@ from loopback import (
 from ros2_graph import ON, layout, tokens
 from stand_ins import Listener, ScriptedMonitor, TickingSource
 
-from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
+from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.io.publish import Publishers
 from gripmon.io.ros2 import (
     Layout,

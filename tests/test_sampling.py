@@ -10,12 +10,12 @@ from meters import FISHEYE_LENS, JAW_SIGMA_M, difference
 from sampled import OPENING_M, NoisyMeter
 from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
+from gripmon.judge.recalibrate import recalibrate
 from gripmon.model.camera import LensSettings
-from gripmon.track.edges import Measurement
-from gripmon.track.differential import differential_update
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, load_gripper
-from gripmon.judge.recalibrate import recalibrate
+from gripmon.track.differential import differential_update
+from gripmon.track.edges import Measurement
 
 SAMPLES = 200
 ADAPTIVE = load_gripper(BOX_FINGERS.parent / "adaptive_arc_fingers.yaml")

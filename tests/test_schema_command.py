@@ -24,6 +24,7 @@ from test_schemas import ONE_OF_EACH
 
 from gripmon.cli import main
 from gripmon.cli.schema import _NAMES
+from gripmon.io.wire import PublishSettings
 from gripmon.model.records import (
     MESSAGES,
     Command,
@@ -37,7 +38,6 @@ from gripmon.model.records import (
     to_json,
     unmeasured_record,
 )
-from gripmon.io.wire import PublishSettings
 
 
 def printed(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:

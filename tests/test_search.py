@@ -20,9 +20,9 @@ from meters import (
 from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
+from gripmon.simulate import make_scenario
 from gripmon.track.edges import Effort, Measurement
 from gripmon.track.edges.search import SearchSettings, search_poses
-from gripmon.simulate import make_scenario
 
 SETTINGS = SearchSettings()
 

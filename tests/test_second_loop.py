@@ -14,11 +14,13 @@ from pulsed_scenes import PULSE_NS, cell, dark, lit
 from rubbish import broken_json
 from stand_ins import Listener, ScriptedSource
 
-from gripmon.daemon.config.second import read_laser
 from gripmon.daemon import DaemonSettings, run_second
+from gripmon.daemon.config.second import read_laser
+from gripmon.io.sources import Waiting
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import LONGEST_S, Told, of_message
 from gripmon.laser.pulses.watching import PulsedWatch
+from gripmon.laser.watch import SpotWatchSettings
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -33,8 +35,6 @@ from gripmon.model.records import (
     Verdict,
     from_json,
 )
-from gripmon.io.sources import Waiting
-from gripmon.laser.watch import SpotWatchSettings
 
 START_NS, PERIOD_NS = 1_000_000_000_000, 400_000_000
 NEVER = 1000.0  # seconds that no test takes

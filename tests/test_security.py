@@ -24,9 +24,9 @@ from sample_messages import SAMPLES, payload
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
-from gripmon.model.records import CommandName, CommandReply
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.io.wire.files import load_file
+from gripmon.model.records import CommandName, CommandReply
 
 PREFIX = "gripmon/arm/wrist"
 

@@ -191,8 +191,8 @@ def test_the_truth_of_the_servo_is_that_of_the_camera_it_gave_the_monitor(tmp_pa
     from servoing import stage
     from servoing.feed import reference_cam_T_grip, write_config
 
-    from gripmon.simulate import Simulator
     from gripmon.io.sources import make_simulator
+    from gripmon.simulate import Simulator
 
     for number, row in enumerate(stage.ROWS):
         scenario = stage.scenario(row, np.random.default_rng(number), FPS, reference_cam_T_grip()[:3, 3])

@@ -17,11 +17,6 @@ import numpy as np
 import psutil
 import pytest
 
-from gripmon.model.camera import PaperLens, make_camera
-from gripmon.model.geometry import exp_rotation, make_transform
-from gripmon.model.gripper import load_gripper
-from gripmon.model.records import Frame
-from gripmon.simulate import make_scenario
 from gripmon.io.sources import (
     SimulatedScene,
     SimulatedSettings,
@@ -33,6 +28,11 @@ from gripmon.io.sources import (
 )
 from gripmon.io.sources.realtime import SimulatedCamera, _Schedule
 from gripmon.io.sources.simulated import SimulatedSequence
+from gripmon.model.camera import PaperLens, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.gripper import load_gripper
+from gripmon.model.records import Frame
+from gripmon.simulate import make_scenario
 
 ROOT = Path(__file__).resolve().parent.parent
 SHAPE = (6, 8)

@@ -18,8 +18,8 @@ from simulated import (
     simulator,
 )
 
-from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.simulate import SCENARIO_NAMES, Simulator, make_scenario
 from gripmon.simulate.background import _smear_kernel
 from gripmon.simulate.coverage import CoverageRaster

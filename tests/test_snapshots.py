@@ -23,9 +23,9 @@ import gripmon.daemon.snapshots as snapshots
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.daemon import DaemonSettings, Reports, run
-from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
 from gripmon.io.sources import FolderSettings, FolderSource, Waiting
 from gripmon.io.wire import PublishSettings
+from gripmon.model.records import CommandFault, CommandReply, Frame, MonitorState, from_json, largest_bytes
 
 
 def picture(seq: int) -> np.ndarray:

@@ -11,7 +11,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.model.records import Frame
 from gripmon.io.sources import (
     FolderSettings,
     FolderSource,
@@ -25,6 +24,7 @@ from gripmon.io.sources import (
     settings_for_path,
 )
 from gripmon.io.sources.folder import natural_key
+from gripmon.model.records import Frame
 
 
 def picture(seed: int, shape: tuple[int, ...] = (48, 64), dtype: type = np.uint8) -> np.ndarray:

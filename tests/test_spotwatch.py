@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
-from gripmon.laser.pointer.spots import Spot
 from gripmon.calibrate.sighting import NotFound
-from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
+from gripmon.laser.pointer.spots import Spot
 from gripmon.laser.watch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
 from gripmon.laser.watch.foresight import foresight
 from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from pulsed_laser import calibration, drawn_world, poses, true_world
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.document import setup_of
 from gripmon.laser.pointer.setup import origin_axes, spots_between, spots_on_plane, spots_on_rays
-from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.geometry import invert, perturb
 from gripmon.laser.watch.single import visible
 from gripmon.laser.watch.ways import INPUTS, disagreements, ways
 from gripmon.laser.watch.world import calibrated, foresee, foresee_moved, larger
+from gripmon.model.geometry import invert, perturb
 
 STEP = 1e-6
 

@@ -18,12 +18,6 @@ from simulated import BOX_FINGERS
 from state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
 from test_references import adopt, broken, configured
 
-from gripmon.model.camera import PaperLens
-from gripmon.model.gripper import GripperModel
-from gripmon.model.records import (
-    MonitorState,
-    Transform,
-)
 from gripmon.judge.references import KEPT, ReferenceBook
 from gripmon.judge.statefile import (
     Owner,
@@ -32,6 +26,12 @@ from gripmon.judge.statefile import (
     default_path,
     pack,
     unpack,
+)
+from gripmon.model.camera import PaperLens
+from gripmon.model.gripper import GripperModel
+from gripmon.model.records import (
+    MonitorState,
+    Transform,
 )
 
 

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from gripmon.model.records import Cause, Frame
 from gripmon.judge.stream import StreamFault, StreamSettings, StreamWatch
+from gripmon.model.records import Cause, Frame
 
 FPS = 30.0
 START_NS = 1_700_000_000_000_000_000

@@ -14,12 +14,22 @@ from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 from watched import reference_of
 
 from gripmon.model.camera import make_camera
-from gripmon.track.edges.prediction import lay_out
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
-from gripmon.teach.forecast import Mount, Rig, expect, field_of_view_rad, moved_camera, see, towards, try_mount, with_focal
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook
+from gripmon.teach.forecast import (
+    Mount,
+    Rig,
+    expect,
+    field_of_view_rad,
+    moved_camera,
+    see,
+    towards,
+    try_mount,
+    with_focal,
+)
+from gripmon.track.edges.prediction import lay_out
 
 AT_PX = (386.0, 298.0)
 SEEN = Mount(0.115, math.radians(32.0), 0.0, 0.0)

@@ -15,10 +15,10 @@ import yaml
 from simulated import STRONG_LENS
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.daemon.config.yaml_file import as_yaml
+from gripmon.model.camera import make_camera
 from gripmon.model.provenance import provenance_of
 
 DEMO = builtin_config("demo.yaml")

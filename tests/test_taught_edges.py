@@ -8,14 +8,14 @@ from meters import box_gripper, moved
 from simulated import nominal_cam_T_grip
 from taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
 
-from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
-from gripmon.track.edges.profiles import profile_offsets_px
-from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
 from gripmon.teach.edges.lines import EdgePoints, find_line, settle_line
 from gripmon.teach.edges.pooling import pool
 from gripmon.teach.edges.shape import slopes
+from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
+from gripmon.track.edges.profiles import profile_offsets_px
+from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 
 POSE = nominal_cam_T_grip()
 GRIPPER = box_gripper()

@@ -19,17 +19,17 @@ from meters import moved
 from simulated import BOX_FINGERS, nominal_cam_T_grip
 from taught_scenes import OPENING_M, image_of, scene
 
-from gripmon.model.atomic import write_atomically
 from gripmon.cli import main
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.track.edges import TaughtModel
-from gripmon.track.edges.taught import TaughtEdge, gripper_digest
+from gripmon.model.atomic import write_atomically
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import load_gripper
 from gripmon.teach.edges.document import to_yaml
 from gripmon.teach.edges.picture import Labels
+from gripmon.track.edges import TaughtModel
+from gripmon.track.edges.taught import TaughtEdge, gripper_digest
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4

@@ -15,24 +15,24 @@ from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenar
 from taught_by_hand import Rig, make_rig
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.model.camera import make_camera
 from gripmon.cli import main
 from gripmon.daemon.config import Settings, builtin_config, load_config
 from gripmon.daemon.config.settings import JawSettings
 from gripmon.daemon.config.typed import to_settings
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.model.camera import make_camera
 from gripmon.model.geometry import from_record, perturb, perturbation_between, to_record
 from gripmon.model.gripper import load_gripper
-from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import expect
 from gripmon.model.provenance import Provenance
+from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor
 from gripmon.teach.edges import TeachingImage
 from gripmon.teach.edges.bench import Bench
 from gripmon.teach.edges.corner_pose import CameraError, PoseRefused, pose_from_corners
 from gripmon.teach.edges.placing import place, usual_view
+from gripmon.teach.forecast import expect
+from gripmon.track.edges.taught import gripper_digest
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")
 OPENING_M = 0.034

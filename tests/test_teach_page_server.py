@@ -21,11 +21,11 @@ from taught_by_hand import Rig, make_rig
 
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.cli.plane_inputs import _read_rough
-from gripmon.monitor import MonitorSettings
-from gripmon.teach.onboarding import UnknownGripper
-from gripmon.model.records import Frame
 from gripmon.io.sources import Waiting
+from gripmon.model.records import Frame
+from gripmon.monitor import MonitorSettings
 from gripmon.teach.edges.bench import Bench, Found
+from gripmon.teach.onboarding import UnknownGripper
 from gripmon.teach.page import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
 from gripmon.teach.page.desk import BadRequest, Labels
 

@@ -22,10 +22,10 @@ from taught_scenes import (
     taught_from,
 )
 
-from gripmon.track.edges.taught import sight_axes
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
 from gripmon.teach.edges import TeachingRefused
+from gripmon.track.edges.taught import sight_axes
 
 POSE = nominal_cam_T_grip()
 PX_PER_M = 8000.0  # at the gripper, to a tenth

@@ -14,14 +14,14 @@ from test_teaching import silhouette_offsets_m
 from watched import pose_of, reference_of
 
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.judge.drift import DriftSettings
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.records import AlertKind, Frame
+from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
 from gripmon.teach.edges import TeachingImage, teach
+from gripmon.track.edges import MeasurementSettings, TaughtEdges
 
 POSE = nominal_cam_T_grip()
 BEVEL_M = 3e-4

@@ -16,17 +16,17 @@ from meters import box_gripper
 from simulated import PAPER_LENS, nominal_cam_T_grip
 from watched import Watched, new_monitor, reference_of, watch
 
+from gripmon.judge.policy import PolicySettings
+from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera
-from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.model.geometry import perturb
+from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.monitor.trust import Integrity
 from gripmon.monitor.weigher import Trust
-from gripmon.judge.policy import PolicySettings
-from gripmon.judge.recalibrate import RecalibrationSettings
-from gripmon.model.records import Frame, Protection, State, Verdict, to_json
 from gripmon.simulate import FrameTruth, Scenario, Simulator
 from gripmon.simulate.scenario import BentFinger, Bump, ObjectLook, Prop
+from gripmon.track.edges import FingerEndsSeen, Measurement
 
 FPS, BEGINS = 20.0, 16
 """Frame in which something begins to happen: until then the view is free, and the gripper's place has proved itself."""

@@ -24,8 +24,8 @@ from gripmon.client.judging import judge
 from gripmon.client.names import MonitorName, Start
 from gripmon.daemon import Reports
 from gripmon.io.publish.presence import Presence, new_monitor_id
-from gripmon.model.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json
 from gripmon.io.wire import Keys, Link, PublishSettings
+from gripmon.model.records import AlertEvent, AlertKind, CommandFault, CommandName, FrameRecord, Verdict, to_json
 
 PATIENT = Policy(max_age_s=3600.0)
 WRIST = MonitorName("arm", "wrist")

@@ -13,8 +13,8 @@ from watched import Watched, frames_of, new_monitor, watch
 
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper
-from gripmon.monitor import MonitorSettings
 from gripmon.model.records import AlertKind, CornerFault, FrameRecord
+from gripmon.monitor import MonitorSettings
 
 ADAPTIVE_FINGERS = BOX_FINGERS.parent / "adaptive_arc_fingers.yaml"
 

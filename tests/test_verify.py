@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, ncx2
 
+from gripmon.calibrate.interchange.fitting import fit_brown_conrady
 from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import (
@@ -18,7 +19,6 @@ from gripmon.calibrate.verify import (
 )
 from gripmon.model.camera import FisheyeLens, PaperLens, make_camera
 from gripmon.model.geometry import perturb
-from gripmon.calibrate.interchange.fitting import fit_brown_conrady
 
 NOMINAL = np.eye(4)
 NOMINAL[:3, :3] = Rotation.from_rotvec([0.5, 0.1, -0.2]).as_matrix()

@@ -13,14 +13,23 @@ from meters import FISHEYE_LENS, box_gripper, moved
 from scipy.spatial.transform import RigidTransform, Rotation
 from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
-from gripmon.model.camera import LensSettings, make_camera
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
 from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
-from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
+from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import FEWEST_CORNERS, Rig, behind_another_finger, border, freedom, moved_camera, over_jaw, see
+from gripmon.teach.forecast import (
+    FEWEST_CORNERS,
+    Rig,
+    behind_another_finger,
+    border,
+    freedom,
+    moved_camera,
+    over_jaw,
+    see,
+)
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, lay_out
 
 NEAR = nominal_cam_T_grip(tcp_m=(0.008, -0.003, 0.046))  # so near that open jaws leave the image
 

@@ -22,8 +22,8 @@ from loopback import (
 from published import Published
 from sample_messages import FOLDER, SAMPLES, kept, payload
 
-from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
 from gripmon.io.wire import PublishSettings
+from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
 
 PAGE = wire_page.PAGE.read_text(encoding="utf-8")
 

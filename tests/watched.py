@@ -11,10 +11,10 @@ from meters import box_gripper, difference
 from scipy.spatial.transform import Rotation
 from simulated import PAPER_LENS, nominal_cam_T_grip
 
-from gripmon.model.camera import make_camera
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.model.camera import make_camera
 from gripmon.model.records import AlertKind, Frame, FrameRecord, Origin, ReferenceRecord, Transform, Verdict
+from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import FrameTruth, Scenario, Simulator, make_scenario
 from gripmon.simulate.scenario import Background, Cover, Creep
 

@@ -1,0 +1,1 @@
+"""Recordings looked at afterwards: the report and the off-line smoother."""

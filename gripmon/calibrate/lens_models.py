@@ -1,7 +1,7 @@
 """Camera models as functions of their parameters: what a calibration estimates, with derivatives.
 
-The maps themselves are those of :mod:`gripmon.model.camera`, so that what is calibrated is what is later used; here they get
-derivatives by their parameters.
+The maps themselves are those of :mod:`gripmon.model.camera`, so that what is calibrated is what is later used; here
+they get derivatives by their parameters.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class LensModel:
         return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
 
     def camera(self, parameters: Array) -> Camera:
-        """The same, ready to project; unlike :func:`gripmon.model.camera.make_camera` it refuses nothing, as an estimate on
-        its way may pass through absurd values.  Points outside the lens's domain project to NaN.
+        """The same, ready to project; unlike :func:`~gripmon.model.camera.make_camera` it refuses nothing, as an estimate
+        on its way may pass through absurd values.  Points outside the lens's domain project to NaN.
         """
         return _camera(self, tuple(parameters.tolist()))
 

@@ -55,9 +55,9 @@ def _size(text: str) -> tuple[int, int]:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate import``."""
     from gripmon.calibrate.documents import CameraCalibration
-    from gripmon.cli.calibration_sources import read_bytes
     from gripmon.calibrate.interchange.cameras import ReadOptions, format_of, read_camera
     from gripmon.calibrate.interchange.fault import InterchangeError
+    from gripmon.cli.calibration_sources import read_bytes
     from gripmon.model.provenance import provenance_of
 
     out, path = Path(arguments.out), Path(arguments.file)

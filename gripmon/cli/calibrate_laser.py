@@ -133,8 +133,8 @@ def _data(
     arguments: argparse.Namespace, calibration: CameraCalibration
 ) -> tuple[Samples, Spots, list[Path], tuple[str, ...]]:
     """Samples that have a spot, their spots, all input files, and what is to be noted."""
-    from gripmon.laser.pointer.samples import picked
     from gripmon.cli import laser_tables
+    from gripmon.laser.pointer.samples import picked
 
     paths = [Path(name) for name in arguments.data]
     samples, origins = laser_tables.read_tables(paths)
@@ -155,8 +155,8 @@ def _calibrated(
     spots: Spots,
     arguments: argparse.Namespace,
 ) -> LaserResult:
-    from gripmon.laser.pointer.calibrating import calibrate
     from gripmon.calibrate.sighting import CalibrationError
+    from gripmon.laser.pointer.calibrating import calibrate
     from gripmon.model.camera import make_camera
 
     try:
@@ -188,8 +188,8 @@ def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> Len
     import numpy as np
 
     from gripmon.calibrate.intrinsics import lens_vector, model_of
-    from gripmon.laser.pointer.spot_problem import LensPrior
     from gripmon.calibrate.lens_models import LensModel, parameter_names
+    from gripmon.laser.pointer.spot_problem import LensPrior
 
     camera = calibration.camera
     count = len(calibration.parameters)
@@ -242,8 +242,8 @@ def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
 
 
 def _planned(result: LaserResult, arguments: argparse.Namespace) -> Plan | None:
-    from gripmon.laser.pointer.planning import Arm, plan
     from gripmon.calibrate.sighting import CalibrationError
+    from gripmon.laser.pointer.planning import Arm, plan
 
     if arguments.plan is None:
         return None

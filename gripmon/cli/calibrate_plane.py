@@ -11,8 +11,8 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.cli.plane_inputs import Inputs, Rough
-    from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
     from gripmon.model.records import Image
+    from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
 
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the

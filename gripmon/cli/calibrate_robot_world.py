@@ -11,9 +11,9 @@ from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.laser.pointer.samples import Row
     from gripmon.calibrate.robot_world import RobotWorld
     from gripmon.calibrate.robot_world_document import RobotWorldCalibration
+    from gripmon.laser.pointer.samples import Row
     from gripmon.model.records import Array
 
 _DESCRIPTION = """\
@@ -84,9 +84,9 @@ class _Poses:
 def _poses(arguments: argparse.Namespace) -> _Poses:
     import numpy as np
 
-    from gripmon.laser.pointer.samples import check_scale, pose_of
     from gripmon.calibrate.robot_world_doubts import check_target_scale
     from gripmon.cli.laser_tables import rows_of
+    from gripmon.laser.pointer.samples import check_scale, pose_of
 
     arm: list[Array] = []
     target, covariances, names = [], [], []

@@ -9,9 +9,9 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config, SecondConfig
-    from gripmon.model.records import Frame
     from gripmon.io.sources import Source
     from gripmon.io.wire import Link
+    from gripmon.model.records import Frame
 
 
 class RecordedInput(NamedTuple):

@@ -121,8 +121,8 @@ def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
 
 def _add_rules(path: Path, robots: list[str]) -> None:
     """Put rules for the robots into a router's file."""
-    from gripmon.model.atomic import write_atomically
     from gripmon.io.wire.rules import with_robot
+    from gripmon.model.atomic import write_atomically
 
     try:
         before = text = path.read_text(encoding="utf-8")

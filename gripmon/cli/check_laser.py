@@ -12,9 +12,9 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.model.records import Array
     from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatch, SpotWatchSettings
     from gripmon.laser.watch.foresight import Foresight
+    from gripmon.model.records import Array
 
 _OPTIONS = ("arm_noise", "false_alarms", "wrong_spots")
 _AXES = ("x", "y", "z")

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.teach.forecast import JawOutlook, Outlook
     from gripmon.model.records import Array
+    from gripmon.teach.forecast import JawOutlook, Outlook
 
 _DIRECTIONS = (
     "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
@@ -81,8 +81,8 @@ def _recalibration(config: Config, outlook: Outlook) -> dict[str, Any]:
     """Whether the corners that this view shows give a full pose by themselves, and how certain one frame's is: what is
     averaged over frames whose errors last is hardly more certain.
     """
-    from gripmon.monitor import CORNER_COUNTS
     from gripmon.judge.recalibrate import coplanar, refusal
+    from gripmon.monitor import CORNER_COUNTS
 
     gripper, variant = config.gripper, config.settings.monitor.recalibrate_corners
     taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[variant])

@@ -14,9 +14,9 @@ from gripmon.cli import common, joining
 
 if TYPE_CHECKING:
     from gripmon.io.publish.frames import FramePublisher
-    from gripmon.model.records import Frame
     from gripmon.io.sources import Source
     from gripmon.io.wire import Link
+    from gripmon.model.records import Frame
 
 _DESCRIPTION = """\
 Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose

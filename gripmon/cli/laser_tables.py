@@ -11,11 +11,11 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     import csv
 
+    from gripmon.calibrate.sighting import NotFound
     from gripmon.laser.pointer.calibrating import Spots
     from gripmon.laser.pointer.planning import Plan
     from gripmon.laser.pointer.samples import Samples
     from gripmon.laser.pointer.spots import Spot
-    from gripmon.calibrate.sighting import NotFound
 
 _SUFFIXES = (".csv", ".yaml", ".yml", ".json")
 
@@ -155,8 +155,8 @@ def write_plan(planned: Plan, path: Path) -> None:
     import csv
     import io
 
-    from gripmon.model.atomic import write_atomically
     from gripmon.laser.pointer.samples import POSITION, QUATERNION
+    from gripmon.model.atomic import write_atomically
     from gripmon.model.geometry import quaternion_xyzw
 
     text = io.StringIO()
@@ -190,9 +190,9 @@ def find_spots(samples: Samples, origins: list[Path], size_px: tuple[int, int]) 
     """
     import numpy as np
 
+    from gripmon.calibrate.sighting import NotFound
     from gripmon.laser.pointer.calibrating import Spots
     from gripmon.laser.pointer.spots import find_spots as in_image
-    from gripmon.calibrate.sighting import NotFound
 
     unseen = set(_unseen(samples))
     uv_px, covariances, others = samples.uv_px.copy(), np.tile(np.eye(2), (len(samples), 1, 1)), []

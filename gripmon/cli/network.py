@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.daemon.config import Config, SecondConfig
     from gripmon.daemon import JawFeed, Reports
+    from gripmon.daemon.config import Config, SecondConfig
     from gripmon.io.metrics import MetricsServer
     from gripmon.io.publish import Presence, Publisher, ZenohCommands
     from gripmon.io.sources import Source
@@ -38,8 +38,8 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
     """Open all of it; ends the command with exit code 2 where it can't be opened as configured, and with 4 where the
     robot's and camera's name is another monitor's, unless it is to ``take_over``.
     """
-    from gripmon.daemon.config import ConfigError, check_network
     from gripmon.daemon import Reports
+    from gripmon.daemon.config import ConfigError, check_network
     from gripmon.io.publish import NullPublisher
 
     try:

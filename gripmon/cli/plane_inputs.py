@@ -20,8 +20,8 @@ from gripmon.daemon.config.calibrated import read_camera
 from gripmon.daemon.config.typed import SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.gripper import Gripper
-from gripmon.teach.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
 from gripmon.model.records import Image
+from gripmon.teach.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
 
 Rough = Mapping[str, tuple[float, float]]
 

@@ -18,11 +18,11 @@ from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
-from gripmon.track.edges.taught import gripper_digest
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperError, GripperModel
-from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
 from gripmon.model.provenance import Provenance, provenance_of
+from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
+from gripmon.track.edges.taught import gripper_digest
 
 
 def inferred_gripper(

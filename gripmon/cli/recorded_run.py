@@ -17,9 +17,9 @@ from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
+    from gripmon.model.records import FrameRecord, Limits
     from gripmon.record.read.replayed import RecordedFrames
     from gripmon.record.write.compared import ComparedRecorder
-    from gripmon.model.records import FrameRecord, Limits
 
 _ENDING = ".rrd"
 

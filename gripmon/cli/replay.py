@@ -21,9 +21,9 @@ from gripmon.cli.replaying import NOTHING_BEFORE, replay
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config, SecondConfig
-    from gripmon.record.write import Recorder
-    from gripmon.model.records import FrameRecord
     from gripmon.io.sources import Source
+    from gripmon.model.records import FrameRecord
+    from gripmon.record.write import Recorder
 
 _DESCRIPTION = """\
 Run recorded frames through the monitor and write one JSON line for every input frame, in input
@@ -155,8 +155,8 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
 
 def _refuse_empty_folder(paths: list[Path]) -> None:
     """Before anything else is asked for, which would not help."""
-    from gripmon.record.read import recordings_below
     from gripmon.io.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+    from gripmon.record.read import recordings_below
 
     for path in paths:
         if not path.is_dir() or recordings_below(path) or (path / TIMESTAMPS_NAME).exists():

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
+    from gripmon.io.sources import Source
+    from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
     from gripmon.monitor import Monitor
     from gripmon.record.write import Recorder
-    from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
-    from gripmon.io.sources import Source
 
 
 class Past(NamedTuple):
@@ -35,8 +35,8 @@ def replay(
     """Process every frame of a source that isn't live: yields each record with its JSON line."""
     import msgspec
 
-    from gripmon.monitor import Monitor
     from gripmon.model.records import Frame, to_json, unmeasured_record
+    from gripmon.monitor import Monitor
 
     monitor = Monitor(
         config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, past.state

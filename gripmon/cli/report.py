@@ -64,9 +64,9 @@ def run(arguments: argparse.Namespace) -> int:
     for path, option in ((page_path, "--out"), (json_path, "--json")):
         _check_folder(path, option)
     collection = _read([Path(name) for name in arguments.recordings])
+    from gripmon.analyse.report import build
     from gripmon.model.atomic import write_atomically
     from gripmon.model.records import to_json
-    from gripmon.analyse.report import build
 
     millimetres, degrees = arguments.limit_mm, arguments.limit_deg
     report, told = build(

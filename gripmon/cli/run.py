@@ -14,10 +14,10 @@ from gripmon.cli import camera_source, common, promising, second_run, viewing
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
+    from gripmon.judge.statefile import StateFile
+    from gripmon.model.records import Alert, MonitorState
     from gripmon.monitor import Monitor
     from gripmon.record.write import Recorder
-    from gripmon.model.records import Alert, MonitorState
-    from gripmon.judge.statefile import StateFile
 
 _log = logging.getLogger(__name__)
 
@@ -199,8 +199,8 @@ def run_daemon(
 
 def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
     """The file for what survives a restart; None without one."""
-    from gripmon.model.records import MonitorState
     from gripmon.judge.statefile import StateFile, StateFileError
+    from gripmon.model.records import MonitorState
 
     path = config.state_path
     if path is None:

@@ -11,8 +11,8 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import SecondConfig
-    from gripmon.model.records import SpotRecord
     from gripmon.io.sources import Source
+    from gripmon.model.records import SpotRecord
 
 
 def run(config: SecondConfig, source: Source, write: Callable[[bytes], None], step: Callable[[], None]) -> int:

@@ -11,11 +11,11 @@ from gripmon.cli import camera_source, common
 from gripmon.cli.viewing import LiveView
 
 if TYPE_CHECKING:
-    from gripmon.daemon.config import SecondConfig
     from gripmon.daemon import Reports
+    from gripmon.daemon.config import SecondConfig
     from gripmon.io.publish import SpotPublisher, ZenohCommands, ZenohPulses
-    from gripmon.record.write import SpotRecorder
     from gripmon.io.wire import Link
+    from gripmon.record.write import SpotRecorder
 
 
 @dataclasses.dataclass(frozen=True)
@@ -105,8 +105,8 @@ def run_second(
 
 def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
     """Open all of it; ends the command as :func:`gripmon.cli.network.open_network` does."""
-    from gripmon.daemon.config import ConfigError, check_second_network
     from gripmon.daemon import Reports
+    from gripmon.daemon.config import ConfigError, check_second_network
     from gripmon.io.publish import NullPublisher
     from gripmon.io.wire import Link, PublishError
 

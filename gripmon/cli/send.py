@@ -107,8 +107,8 @@ def _misuse(arguments: argparse.Namespace) -> str:
 def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     """The reply, and the image of a snapshot."""
     from gripmon.client import Ambiguous, Client, NotCarriedOut
-    from gripmon.model.records import CommandFault, CommandName
     from gripmon.io.wire import PublishError
+    from gripmon.model.records import CommandFault, CommandName
 
     try:
         client = Client(

@@ -40,9 +40,9 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     """``snapshot-<n>.png``, ``snapshot-<n>.json`` and a row in ``timestamps.csv``, as a source of kind ``folder`` and
     ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.
     """
+    from gripmon.io.sources.folder import TIMESTAMPS_NAME
     from gripmon.model.atomic import write_atomically
     from gripmon.model.records import to_json
-    from gripmon.io.sources.folder import TIMESTAMPS_NAME
 
     number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)
     files = {out / f"snapshot-{number}.json": to_json(reply) + b"\n"}

@@ -15,8 +15,8 @@ from gripmon.cli.margins import rig_of
 if TYPE_CHECKING:
     from PIL.Image import Image
 
-    from gripmon.model.camera import Camera
     from gripmon.daemon.config import Config
+    from gripmon.model.camera import Camera
     from gripmon.teach.forecast import Grid
 
 _MOST_VALUES, _MOST_MOUNTS = 100, 20000
@@ -205,9 +205,9 @@ def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
 
 def _calibrated(path: Path) -> Camera:
     """The camera in a file; a fault ends the command with exit code 2."""
-    from gripmon.model.camera import make_camera
     from gripmon.daemon.config import ConfigError
     from gripmon.daemon.config.calibrated import read_camera
+    from gripmon.model.camera import make_camera
 
     try:
         return make_camera(read_camera(path).camera)

@@ -6,8 +6,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gripmon.model.camera import Camera
     from gripmon.daemon.config import Config
+    from gripmon.model.camera import Camera
     from gripmon.teach.forecast import Grid, Trial
 
 _SHOWN = 8

@@ -16,10 +16,10 @@ from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.track.edges import TaughtModel
-    from gripmon.track.edges.taught import TaughtEdge
     from gripmon.model.records import Image
     from gripmon.teach.edges import Taught
+    from gripmon.track.edges import TaughtModel
+    from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
 Measure where each edge of the gripper really shows, in images taken at the reference calibration,
@@ -163,8 +163,8 @@ def _named_in(config: Config, out: Path) -> Config:
     """The configuration with the line that names the file, if it hadn't."""
     import os
 
-    from gripmon.model.atomic import write_atomically
     from gripmon.cli.teach_config import with_taught
+    from gripmon.model.atomic import write_atomically
 
     if config.taught_path is None:
         name = Path(os.path.relpath(out.resolve(), config.directory.resolve())).as_posix()
@@ -304,8 +304,8 @@ def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
     import cv2
 
     from gripmon.model.atomic import write_atomically
-    from gripmon.track.edges import TaughtEdges
     from gripmon.teach.edges.picture import draw
+    from gripmon.track.edges import TaughtEdges
 
     picture = draw(
         config.camera, config.gripper, config.cam_T_grip, image, TaughtEdges.of_model(model, config.gripper), model

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.model.camera import Camera, LensSettings
     from gripmon.daemon.config import Config
+    from gripmon.io.sources import FolderSettings, LiveSettings
+    from gripmon.model.camera import Camera, LensSettings
     from gripmon.model.gripper import Gripper
     from gripmon.model.records import Image, ReferenceRecord
-    from gripmon.io.sources import FolderSettings, LiveSettings
     from gripmon.teach.edges.bench import Bench
     from gripmon.teach.edges.corner_pose import CameraError
     from gripmon.teach.page import Picture
@@ -84,8 +84,8 @@ def read_inputs(arguments: argparse.Namespace) -> Inputs:
 def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
     """The corners in a file; a fault ends the command with exit code 2."""
     from gripmon.daemon.config.typed import to_settings
-    from gripmon.teach.onboarding.rough import RoughCorners
     from gripmon.teach.edges.bench import rough_fault
+    from gripmon.teach.onboarding.rough import RoughCorners
 
     with _faults_of(path):
         rough = to_settings(_yaml(path), RoughCorners)
@@ -150,9 +150,9 @@ def read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     """A camera's file: of ``gripmon calibrate intrinsics``, or the section of a configuration by itself."""
     import numpy as np
 
-    from gripmon.model.camera import LensSettings
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.daemon.config.typed import to_settings
+    from gripmon.model.camera import LensSettings
     from gripmon.teach.edges.corner_pose import CameraError
 
     with _faults_of(path):
@@ -228,10 +228,10 @@ def _faults_of(path: Path) -> Iterator[None]:
 
 def read_fitting_image(path: Path, camera: Camera, gripper: Gripper, bit_depth: int) -> Image:
     """An image that fits the camera, in full scale; anything else ends the command with exit code 2."""
+    from gripmon.io.sources.folder import read_image
     from gripmon.judge.inspection import inspect
     from gripmon.model.pixels import in_full_scale
     from gripmon.model.records import Frame
-    from gripmon.io.sources.folder import read_image
 
     if path.is_dir():
         raise common.CommandFailedError(f"{path}: is a folder; image files, e.g. {path}/*.png", common.EXIT_USAGE)

@@ -13,12 +13,12 @@ from gripmon import __version__
 
 if TYPE_CHECKING:
     from gripmon.cli.teach_inputs import Inputs
-    from gripmon.track.edges import TaughtModel
     from gripmon.model.records import ReferenceRecord
     from gripmon.teach.edges import Taught
     from gripmon.teach.edges.bench import Found
     from gripmon.teach.page import Picture, Saved, SaveOrder
     from gripmon.teach.page.desk import Labels
+    from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
 
@@ -162,9 +162,9 @@ class FileSaving:
     ) -> TaughtModel:
         from datetime import UTC, datetime
 
+        from gripmon.model.geometry import from_record
         from gripmon.track.edges import TaughtModel
         from gripmon.track.edges.taught import Provenance, TaughtImage, identity
-        from gripmon.model.geometry import from_record
 
         bench, names = self._inputs.bench, iter(files)
         images = []

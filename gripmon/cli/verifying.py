@@ -169,8 +169,8 @@ def _each_measured(
     import numpy as np
 
     from gripmon.model.geometry import from_record, to_record
-    from gripmon.monitor import Monitor
     from gripmon.model.records import Frame, Origin, ReferenceRecord
+    from gripmon.monitor import Monitor
 
     flat = tuple(covariance.ravel().tolist())
     reference = ReferenceRecord("verify", 0, 0, "configuration", to_record(expected), flat)

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
-from gripmon.model.records import ClockReading
 from gripmon.io.wire import MOST_DRIFT
+from gripmon.model.records import ClockReading
 
 _MOST_CLOCKS = 16
 """Of more clocks nothing is kept: each start of a monitor has one, and a stranger may make up any number."""

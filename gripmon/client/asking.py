@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 import zenoh
 
-from gripmon.model.records import ClockReading, MessageRefused, from_json
 from gripmon.io.wire import CLOCK_PARAMETER, steady_ns
+from gripmon.model.records import ClockReading, MessageRefused, from_json
 
 ASK_EVERY_S = 1.0
 """The bound grows by 1 ms meanwhile (:data:`gripmon.io.wire.MOST_DRIFT`); 200 bytes each way."""

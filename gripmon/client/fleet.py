@@ -17,8 +17,8 @@ import zenoh.ext
 from gripmon.client.names import MonitorName, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.status import MonitorStatus
-from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link
+from gripmon.model.records import AlertRecord, MessageRefused, StateRecord, from_json
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 _log = logging.getLogger(__name__)

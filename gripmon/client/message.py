@@ -11,7 +11,7 @@ _LARGEST_NUMBER = 2**63 - 1
 
 
 def transform_message(payload: bytes) -> FrameRecord:
-    """Raises :class:`gripmon.model.records.MessageRefused` for anything that is no message or no pose, whoever sent it."""
+    """Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose, whoever sent it."""
     record = from_json(payload, FrameRecord)
     for pose in (record.cam_T_grip, record.smoothed):
         if pose is not None and not _is_pose(pose):

@@ -13,6 +13,7 @@ import zenoh
 
 from gripmon.client.names import MonitorName, Start, monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
+from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 from gripmon.model.records import (
     CommandError,
     CommandFault,
@@ -26,7 +27,6 @@ from gripmon.model.records import (
     from_json,
     to_json,
 )
-from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 
 _T = TypeVar("_T", bound=msgspec.Struct)
 
@@ -92,8 +92,8 @@ class Client:
     def latest(self) -> FrameRecord | None:
         """The newest record, at once; the same one again while no newer one came; None before the first.
 
-        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises :class:`gripmon.model.records.MessageRefused` for
-        a message that is no record, or one of a major version that isn't known here.
+        It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises
+        :class:`gripmon.model.records.MessageRefused` for a message that is not a record, or of an unknown major version.
         """
         newest: zenoh.Sample | None = None
         while (sample := self._samples.try_recv()) is not None:

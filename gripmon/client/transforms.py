@@ -18,8 +18,8 @@ from gripmon.client.judging import judge
 from gripmon.client.names import monitor_name, start_of
 from gripmon.client.network import named_as_arguments, reader_settings
 from gripmon.client.reading import NotUsable, Policy, Reading
-from gripmon.model.records import ClockReading, MessageRefused, from_json
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, Link, steady_ns
+from gripmon.model.records import ClockReading, MessageRefused, from_json
 
 _LOOK_WITHIN_S = 1.0  # who is there answers in milliseconds
 

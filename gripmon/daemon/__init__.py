@@ -28,11 +28,11 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
 from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
+from gripmon.io.sources import Source
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
 from gripmon.model.records import Alert
-from gripmon.io.sources import Source
+from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
 
 __all__ = [
     "EXIT_DONE",

@@ -15,7 +15,7 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import Loop, StopRequest, in_short
 from gripmon.io.publish import Publisher
-from gripmon.record.write import Recorder
+from gripmon.io.sources import Source
 from gripmon.model.records import (
     Alert,
     Command,
@@ -26,7 +26,7 @@ from gripmon.model.records import (
     unmeasured_record,
     withheld,
 )
-from gripmon.io.sources import Source
+from gripmon.record.write import Recorder
 
 KEEP_LAST_EVERY_S = 60.0
 """How old the last transform that is kept may be; references and alerts are kept when they change."""

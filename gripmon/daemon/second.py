@@ -15,12 +15,12 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest, in_short
 from gripmon.daemon.watch import Judged
-from gripmon.judge.policy import AlertBook
 from gripmon.io.publish import SpotPublisher
+from gripmon.io.sources import Source
+from gripmon.judge.policy import AlertBook
 from gripmon.laser.pulses.matching import Shown
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import Outcome, PulsedWatch
-from gripmon.record.write import SpotRecorder
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -37,7 +37,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
-from gripmon.io.sources import Source
+from gripmon.record.write import SpotRecorder
 
 _log = logging.getLogger(__name__)
 _NO_SPOT = "no_spot"

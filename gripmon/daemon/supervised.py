@@ -19,7 +19,7 @@ from gripmon.daemon.snapshots import Newest, Snapshots
 from gripmon.daemon.watch import Watch
 from gripmon.io.publish import StatePublisher
 from gripmon.io.publish.presence import in_words
-from gripmon.record.write import EventRecorder
+from gripmon.io.sources import Source, Waiting
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -40,7 +40,7 @@ from gripmon.model.records import (
     Verdict,
     accepting,
 )
-from gripmon.io.sources import Source, Waiting
+from gripmon.record.write import EventRecorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")

@@ -1,0 +1,1 @@
+"""Measured poses to decisions: filter, drift test, causes, policy, references, recalibration."""

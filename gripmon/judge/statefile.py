@@ -1,8 +1,8 @@
 """What survives a restart, in a file: written whole or not at all, read whole or not at all.
 
-A file holds one :class:`gripmon.model.records.MonitorState` with the robot, the camera and the calibration that it belongs
-to, under a checksum.  One that is damaged, or that belongs to another calibration, is renamed aside and never used;
-one of another robot is left alone, and so is one that another process uses.
+A file holds one :class:`gripmon.model.records.MonitorState` with the robot, the camera and the calibration that it
+belongs to, under a checksum.  One that is damaged, or that belongs to another calibration, is renamed aside and
+never used; one of another robot is left alone, and so is one that another process uses.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from typing import Annotated
 
 import msgspec
 
+from gripmon.judge.references import state_fault
 from gripmon.model.atomic import remove_leftovers, write_atomically
 from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import GripperModel, contents_of
 from gripmon.model.records import MonitorState, ReferenceRecord
-from gripmon.judge.references import state_fault
 
 _log = logging.getLogger(__name__)
 

@@ -1,0 +1,1 @@
+"""The laser pointer: calibrating a second camera and watching it."""

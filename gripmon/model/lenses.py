@@ -1,4 +1,4 @@
-"""The lens maps behind :mod:`gripmon.model.camera`: ideal <-> distorted normalised coordinates, with analytic Jacobians.
+"""Lens maps behind :mod:`gripmon.model.camera`: ideal <-> distorted normalised coordinates, with analytic Jacobians.
 
 ``xy`` are ideal normalised coordinates x/z, y/z, ``q`` distorted ones, ``((u - cx)/fx, (v - cy)/fy)``, both (2, n).
 """

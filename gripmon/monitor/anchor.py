@@ -14,11 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.track.integrity import Doubts, Hypotheses
-from gripmon.monitor.refits import INFLATION, Refits, of_fingers
-from gripmon.model.records import Array
 from gripmon.judge.smoothing import LEAST_KEPT, MOST_SCATTER
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array
+from gripmon.monitor.refits import INFLATION, Refits, of_fingers
+from gripmon.track.integrity import Doubts, Hypotheses
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.edges import Measurement
+from gripmon.judge.policy import Evidence, Judgement
+from gripmon.judge.smoothing import PoseAverage
+from gripmon.judge.stream import StreamFault
 from gripmon.model.geometry import invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.monitor.trust import Standing
-from gripmon.judge.policy import Evidence, Judgement
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -28,8 +28,8 @@ from gripmon.model.records import (
     Severity,
     Smoothed,
 )
-from gripmon.judge.smoothing import PoseAverage
-from gripmon.judge.stream import StreamFault
+from gripmon.monitor.trust import Standing
+from gripmon.track.edges import Measurement
 
 FINGER_SEEN, FINGER_ASTRAY = 0.6, 0.35
 """Shares of a finger's profiles that agree: above the first it is where it should be, below the second it is not."""

@@ -10,35 +10,19 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from gripmon.model.camera import Camera
 from gripmon.judge.causes import CauseJudge, Watches
-from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 from gripmon.judge.drift import Baseline, MotionWatch
-from gripmon.model.geometry import from_record, perturbation_between, to_record
-from gripmon.model.gripper import Gripper
 from gripmon.judge.inspection import inspect
-from gripmon.monitor.answers import (
-    after_restart,
-    drift_between,
-    flat,
-    frozen,
-    gripper_astray,
-    measured_record,
-    of_stream,
-    smoothed_record,
-    unmeasured_corners,
-)
-from gripmon.monitor.asking import Inquiry
-from gripmon.monitor.notes import NoteTaker
-from gripmon.monitor.orders import Moment, obey
-from gripmon.monitor.renewal import Renewal
-from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.tracker import Tracker
-from gripmon.monitor.trust import Integrity, Standing
-from gripmon.model.pixels import in_full_scale
 from gripmon.judge.policy import Evidence, Judgement, Policy
 from gripmon.judge.recalibrate import Proposal
 from gripmon.judge.recalibrate import Refusal as Refused
+from gripmon.judge.references import CommandRefused, Keep
+from gripmon.judge.smoothing import PoseAverage
+from gripmon.judge.stream import StreamFault, StreamWatch
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record, perturbation_between, to_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import (
     Alert,
     Array,
@@ -61,9 +45,25 @@ from gripmon.model.records import (
     Verdict,
     unmeasured_record,
 )
-from gripmon.judge.references import CommandRefused, Keep
-from gripmon.judge.smoothing import PoseAverage
-from gripmon.judge.stream import StreamFault, StreamWatch
+from gripmon.monitor.answers import (
+    after_restart,
+    drift_between,
+    flat,
+    frozen,
+    gripper_astray,
+    measured_record,
+    of_stream,
+    smoothed_record,
+    unmeasured_corners,
+)
+from gripmon.monitor.asking import Inquiry
+from gripmon.monitor.notes import NoteTaker
+from gripmon.monitor.orders import Moment, obey
+from gripmon.monitor.renewal import Renewal
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import Tracker
+from gripmon.monitor.trust import Integrity, Standing
+from gripmon.track.edges import Effort, Measurement, TaughtEdges, agreeing_fingers, trace_of
 
 RESTARTED = "restarted, and too few frames since to say whether the picture fits the reference"
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.judge.drift import Baseline, MotionWatch
-from gripmon.monitor.settings import MonitorSettings
+from gripmon.judge.smoothing import PoseAverage
 from gripmon.model.records import Array, Limits, MonitorNotes
 from gripmon.model.records.notes import SixNumbers
-from gripmon.judge.smoothing import PoseAverage
+from gripmon.monitor.settings import MonitorSettings
 
 
 class NoteTaker:

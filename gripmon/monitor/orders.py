@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gripmon.monitor.renewal import Renewal
 from gripmon.judge.policy import Policy
-from gripmon.model.records import Alert, Array, Command, CommandName
 from gripmon.judge.references import CommandRefused
+from gripmon.model.records import Alert, Array, Command, CommandName
+from gripmon.monitor.renewal import Renewal
 
 
 @dataclass(frozen=True, slots=True)

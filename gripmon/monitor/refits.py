@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, separate
 from gripmon.model.records import Array, Protection
+from gripmon.track.edges import JAW_UNREPORTED_SIGMA_M, Measurement, NormalEquations, prior_information
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, separate
 
 INFLATION = 1.2
 """Factor on standard deviations so that a normal distribution bounds the tails of the edges' errors."""

@@ -6,14 +6,11 @@ import math
 
 import numpy as np
 
-from gripmon.track.edges import Measurement, edge_sums
-from gripmon.model.geometry import from_record, perturbation_between
-from gripmon.model.gripper import Gripper
-from gripmon.monitor.settings import MonitorSettings
-from gripmon.monitor.tracker import CORNER_COUNTS
-from gripmon.monitor.trust import Standing
 from gripmon.judge.policy import NO_REFERENCE, Judgement, Policy
 from gripmon.judge.recalibrate import Proposal, Recalibrator, Refusal, StillFrame
+from gripmon.judge.references import CommandRefused, Keep, ReferenceBook
+from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -29,7 +26,10 @@ from gripmon.model.records import (
     Severity,
     State,
 )
-from gripmon.judge.references import CommandRefused, Keep, ReferenceBook
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.monitor.tracker import CORNER_COUNTS
+from gripmon.monitor.trust import Standing
+from gripmon.track.edges import Measurement, edge_sums
 
 KEEP_AGAIN_S = 10.0
 """Pause before a reference that could not be kept is measured and tried again: a full disk stays full for a while."""

@@ -8,12 +8,12 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.judge.causes import CauseSettings
-from gripmon.track.edges import MeasurementSettings
 from gripmon.judge.drift import DriftSettings
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.judge.smoothing import SmoothingSettings
 from gripmon.judge.stream import StreamSettings
+from gripmon.track.edges import MeasurementSettings
 
 
 class MonitorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
-from gripmon.track.differential import DegenerateGeometry, Update, differential_update
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper
-from gripmon.track.jaw import JawKnowledge
-from gripmon.monitor.settings import MonitorSettings
 from gripmon.model.records import Array, EdgeEvidence, Frame
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.track.differential import DegenerateGeometry, Update, differential_update
+from gripmon.track.edges import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.track.jaw import JawKnowledge
 
 USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before anything is known about this gripper."""

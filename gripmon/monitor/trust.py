@@ -11,16 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
-from gripmon.track.edges import Measurement
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.track.look import GripperLook, LookRefused
+from gripmon.model.records import Array, Frame, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
-from gripmon.judge.policy import past_alert_limit
-from gripmon.model.records import Array, Frame, MonitorState, Protection, ReferenceRecord
+from gripmon.track.edges import Measurement
+from gripmon.track.look import GripperLook, LookRefused
 
 PROOF_EVERY = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""

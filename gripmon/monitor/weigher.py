@@ -12,15 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.edges import FingerEndsSeen, Measurement
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
+from gripmon.model.records import Array, Protection, ReferenceRecord
 from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
-from gripmon.model.records import Array, Protection, ReferenceRecord
+from gripmon.track.edges import FingerEndsSeen, Measurement
+from gripmon.track.integrity import Hypotheses, bounds, hypotheses_of
 
 SECONDS_A_MONTH = 30.0 * 86400.0
 

@@ -1,0 +1,1 @@
+"""A gripper made known: its model and edges from images, and what to expect of a view."""

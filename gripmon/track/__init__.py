@@ -1,0 +1,1 @@
+"""One frame to a measured pose with its covariance and protection level."""

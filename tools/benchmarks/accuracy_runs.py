@@ -13,8 +13,8 @@ from benchmarks.peers import LOST_M, PEERS, timed
 from benchmarks.scenes import Sequence, Shot
 from gripmon.judge.drift import DriftSettings
 from gripmon.model.geometry import from_record, make_transform, perturbation_between, rotation_from_xyzw, to_record
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.model.records import Array, FrameRecord, Origin, ReferenceRecord, Verdict
+from gripmon.monitor import Monitor, MonitorSettings
 
 WAYS = ("edges", "corners")
 """Both values of ``monitor.measurement``."""

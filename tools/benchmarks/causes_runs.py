@@ -8,12 +8,12 @@ import numpy as np
 
 from benchmarks.causes_rigs import START_SIGMA
 from benchmarks.causes_trials import Trial
-from gripmon.model.camera import make_camera
 from gripmon.judge.drift import DriftSettings
-from gripmon.model.geometry import to_record
-from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.judge.recalibrate import RecalibrationSettings
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import to_record
 from gripmon.model.records import Alert, AlertEvent, Cause, ReferenceRecord
+from gripmon.monitor import Monitor, MonitorSettings
 
 
 @dataclass(frozen=True)

@@ -174,8 +174,8 @@ def stream(scenario: Scenario, error: Any, vibrates: Any, rng: Any) -> tuple[Any
 
     from benchmarks.noise_model import NoiseModel
     from benchmarks.scene import config_for
-    from gripmon.model.geometry import from_record
     from gripmon.analyse.smoother import chart
+    from gripmon.model.geometry import from_record
 
     nominal_T = from_record(config_for((768, 576)).reference.cam_T_grip)
     rough = NoiseModel.load("rough").vibration

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from benchmarks.scene import FPS, Ring
 from gripmon import daemon
 from gripmon.daemon.config import Config
-from gripmon.monitor import Monitor
 from gripmon.io.publish import Publisher, ZenohPublisher
-from gripmon.record.write import NullRecorder, Recorder
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, ReferenceRecord, StateRecord
+from gripmon.monitor import Monitor
+from gripmon.record.write import NullRecorder, Recorder
 
 _SUBSCRIBER = Path(__file__).parent / "subscriber.py"
 _CORES = os.sched_getaffinity(0)

@@ -20,12 +20,10 @@ from benchmarks.integrity_misleading import CONDITIONS
 from benchmarks.integrity_scenes import IntegrityScene, make_integrity_scene
 from benchmarks.machine import commit
 from benchmarks.rendered import Rendered
-from gripmon.model.camera import Camera
 from gripmon.judge.drift import DriftSettings
+from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, perturbation_between, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
-from gripmon.monitor import Monitor, MonitorSettings
-from gripmon.teach.forecast import Rig, foresee_frame
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -38,8 +36,10 @@ from gripmon.model.records import (
     ReferenceRecord,
     Verdict,
 )
+from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
+from gripmon.teach.forecast import Rig, foresee_frame
 
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""

@@ -13,12 +13,12 @@ from scipy.stats import f as fisher_f
 
 from benchmarks.laser_scenes import PAPER_LENS, REAL_LENS, LaserData, paper_setup, real_setup, sampled
 from gripmon.calibrate import robot_world
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import closed_form, common_plane
 from gripmon.laser.pointer.document import pose_jacobian
 from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturbation_between
 
 Array = NDArray[np.float64]

@@ -23,8 +23,8 @@ import numpy as np
 from benchmarks.scene import FPS, config_for
 from gripmon.daemon.config import Config
 from gripmon.model.geometry import from_record, perturbation_between
-from gripmon.monitor import Monitor
 from gripmon.model.records import Array, Origin, Verdict
+from gripmon.monitor import Monitor
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import (
     Background,

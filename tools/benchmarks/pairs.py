@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import rendered
-from gripmon.model.camera import Camera
 from gripmon.daemon.config import builtin_config, load_config
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.track.edges.prediction import SamplingSettings
-from gripmon.track.differential import DegenerateGeometry, differential_update
+from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate
+from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert, perturb
 from gripmon.model.gripper import Gripper
-from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate
 from gripmon.model.records import Array, Image
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import Background
+from gripmon.track.differential import DegenerateGeometry, differential_update
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.prediction import SamplingSettings
 
 _RENDERED = "rendered series2, true jaw"
 _ITERATIONS = 5

@@ -96,10 +96,10 @@ def run(arguments: argparse.Namespace) -> int:
 def trial(seed: int, number: int) -> Outcome:
     """One knock, watched until the monitor has made up its mind."""
     from benchmarks.knocks import BEFORE, draw_knock
-    from gripmon.model.geometry import from_record, to_record
-    from gripmon.monitor import Monitor, MonitorSettings
     from gripmon.judge.recalibrate import Refusal
+    from gripmon.model.geometry import from_record, to_record
     from gripmon.model.records import ReferenceRecord, State
+    from gripmon.monitor import Monitor, MonitorSettings
 
     knock = draw_knock(seed, number)
     known = {} if knock.jaw_sigma_m is None else {"jaw_sigma_m": knock.jaw_sigma_m}

@@ -18,12 +18,12 @@ import cv2
 import msgspec
 
 from benchmarks import scene
+from gripmon.model.records import StateRecord
 from gripmon.monitor import Monitor
 from gripmon.record.write.columns import Row
 from gripmon.record.write.files import FileSeries
 from gripmon.record.write.wire import Events, Scene, make_scene, pack_trace
 from gripmon.record.write.worker import encode_picture
-from gripmon.model.records import StateRecord
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "report": ("--out", "report.html"),

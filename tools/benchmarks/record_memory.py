@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks import machine, scene
+from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 from gripmon.monitor import Monitor
 from gripmon.record.write import ProcessRecorder, open_recorder
-from gripmon.model.records import Frame, FrameRecord, MeasurementTrace
 
 FRAMES_PER_HOUR = round(3600 * scene.FPS)
 _LIGHT = {

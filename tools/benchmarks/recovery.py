@@ -139,8 +139,8 @@ def _monitor(camera: Any, gripper: Any, cam_T_grip: Any) -> Callable[[Any], Any]
     import numpy as np
 
     from gripmon.model.geometry import to_record
-    from gripmon.monitor import Monitor, MonitorSettings
     from gripmon.model.records import ReferenceRecord
+    from gripmon.monitor import Monitor, MonitorSettings
 
     sigma = np.array([2e-4] * 3 + [2e-3] * 3)
     covariance = tuple(np.diag(sigma**2).ravel().tolist())

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from benchmarks import tags
 from benchmarks.machine import ROOT
-from gripmon.model.camera import PaperLens, make_camera
 from gripmon.daemon.config import Config, load_config
+from gripmon.model.camera import PaperLens, make_camera
 from gripmon.model.geometry import from_record
 from gripmon.model.records import Frame
 from gripmon.simulate import Scenario, Simulator

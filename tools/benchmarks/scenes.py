@@ -22,13 +22,13 @@ from benchmarks.conditions import Condition, Draw, scenario
 from benchmarks.machine import ROOT
 from benchmarks.tags import FingerTags
 from gripmon.model.camera import Camera, PaperLens, make_camera
-from gripmon.track.edges import MeasurementSettings, TaughtEdges
 from gripmon.model.geometry import exp_rotation, make_transform, perturb, to_record
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord
 from gripmon.simulate import FrameTruth, Hidden, Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
+from gripmon.track.edges import MeasurementSettings, TaughtEdges
 
 CAMERA = PaperLens(
     width_px=768, height_px=576, fx_px=962.0, fy_px=962.0, cx_px=383.5, cy_px=287.5, kappa_per_px2=1.9e-7

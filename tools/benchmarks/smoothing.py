@@ -112,8 +112,8 @@ def _run(average: Any, error: Any, motion: Any, covariance: Any) -> tuple[Any, _
     import numpy as np
 
     from benchmarks.scene import FPS, config_for
-    from gripmon.model.geometry import from_record, perturb, perturbation_between
     from gripmon.judge.smoothing import PoseAverage
+    from gripmon.model.geometry import from_record, perturb, perturbation_between
 
     config = config_for((768, 576))
     settings = config.settings.monitor

@@ -11,16 +11,16 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import gripmon.track.edges.settling
 import gripmon.monitor.core
-from gripmon.track.edges import FingertipMeter
-from gripmon.judge.drift import MotionWatch
-from gripmon.monitor import Monitor, Tracker
-from gripmon.monitor.asking import Inquiry
-from gripmon.judge.policy import Policy
+import gripmon.track.edges.settling
 from gripmon.io.publish import ZenohPublisher
+from gripmon.judge.drift import MotionWatch
+from gripmon.judge.policy import Policy
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamWatch
+from gripmon.monitor import Monitor, Tracker
+from gripmon.monitor.asking import Inquiry
+from gripmon.track.edges import FingertipMeter
 
 STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "inspect the image": ((gripmon.monitor.core, "inspect"),),

@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 
 from gripmon.daemon.config import Config
-from gripmon.record.write import Notes, ProcessRecorder, Trace, open_recorder
 from gripmon.model.records import AlertRecord, Frame, FrameRecord, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.record.write import Notes, ProcessRecorder, Trace, open_recorder
 
 
 class SwitchedRecorder:

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from benchmarks import harness, scene
 from benchmarks.wire_others import Crowd, RouterProcess, Staller, free_endpoint
 from gripmon.io.publish import Publisher, ZenohPublisher
-from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.records import AlertRecord, FrameRecord, ReferenceRecord, StateRecord
 
 CONDITIONS = ("alone", "stopped", "blocked", "ten", "router")
 

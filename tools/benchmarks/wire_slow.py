@@ -19,8 +19,8 @@ from benchmarks.wire import MAX_AGE_S
 from benchmarks.wire_others import RouterProcess, free_endpoint
 from gripmon.client import Policy, TransformClient
 from gripmon.io.publish import ZenohPublisher
-from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.records import CornerRecord, Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict
 
 RATES_BYTES_PER_S = (100e3, 70e3, 30e3)
 POLICY = Policy(max_age_s=MAX_AGE_S)

@@ -182,8 +182,8 @@ def real_record() -> bytes:
     """What the monitor says of a picture of the demo's scene."""
     from benchmarks import scene
 
-    from gripmon.monitor import Monitor
     from gripmon.model.records import to_json
+    from gripmon.monitor import Monitor
 
     config, ring = scene.config_for((768, 576)), scene.render((768, 576), 4)
     monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)

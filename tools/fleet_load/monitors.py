@@ -16,6 +16,7 @@ from pathlib import Path
 import msgspec
 
 from gripmon.io.publish import ZenohPublisher
+from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -28,7 +29,6 @@ from gripmon.model.records import (
     StateRecord,
     Verdict,
 )
-from gripmon.io.wire import Link, PublishSettings
 
 _STATE_S, _ALERT_S = 1.0, 10.0
 _CAMERA = "wrist"

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array
 from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import AffectedRange, Displacement, Event, Limits
 from gripmon.analyse.report.formats import COVERAGE
 from gripmon.analyse.report.lives import MOTIONS
 from gripmon.analyse.report.track import Track, displacement
+from gripmon.model.records import Array
 
 _MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
 _RELIEF = 0.8  # of the limit, below which it is over

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
 from gripmon.analyse.report.affected import motion_ranges, verdict_ranges
 from gripmon.analyse.report.clock import straightened
 from gripmon.analyse.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
@@ -26,6 +25,7 @@ from gripmon.analyse.report.running import dropped_of, running_of
 from gripmon.analyse.report.source import Source, main_text
 from gripmon.analyse.report.track import Track, displacement, make_track
 from gripmon.analyse.report.words import headline, paragraph
+from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
 
 _END_FRAMES = 15
 _NEIGHBOURS = 6

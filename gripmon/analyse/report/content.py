@@ -267,7 +267,7 @@ class RecordingReport(msgspec.Struct, frozen=True, kw_only=True):
     ] = None
 
 
-class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.analyse.report/1"):
+class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.report/1"):
     """After a failed shift: what moved, when, how far, why, and what is affected."""
 
     summary: str

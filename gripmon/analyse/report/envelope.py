@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array
 from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import Curve
 from gripmon.analyse.report.formats import COVERAGE
 from gripmon.analyse.report.track import Track
+from gripmon.model.records import Array
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

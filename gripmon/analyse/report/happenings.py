@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.model.records import AlertKind, ReferenceRecord, Severity
 from gripmon.analyse.report.clock import SECOND_NS, Clock
 from gripmon.analyse.report.content import Event, Moment, Onset
 from gripmon.analyse.report.formats import count, duration
 from gripmon.analyse.report.lives import Life, explained, probability, worst
+from gripmon.model.records import AlertKind, ReferenceRecord, Severity
 
 TITLES = {
     AlertKind.VIBRATION: "The camera vibrated",

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.analyse.smoother import LEAST_FRAMES, ChangePoint, correct
-from gripmon.model.records import AlertKind, Severity
 from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import Displacement, Event, Limits, Moment, Onset
 from gripmon.analyse.report.limits import excess
 from gripmon.analyse.report.lives import MOTIONS
 from gripmon.analyse.report.source import Source
 from gripmon.analyse.report.track import Track, displacement
+from gripmon.analyse.smoother import LEAST_FRAMES, ChangePoint, correct
+from gripmon.model.records import AlertKind, Severity
 
 _NEAR_NS = SECOND_NS // 4  # an onset in the frames and its change point are no farther apart
 _ALIKE = (0.5, 2.0)  # times as large

@@ -8,8 +8,8 @@ from typing import Any
 import msgspec
 import yaml
 
-from gripmon.judge.policy import PolicySettings
 from gripmon.analyse.report.content import Limits
+from gripmon.judge.policy import PolicySettings
 
 
 def limits_of(main_text: str | None, affected_m: float | None, affected_rad: float | None) -> Limits:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Severity
 from gripmon.analyse.report.clock import Clock
+from gripmon.model.records import AlertEvent, AlertKind, AlertRecord, Cause, Severity
 
 MOTIONS = (AlertKind.STEP, AlertKind.CREEP, AlertKind.DRIFT)
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}

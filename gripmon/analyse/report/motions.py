@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from gripmon.model.records import AlertKind, Array, Severity
 from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import Displacement, Event, Moment, Onset
 from gripmon.analyse.report.hindsight import Hindsight
 from gripmon.analyse.report.lives import Life, Said, explained, probability, worst
 from gripmon.analyse.report.onsets import drift_onset, frame_noise, step_onset
 from gripmon.analyse.report.track import Track, displacement
+from gripmon.model.records import AlertKind, Array, Severity
 
 _SIDE_FRAMES = 15  # that a level is the median of
 _SETTLED = 0.95

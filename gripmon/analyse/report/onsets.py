@@ -6,10 +6,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array
 from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import Onset
 from gripmon.analyse.report.track import Track
+from gripmon.model.records import Array
 
 _SIDE = 5  # frames on either side of a step that are compared
 _BACK_NS = 5 * SECOND_NS  # a step is noticed within this time

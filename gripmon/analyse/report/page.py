@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.model.records import AlertKind, CauseWeight, Origin
 from gripmon.analyse.report import formats
 from gripmon.analyse.report.build import Told
 from gripmon.analyse.report.content import AffectedRange, Event, Noise, RecordingReport, Report
 from gripmon.analyse.report.lives import MOTIONS
 from gripmon.analyse.report.pictures import Looked, Shown, together
 from gripmon.analyse.report.words import CAUSES, cause_words
+from gripmon.model.records import AlertKind, CauseWeight, Origin
 
 _MOST_CARDS = 20  # events of one recording that are shown with pictures and all that was said
 _MOST_ROWS = 400
@@ -60,7 +60,10 @@ def page(report: Report, told: Sequence[Told], step: Callable[[], None] = lambda
             shown[n, event.number] = _pictures(each, event)
         step()
     environment = Environment(
-        loader=PackageLoader("gripmon.analyse.report", "page"), autoescape=True, undefined=StrictUndefined, trim_blocks=True
+        loader=PackageLoader("gripmon.analyse.report", "page"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
     )
     environment.globals.update(_VOCABULARY)
     environment.filters["units"] = _with_units

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array, StateRecord
 from gripmon.analyse.report.affected import runs_of_equal
 from gripmon.analyse.report.clock import SECOND_NS, Clock
 from gripmon.analyse.report.content import Noise, Running, Share, Slice, Stretch
 from gripmon.analyse.report.onsets import robust_sigma
 from gripmon.analyse.report.source import Source
 from gripmon.analyse.report.track import Track
+from gripmon.model.records import Array, StateRecord
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from gripmon.record.read import RecordedRun
 from gripmon.model.records import RecordedConfiguration
+from gripmon.record.read import RecordedRun
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.model.records import Array, ReferenceRecord
 from gripmon.analyse.report.content import Displacement
+from gripmon.model.records import Array, ReferenceRecord
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable

@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gripmon.model.records import AlertKind, Cause
 from gripmon.analyse.report.content import AffectedRange, Event, RecordingReport
-from gripmon.analyse.report.formats import clock_time, count, date, degrees, duration, millimetres, percent, period, size, span
+from gripmon.analyse.report.formats import (
+    clock_time,
+    count,
+    date,
+    degrees,
+    duration,
+    millimetres,
+    percent,
+    period,
+    size,
+    span,
+)
 from gripmon.analyse.report.limits import excess
 from gripmon.analyse.report.lives import MOTIONS
+from gripmon.model.records import AlertKind, Cause
 
 CAUSES: dict[str, str] = {
     Cause.CAMERA_MOUNT: "the camera's mount moved",

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gripmon.model.camera import LensSettings
 from gripmon.calibrate.interchange import kalibr, mrcal, opencv_storage, ros_camera_info
 from gripmon.calibrate.interchange.fault import InterchangeError
 from gripmon.calibrate.interchange.fitting import fit_brown_conrady
+from gripmon.model.camera import LensSettings
 
 FORMATS = ("ros", "kalibr", "opencv", "mrcal")
 LARGEST_FIT_PX = 1.0

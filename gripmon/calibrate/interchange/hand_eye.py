@@ -18,8 +18,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.calibrate.interchange.fault import number_text
+from gripmon.model.geometry import from_record, invert, to_record
 from gripmon.model.records import Array, Transform
 
 FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")

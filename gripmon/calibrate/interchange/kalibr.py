@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gripmon.model.camera import LensSettings
 from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
@@ -17,6 +16,7 @@ from gripmon.calibrate.interchange.fault import (
     whole_number_of,
 )
 from gripmon.calibrate.interchange.yaml_text import read_mapping
+from gripmon.model.camera import LensSettings
 
 _RIGHT = "a camchain of Kalibr: cam0: {camera_model, intrinsics, distortion_model, …}"
 _COUNTS = {"radtan": (4,), "equidistant": (4,), "none": (0,)}

@@ -8,7 +8,6 @@ from __future__ import annotations
 import ast
 from collections.abc import Sequence
 
-from gripmon.model.camera import LensSettings
 from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
@@ -17,6 +16,7 @@ from gripmon.calibrate.interchange.fault import (
     value_at,
     whole_number_of,
 )
+from gripmon.model.camera import LensSettings
 
 _RIGHT = "a .cameramodel of mrcal: { 'lensmodel': 'LENSMODEL_OPENCV8', 'intrinsics': […], … }"
 _COUNTS = {"LENSMODEL_PINHOLE": 0, **{f"LENSMODEL_OPENCV{n}": n for n in (4, 5, 8, 12)}}

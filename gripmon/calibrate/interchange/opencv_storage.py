@@ -12,7 +12,6 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from gripmon.model.camera import LensSettings
 from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
@@ -22,6 +21,7 @@ from gripmon.calibrate.interchange.fault import (
     numbers_of,
     whole_number_of,
 )
+from gripmon.model.camera import LensSettings
 
 _RIGHT = "a file that cv2.FileStorage wrote: camera_matrix, distortion_coefficients, image_width, image_height"
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix")

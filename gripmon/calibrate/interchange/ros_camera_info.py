@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from gripmon.model.camera import LensSettings
 from gripmon.calibrate.interchange.fault import (
     InterchangeError,
     brown_conrady,
@@ -23,6 +22,7 @@ from gripmon.calibrate.interchange.fault import (
     whole_number_of,
 )
 from gripmon.calibrate.interchange.yaml_text import read_mapping
+from gripmon.model.camera import LensSettings
 
 _RIGHT = "a camera_info file of ROS: image_width, camera_matrix, distortion_model, …"
 _MODELS = "plumb_bob, rational_polynomial or equidistant"

@@ -11,28 +11,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import gripmon
-from gripmon.model.camera import Camera, make_camera
 from gripmon.daemon.config.calibrated import CalibrationFiles, with_sections
 from gripmon.daemon.config.calibrated import mismatch as calibrated_mismatch
-from gripmon.daemon.config.checks import View, covariance_of, monitor_fault, predict_view, reference_transform, view_fault
+from gripmon.daemon.config.checks import (
+    View,
+    covariance_of,
+    monitor_fault,
+    predict_view,
+    reference_transform,
+    view_fault,
+)
 from gripmon.daemon.config.deprecated import with_alert_limit
 from gripmon.daemon.config.errors import ConfigError
 from gripmon.daemon.config.inputs import jaw_fault, network_fault, source_fault
 from gripmon.daemon.config.order import order_fault
-from gripmon.daemon.config.second import SECTION, SecondConfig, check_second_network, is_second, load_pulses, load_second
+from gripmon.daemon.config.second import (
+    SECTION,
+    SecondConfig,
+    check_second_network,
+    is_second,
+    load_pulses,
+    load_second,
+)
 from gripmon.daemon.config.session import joined_or_fault
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.track.edges import TaughtEdges, TaughtModel
-from gripmon.track.edges.taught import mismatch
+from gripmon.io.ros2 import fault_of as ros2_fault
+from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
+from gripmon.io.wire import Joining
+from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
+from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import LARGEST_EXTENT_M, AxisMotion, Gripper, GripperError, GripperModel, TableMotion
 from gripmon.model.records import Array, ReferenceRecord, to_json
-from gripmon.io.ros2 import fault_of as ros2_fault
-from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
-from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path
-from gripmon.io.wire import Joining
+from gripmon.track.edges import TaughtEdges, TaughtModel
+from gripmon.track.edges.taught import mismatch
 
 if TYPE_CHECKING:
     from gripmon.simulate import Scenario

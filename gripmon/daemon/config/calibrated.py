@@ -9,12 +9,12 @@ from typing import Any, TypeVar
 import msgspec
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
-from gripmon.model.camera import LensSettings
 from gripmon.daemon.config.errors import ConfigError
 from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.track.edges.taught import gripper_digest
+from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
+from gripmon.track.edges.taught import gripper_digest
 
 _T = TypeVar("_T")
 _WHAT = {

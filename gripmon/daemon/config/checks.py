@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.daemon.config.settings import ReferenceSettings
 from gripmon.daemon.config.typed import Fault
+from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.gripper import Gripper
-from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Array
+from gripmon.monitor import MonitorSettings
 
 NEAREST_M = 0.005
 FARTHEST_M = 5.0

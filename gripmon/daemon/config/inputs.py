@@ -6,7 +6,6 @@ from pathlib import Path
 
 from gripmon.daemon.config.settings import JawSettings, Settings
 from gripmon.daemon.config.typed import Fault
-from gripmon.model.gripper import Gripper
 from gripmon.io.ros2 import JOINT_STATE, RosNameError, subscription_key
 from gripmon.io.sources import (
     FolderSettings,
@@ -19,6 +18,7 @@ from gripmon.io.sources import (
 )
 from gripmon.io.sources.live import backend_number
 from gripmon.io.wire import PublishSettings
+from gripmon.model.gripper import Gripper
 
 _NETWORK_JAWS = ("zenoh", "ros2_joint_state")
 

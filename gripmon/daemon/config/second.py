@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.camera import Camera, make_camera
+from gripmon.daemon import DaemonSettings
 from gripmon.daemon.config.calibrated import wrong_schema
 from gripmon.daemon.config.errors import ConfigError
 from gripmon.daemon.config.inputs import network_fault, source_fault
@@ -19,16 +18,17 @@ from gripmon.daemon.config.session import second_joined_or_fault
 from gripmon.daemon.config.settings import Name
 from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
-from gripmon.daemon import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
+from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
+from gripmon.io.sources.pulses import read_pulses
+from gripmon.io.wire import Joining, PublishSettings
+from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.record.write import RecordingSettings, ViewSettings
-from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
-from gripmon.io.sources.pulses import read_pulses
 from gripmon.laser.watch import SpotWatchSettings
-from gripmon.io.wire import Joining, PublishSettings
+from gripmon.model.camera import Camera, make_camera
+from gripmon.record.write import RecordingSettings, ViewSettings
 
 SECTION = "laser"
 _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.model.camera import Camera
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import Fault
 from gripmon.io.metrics import MetricsSettings, package_fault
@@ -13,6 +12,7 @@ from gripmon.io.ros2.types import typestore
 from gripmon.io.sources import NetworkSettings, SourceError, SourceSettings
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining
+from gripmon.model.camera import Camera
 
 
 def joined_or_fault(settings: Settings, camera: Camera, directory: Path) -> Joining | Fault | None:

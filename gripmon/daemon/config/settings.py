@@ -7,15 +7,15 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.camera import LensSettings
 from gripmon.daemon import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
-from gripmon.monitor import MonitorSettings
-from gripmon.record.write import RecordingSettings, ViewSettings
 from gripmon.io.ros2 import JointOpening, Ros2Settings
 from gripmon.io.sources import SourceSettings
-from gripmon.judge.statefile import StateSettings
 from gripmon.io.wire import PublishSettings
+from gripmon.judge.statefile import StateSettings
+from gripmon.model.camera import LensSettings
+from gripmon.monitor import MonitorSettings
+from gripmon.record.write import RecordingSettings, ViewSettings
 
 Name = Annotated[
     str,

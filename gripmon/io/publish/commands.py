@@ -12,6 +12,8 @@ import zenoh
 
 from gripmon.io.publish.answers import Answers, send_now
 from gripmon.io.publish.presence import Presence, in_words
+from gripmon.io.wire import Keys, Link
+from gripmon.io.wire.malformed import Malformed
 from gripmon.model.records import (
     Command,
     CommandError,
@@ -24,8 +26,6 @@ from gripmon.model.records import (
     largest_bytes,
     to_json,
 )
-from gripmon.io.wire import Keys, Link
-from gripmon.io.wire.malformed import Malformed
 
 _log = logging.getLogger(__name__)
 
@@ -102,9 +102,10 @@ class PendingCommand:
 
 
 class ZenohCommands:
-    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`gripmon.model.records.CommandRequest` or none.
+    """The queryable ``gripmon/<robot>/<camera>/cmd/<name>``: payload a :class:`CommandRequest` or none.
 
-    It replies a :class:`gripmon.model.records.CommandReply` as JSON, or as an error a :class:`gripmon.model.records.CommandError`.
+    It replies a :class:`~gripmon.model.records.CommandReply` as JSON, or as an error a
+    :class:`~gripmon.model.records.CommandError`.
     What was carried out under an id is not carried out again: the last 256 answers are remembered.
     """
 

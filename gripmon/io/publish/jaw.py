@@ -11,10 +11,10 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.model.records import JawReading, MessageRefused, from_json, largest_bytes
 from gripmon.io.ros2 import JointOpening, MessageError, decode_joint_state
 from gripmon.io.wire import Link
 from gripmon.io.wire.malformed import Malformed
+from gripmon.model.records import JawReading, MessageRefused, from_json, largest_bytes
 
 LARGEST_OPENING_M = 0.5
 """No gripper file allows more."""

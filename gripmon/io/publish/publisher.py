@@ -13,8 +13,16 @@ import zenoh
 
 from gripmon.io.publish.answers import Answers
 from gripmon.io.publish.presence import Presence
-from gripmon.model.records import AlertRecord, ClockReading, FrameRecord, ReferenceRecord, SpotRecord, StateRecord, to_json
 from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
+from gripmon.model.records import (
+    AlertRecord,
+    ClockReading,
+    FrameRecord,
+    ReferenceRecord,
+    SpotRecord,
+    StateRecord,
+    to_json,
+)
 
 _T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON

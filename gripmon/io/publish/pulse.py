@@ -7,10 +7,10 @@ from collections import deque
 
 import zenoh
 
-from gripmon.laser.pulses.told import Told, of_message
-from gripmon.model.records import LaserPulse, MessageRefused, from_json, largest_bytes
 from gripmon.io.wire import Link
 from gripmon.io.wire.malformed import Malformed
+from gripmon.laser.pulses.told import Told, of_message
+from gripmon.model.records import LaserPulse, MessageRefused, from_json, largest_bytes
 
 _log = logging.getLogger(__name__)
 _WAITING_MOST = 64

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from gripmon.io.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, typestore
 from gripmon.model.pixels import ENCODINGS, unpacked
 from gripmon.model.records import Image
-from gripmon.io.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, typestore
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -45,8 +45,8 @@ def decode_image(payload: bytes) -> tuple[int, Image]:
     """``sensor_msgs/msg/Image`` -> stamp and image: H x W (one channel, and the brightness of ``yuv422``) or H x W x 3,
     BGR (colours, Bayer patterns).
 
-    The encodings are :data:`gripmon.model.pixels.ENCODINGS`; in the machine's byte order; it may be a read-only view of the
-    payload.
+    The encodings are :data:`gripmon.model.pixels.ENCODINGS`; in the machine's byte order; it may be a read-only view of
+    the payload.
     """
     message = _decoded(IMAGE, payload, MOST_IMAGE_BYTES)
     pixels = ENCODINGS.get(message.encoding)

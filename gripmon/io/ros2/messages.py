@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF, prepare, typestore
 from gripmon.model.geometry import from_record, invert, skew, to_record
 from gripmon.model.records import (
     Array,
@@ -20,7 +21,6 @@ from gripmon.model.records import (
     Transform,
     Verdict,
 )
-from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF, prepare, typestore
 
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""

@@ -8,13 +8,21 @@ from dataclasses import dataclass
 
 import zenoh
 
-from gripmon.model.records import AlertEvent, AlertRecord, FrameRecord, ReferenceRecord, StandingAlert, StateRecord, Transform
 from gripmon.io.ros2.messages import Messages, inverse
 from gripmon.io.ros2.names import Qos
 from gripmon.io.ros2.node import Node, TopicPublisher
 from gripmon.io.ros2.settings import Layout, Ros2Settings
 from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF
 from gripmon.io.wire import Link
+from gripmon.model.records import (
+    AlertEvent,
+    AlertRecord,
+    FrameRecord,
+    ReferenceRecord,
+    StandingAlert,
+    StateRecord,
+    Transform,
+)
 
 _log = logging.getLogger(__name__)
 

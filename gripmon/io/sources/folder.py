@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from gripmon.model.records import Frame, Image
 from gripmon.io.sources.base import SourceError
+from gripmon.model.records import Frame, Image
 
 if TYPE_CHECKING:
     from _csv import Reader as _Lines

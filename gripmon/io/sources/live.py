@@ -10,9 +10,9 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from gripmon.model.records import Frame
 from gripmon.io.sources.base import SourceError, Waiting
 from gripmon.io.sources.newest import NewestFrame
+from gripmon.model.records import Frame
 
 _log = logging.getLogger(__name__)
 _PAUSE_S = 0.25  # longest wait of the reading thread between two looks at the clock

@@ -10,7 +10,6 @@ from typing import Annotated, Literal, NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.io.sources.lateness import MOST_LATE_S, Lateness
 from gripmon.io.sources.payload import (
@@ -26,6 +25,7 @@ from gripmon.io.sources.payload import (
 from gripmon.io.wire import Link
 from gripmon.io.wire.malformed import Malformed
 from gripmon.io.wire.settings import KEY_PATTERN
+from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
 
 _log = logging.getLogger(__name__)
 

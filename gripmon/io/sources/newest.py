@@ -6,8 +6,8 @@ import logging
 import threading
 from typing import Protocol
 
-from gripmon.model.records import Frame
 from gripmon.io.sources.base import READ_TIMEOUT_S, Waiting
+from gripmon.model.records import Frame
 
 _log = logging.getLogger(__name__)
 _SILENT = Waiting("the camera is silent")

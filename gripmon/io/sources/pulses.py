@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gripmon.laser.pulses.told import Told, of_rows
 from gripmon.io.sources.base import SourceError
+from gripmon.laser.pulses.told import Told, of_rows
 
 COLUMNS = "stamp_ns,until_ns,tx_m,ty_m,tz_m,qx,qy,qz,qw"
 

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Frame, Image
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
+from gripmon.model.records import Frame, Image
 
 _log = logging.getLogger(__name__)
 _NS = 1_000_000_000

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from gripmon.model.records import Array, Frame
 from gripmon.io.sources.base import Source, SourceError
+from gripmon.model.records import Array, Frame
 
 if TYPE_CHECKING:
     from gripmon.model.camera import Camera

@@ -10,8 +10,8 @@ from typing import Annotated
 
 import msgspec
 
-from gripmon.model.records import Frame
 from gripmon.io.sources.base import SourceError
+from gripmon.model.records import Frame
 
 _log = logging.getLogger(__name__)
 _NS = 1_000_000_000

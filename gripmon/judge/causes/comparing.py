@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.judge.causes.baseline import Baseline
 from gripmon.judge.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
 from gripmon.judge.causes.pooling import Pooled
 from gripmon.judge.causes.state import EdgeView, State
 from gripmon.judge.causes.weighing import Errors, Weighed, weigh
+from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 

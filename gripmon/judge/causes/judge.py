@@ -12,11 +12,11 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.judge.causes.baseline import Baseline
 from gripmon.judge.causes.comparing import Comparison, Key, Report, compare
 from gripmon.judge.causes.pooling import Pooled, pool
 from gripmon.judge.causes.words import sentence
+from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import END_CORNERS, Array, Cause, CauseWeight, EdgeEvidence, Explanation
 

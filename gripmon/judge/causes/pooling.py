@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.judge.causes.state import EdgeView, State, edge_places
+from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence
 

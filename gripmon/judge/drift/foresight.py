@@ -39,7 +39,7 @@ class Foresight:
 
 
 def foresee(covariance: Array, settings: DriftSettings) -> Foresight:
-    """What the test of :mod:`gripmon.judge.drift.sequential` notices where frames have errors of ``covariance`` (6, 6)."""
+    """What :mod:`~gripmon.judge.drift.sequential` detects where frames have errors of ``covariance`` (6, 6)."""
     windows = np.full((len(LENGTHS), 1), np.inf)
     threshold, inflation = rarity(settings.false_alarms_per_day, settings.frames_per_s, windows)
     of_mean = _variance_of_means(np.array([*LENGTHS, 2 * LENGTHS[-1]], dtype=float))

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import f as fisher
 
-from gripmon.model.geometry import perturbation_between
 from gripmon.judge.recalibrate.stills import StillFrame
+from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, EdgeSums
 
 STRETCH_PX, EDGE_PX = 0.015, 0.03

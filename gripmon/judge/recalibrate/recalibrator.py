@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
-from gripmon.model.gripper import Gripper
 from gripmon.judge.recalibrate.edges import PooledEdges, fingers_disagree, leave_one_out, pool
 from gripmon.judge.recalibrate.pnp import (
     FEWEST_COPLANAR,
@@ -29,6 +27,8 @@ from gripmon.judge.recalibrate.pnp import (
 )
 from gripmon.judge.recalibrate.settings import RecalibrationSettings
 from gripmon.judge.recalibrate.stills import GATE, Average, MeanCorners, StillFrame, average, larger, mean_corners
+from gripmon.model.geometry import from_record, perturbation_between, rotation_angle
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceInputs, ReferenceRecord
 
 MOST_OUTLYING = 0.25

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane
 from gripmon.laser.pointer.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups
 from gripmon.laser.pointer.held_lens import with_held_lens
@@ -15,7 +16,6 @@ from gripmon.laser.pointer.misreading import SUSPECT_PX, check_reading
 from gripmon.laser.pointer.refinement import Refined, refine
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array
 

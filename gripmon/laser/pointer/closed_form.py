@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes
 from gripmon.calibrate.sighting import CalibrationError
+from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 

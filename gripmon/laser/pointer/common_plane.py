@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.closed_form import (
     FLAT,
     beam_in_hand,
@@ -27,7 +28,6 @@ from gripmon.laser.pointer.closed_form import (
 )
 from gripmon.laser.pointer.planar_start import SUBSET, planar_start
 from gripmon.laser.pointer.setup import LaserSetup, basis
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 

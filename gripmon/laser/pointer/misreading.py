@@ -7,10 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane
 from gripmon.laser.pointer.refinement import refine
 from gripmon.laser.pointer.spot_problem import SpotProblem
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array

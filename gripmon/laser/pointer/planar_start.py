@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.laser.pointer.setup import basis
 from gripmon.calibrate.sighting import CalibrationError
+from gripmon.laser.pointer.setup import basis
 from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)

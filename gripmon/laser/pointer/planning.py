@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.document import pose_jacobian
 from gripmon.laser.pointer.refinement import Refined
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup, spots_on_plane
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array

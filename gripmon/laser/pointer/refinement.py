@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher_f
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
 from gripmon.laser.pointer.spot_problem import SpotProblem, State
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import LensSettings
 from gripmon.model.records import Array
 

@@ -9,16 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gripmon.calibrate.sighting import NotFound
+from gripmon.judge.policy import AlertBook
 from gripmon.laser.pointer.document import LaserCalibration, setup_of
 from gripmon.laser.pointer.spots import Spot, find_spots
-from gripmon.calibrate.sighting import NotFound
-from gripmon.model.camera import make_camera
-from gripmon.model.geometry import from_record, perturb, quaternion_xyzw, skew
-from gripmon.judge.policy import AlertBook
 from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
 from gripmon.laser.pulses.settings import PulseSettings
 from gripmon.laser.pulses.standing import way_px
 from gripmon.laser.pulses.told import Told
+from gripmon.laser.watch import SpotFault, SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
+from gripmon.laser.watch.world import LEAST_NOISE_PX
+from gripmon.model.camera import make_camera
+from gripmon.model.geometry import from_record, perturb, quaternion_xyzw, skew
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -37,8 +39,6 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
-from gripmon.laser.watch import SpotFault, SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
-from gripmon.laser.watch.world import LEAST_NOISE_PX
 
 _IMAGE = "image"
 _IMAGE_ALERT_AFTER_S = 1.0

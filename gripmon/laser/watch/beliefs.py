@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.records import Array
 from gripmon.laser.watch.world import COUNT, Calibrated, foresee_moved
+from gripmon.model.records import Array
 
 PLACES = 12
 """Poses whose own offset is remembered; the one that was least recently visited is forgotten for a new one."""

@@ -12,8 +12,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.model.geometry import make_transform
-from gripmon.model.records import Array
 from gripmon.laser.watch.motion import UNIT
 from gripmon.laser.watch.motions import KINDS, SCALES, assumed
 from gripmon.laser.watch.moving import on_plane
@@ -21,6 +19,8 @@ from gripmon.laser.watch.sequential import LEAST_PULSES
 from gripmon.laser.watch.settings import SpotWatchSettings
 from gripmon.laser.watch.single import spread_px, visible
 from gripmon.laser.watch.world import CAMERA, COUNT, Calibrated, Foreseen, foresee, larger
+from gripmon.model.geometry import make_transform
+from gripmon.model.records import Array
 
 PULSES = (LEAST_PULSES, 10, 30, 100)
 POSES, ASSUMED_TILT_RAD, ASSUMED_DISTANCE_M = 9, math.radians(30.0), 0.3

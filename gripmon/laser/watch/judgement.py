@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.laser.pointer.spots import Spot
 from gripmon.calibrate.sighting import NotFound
+from gripmon.laser.pointer.spots import Spot
 from gripmon.model.records import Alert, Array, CauseWeight, State, Verdict
 from gripmon.model.records.values import OpenEnum
 

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from gripmon.model.records import Array
 from gripmon.laser.watch.beliefs import MOVED, Beliefs
 from gripmon.laser.watch.judgement import CameraMotion
 from gripmon.laser.watch.motions import SCALES
 from gripmon.laser.watch.world import CAMERA
+from gripmon.model.records import Array
 
 UNIT = np.array([0.01] * 3 + [0.01] * 3)
 """Metres and radians that count alike: half a metre off, 10 mrad move a point by 5 mm."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.model.records import Array, Cause
 from gripmon.laser.watch.world import CAMERA, COUNT, LASER, PLANE
+from gripmon.model.records import Array, Cause
 
 KINDS: tuple[tuple[Cause, slice, float], ...] = (
     (Cause.CAMERA_MOUNT, CAMERA, 0.3),

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 from gripmon.laser.watch import words
 from gripmon.laser.watch.beliefs import MOVED
 from gripmon.laser.watch.judgement import CameraMotion
@@ -17,6 +16,7 @@ from gripmon.laser.watch.motions import KINDS
 from gripmon.laser.watch.sequential import MotionTest
 from gripmon.laser.watch.settings import SpotWatchSettings
 from gripmon.laser.watch.world import CAMERA, Calibrated, World, foresee, foresee_moved
+from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 
 MAYBE = 0.05
 """Probability from which a motion of the camera is told."""

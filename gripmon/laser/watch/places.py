@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from gripmon.laser.watch.beliefs import PLACES
 from gripmon.model.geometry import rotation_angle
 from gripmon.model.records import Array
-from gripmon.laser.watch.beliefs import PLACES
 
 SAME_M, SAME_RAD = 5e-3, 0.02
 """How far apart poses of one place are at most: less than what an arm's error changes over."""

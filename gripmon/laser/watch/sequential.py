@@ -19,10 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.model.records import Array
 from gripmon.laser.watch.beliefs import MOVED, Bank, Beliefs, Pulse, as_calibrated
 from gripmon.laser.watch.motions import BACK, newborn
 from gripmon.laser.watch.world import Calibrated
+from gripmon.model.records import Array
 
 LEAST_PULSES = 3
 """That speak for a motion before it is said: two wrong spots may look like one."""

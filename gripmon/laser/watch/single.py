@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.laser.pointer.spots import Spot
-from gripmon.model.records import Array
 from gripmon.laser.watch.judgement import Disagreement
 from gripmon.laser.watch.ways import INPUTS, disagreements, ways
 from gripmon.laser.watch.world import COUNT, Calibrated, Foreseen, larger
+from gripmon.model.records import Array
 
 MOST_UNCERTAIN = 0.1
 """Of the image's diagonal: a foreseen spot that is less certain is none."""

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.laser.pointer.spots import Spot
 from gripmon.calibrate.sighting import NotFound
 from gripmon.judge.policy import AlertBook
-from gripmon.model.records import Alert, State, Verdict
+from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.laser.pointer.spots import Spot
 from gripmon.laser.watch import words
 from gripmon.laser.watch.beliefs import Pulse
 from gripmon.laser.watch.judgement import SpotFault, SpotJudgement, SpotSeen
@@ -22,6 +21,7 @@ from gripmon.laser.watch.sequential import MotionTest
 from gripmon.laser.watch.settings import SpotWatchSettings
 from gripmon.laser.watch.single import Single, alone, visible
 from gripmon.laser.watch.world import Foreseen, calibrated, foresee, larger
+from gripmon.model.records import Alert, State, Verdict
 
 MOTION, VIEW = "motion", "view"
 """What alerts are about."""

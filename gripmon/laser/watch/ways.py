@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.laser.pointer.setup import basis, origin_axes
+from gripmon.laser.watch.judgement import Disagreement
+from gripmon.laser.watch.world import COUNT, World
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import skew
 from gripmon.model.records import Array
-from gripmon.laser.watch.judgement import Disagreement
-from gripmon.laser.watch.world import COUNT, World
 
 BEAM_PLANE, RAY_PLANE, BEAM_RAY = "beam and plane", "ray and plane", "beam and ray"
 BEAM, RAY = "beam", "ray"

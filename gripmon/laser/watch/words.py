@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 from gripmon.laser.watch.judgement import CameraMotion, SpotFault
+from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity
 
 _WHAT = {
     Cause.CAMERA_MOUNT: "the camera",

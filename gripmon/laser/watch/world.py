@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.document import NAMES, LaserCalibration
 from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes, pose_slopes, spots_on_plane
-from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, make_camera
 from gripmon.model.geometry import from_record, perturb, skew
 from gripmon.model.records import Array

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.gripper.faces import LARGEST_SKEW, LARGEST_WARP_M, FaceLoop, extent_m, normal_of, off_plane_m, triangles
+from gripmon.model.gripper.faces import (
+    LARGEST_SKEW,
+    LARGEST_WARP_M,
+    FaceLoop,
+    extent_m,
+    normal_of,
+    off_plane_m,
+    triangles,
+)
 from gripmon.model.gripper.model import EdgeModel, FaceModel, GripperError, GripperModel, JawModel
 from gripmon.model.gripper.motion import motion_table, offset_m
 from gripmon.model.records import Array

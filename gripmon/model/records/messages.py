@@ -102,7 +102,7 @@ class ClockReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon
     ]
 
 
-class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.track.jaw/1"):
+class JawReading(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.jaw/1"):
     """The opening of the jaws, which the robot writes."""
 
     stamp_ns: Annotated[int, Meta(description="when it was measured, Unix ns; 0 if that isn't known")]

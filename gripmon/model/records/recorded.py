@@ -15,7 +15,7 @@ from gripmon.model.records.commands import CommandName
 from gripmon.model.records.references import MonitorState
 
 
-class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.record.write/1"):
+class Meta(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.recording/1"):
     """What a file is: the files of one run have one ``recording_id``."""
 
     name: Annotated[str, msgspec.Meta(description="the files' name before their number")]

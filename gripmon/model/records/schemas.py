@@ -1,7 +1,7 @@
 """The messages by name, and reading one that may come from anybody.
 
 A message says its schema and that one's major version, ``"schema": "gripmon.transform/1"``.  Within a major version
-fields and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader passes over what it doesn't know.
+fields and names (:class:`gripmon.model.records.values.OpenEnum`) may be added; a reader ignores what it doesn't know.
 """
 
 from __future__ import annotations

@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gripmon.model.atomic import opened_atomically, remove_leftovers
+from gripmon.model.records import ReferenceRecord
 from gripmon.record.export.schemas import SCHEMAS
 from gripmon.record.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
 from gripmon.record.read import RecordedRun
-from gripmon.model.records import ReferenceRecord
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""

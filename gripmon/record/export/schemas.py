@@ -157,7 +157,7 @@ def _schema(table: str, columns: list[_Column]) -> pa.Schema:
     fields = [pa.field(name, kind, metadata={"unit": unit, "description": text}) for name, kind, unit, text in columns]
     units = {name: unit for name, _, unit, _ in columns if unit}
     about = {
-        "gripmon.schema": f"gripmon.record.export.{table}/1",
+        "gripmon.schema": f"gripmon.export.{table}/1",
         "gripmon.version": __version__,
         "gripmon.units": json.dumps(units),
     }

@@ -10,10 +10,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from gripmon.record.export.schemas import AXES, POSE, SCHEMAS, TIME, TRIANGLE, UPPER
-from gripmon.record.read import FrameTable
 from gripmon.model.records import AlertRecord, ReferenceRecord, StateRecord, Transform
 from gripmon.model.records.recorded import RecordedCommand
+from gripmon.record.export.schemas import AXES, POSE, SCHEMAS, TIME, TRIANGLE, UPPER
+from gripmon.record.read import FrameTable
 
 _Row = dict[str, Any]
 

@@ -13,10 +13,6 @@ from typing import Any, Protocol
 import msgspec
 import numpy as np
 
-from gripmon.record.read import entities
-from gripmon.record.read.container import FRAME, Block, Chunk, Manifest, RrdFile, Span, StoreName, texts_of
-from gripmon.record.read.lenient import DECODING_ERRORS, read
-from gripmon.record.read.table import IntArray, Line, TableBuilder
 from gripmon.model.records import (
     AlertRecord,
     FrameRecord,
@@ -27,6 +23,10 @@ from gripmon.model.records import (
     StateRecord,
     schema_name,
 )
+from gripmon.record.read import entities
+from gripmon.record.read.container import FRAME, Block, Chunk, Manifest, RrdFile, Span, StoreName, texts_of
+from gripmon.record.read.lenient import DECODING_ERRORS, read
+from gripmon.record.read.table import IntArray, Line, TableBuilder
 
 _BLOCK_BYTES = 1 << 20
 _ABOUT = re.compile(r"^# (.+?) / (.+)$", re.MULTILINE)

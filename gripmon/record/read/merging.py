@@ -12,10 +12,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.record.read import entities
-from gripmon.record.read.container import Block
-from gripmon.record.read.contents import Contents
-from gripmon.record.read.table import FrameTable, IntArray, TableBuilder
 from gripmon.model.records import (
     AlertRecord,
     FrameRecord,
@@ -25,6 +21,10 @@ from gripmon.model.records import (
     ReferenceRecord,
     StateRecord,
 )
+from gripmon.record.read import entities
+from gripmon.record.read.container import Block
+from gripmon.record.read.contents import Contents
+from gripmon.record.read.table import FrameTable, IntArray, TableBuilder
 
 UNKNOWN = "unknown"
 _NUMBERED = re.compile(r"-(\d{4,})$")

@@ -11,12 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.record.read import entities
-from gripmon.record.read.container import Block
-from gripmon.record.read.contents import Contents, frame_numbers
-from gripmon.record.read.lenient import read
-from gripmon.record.read.merging import Merged, merge
-from gripmon.record.read.table import FrameTable, IntArray
 from gripmon.model.records import (
     AlertRecord,
     CornerRecord,
@@ -28,6 +22,12 @@ from gripmon.model.records import (
     ReferenceRecord,
     StateRecord,
 )
+from gripmon.record.read import entities
+from gripmon.record.read.container import Block
+from gripmon.record.read.contents import Contents, frame_numbers
+from gripmon.record.read.lenient import read
+from gripmon.record.read.merging import Merged, merge
+from gripmon.record.read.table import FrameTable, IntArray
 
 _BLOCKS_KEPT = 16
 Pixels = NDArray[np.float32]

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 from gripmon.record.read.opening import open_recordings
 from gripmon.record.read.recordings import Recording, Shot, decode_image
-from gripmon.model.records import Frame, FrameRecord, RecordedCommand, RecordedConfiguration, ReferenceRecord, Refusal
 
 _NEVER_AS_IMAGE = frozenset({Refusal.NOT_AN_IMAGE, Refusal.WRONG_TYPE, Refusal.NOT_FINITE})
 """What looks like another image, or like none, once it has been encoded with 8 bits."""

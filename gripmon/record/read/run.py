@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from gripmon.record.read.table import FrameTable
 from gripmon.model.records import AlertRecord, Meta, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.record.read.table import FrameTable
 
 
 class RecordedRun(Protocol):
-    """What recordings say of one run of one monitor, or a part of it, as :class:`gripmon.record.read.Recording` does."""
+    """What recordings hold of one run of one monitor, or of a part, as :class:`gripmon.record.read.Recording` does."""
 
     @property
     def recording_id(self) -> str: ...

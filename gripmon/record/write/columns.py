@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import rerun as rr
 
-from gripmon.record.write.wire import TraceNote
 from gripmon.model.records import FrameRecord, Limits, SpotRecord
+from gripmon.record.write.wire import TraceNote
 
 
 @dataclass(frozen=True, slots=True)

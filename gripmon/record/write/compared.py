@@ -12,6 +12,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
+from gripmon.model.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord, StateRecord
 from gripmon.record.read.replayed import RecordedFrames
 from gripmon.record.write import palette
 from gripmon.record.write.columns import Picture, Row, Sender
@@ -23,7 +24,6 @@ from gripmon.record.write.recorder import Notes, Trace
 from gripmon.record.write.rows import RowWriter
 from gripmon.record.write.wire import Events, Scene, pack_trace
 from gripmon.record.write.worker import measured_picture
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord, StateRecord
 
 RECORDED, REPLAYED = "recorded", "replayed"
 _BATCH_ROWS = 32

@@ -30,10 +30,10 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from gripmon.model.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 from gripmon.record.write import palette
 from gripmon.record.write.columns import Row, Sender
 from gripmon.record.write.wire import Scene, TraceNote, pairs
-from gripmon.model.records import AlertEvent, AlertKind, FrameRecord, Limits, ReferenceRecord, Severity
 
 _XYZ = ["x", "y", "z"]
 _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]

@@ -7,9 +7,6 @@ from dataclasses import dataclass
 
 import rerun as rr
 
-from gripmon.record.write import palette
-from gripmon.record.write.columns import AnyRow, Sender
-from gripmon.record.write.wire import Events
 from gripmon.model.records import (
     Alert,
     AlertEvent,
@@ -21,6 +18,9 @@ from gripmon.model.records import (
     Verdict,
     to_json,
 )
+from gripmon.record.write import palette
+from gripmon.record.write.columns import AnyRow, Sender
+from gripmon.record.write.wire import Events
 
 _LONGEST_SILENCE_NS = 86_400_000_000_000  # between a frame and what belongs to none: a day
 _LEVELS = {Severity.INFO: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}

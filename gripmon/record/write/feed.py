@@ -13,18 +13,6 @@ from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from gripmon.record.write.health import Health
-from gripmon.record.write.process import WorkerProcess
-from gripmon.record.write.recorder import Notes, Trace
-from gripmon.record.write.wire import (
-    EncodedBatch,
-    Events,
-    FrameNote,
-    ImageNote,
-    ImageRing,
-    Scene,
-    pack_trace,
-)
 from gripmon.model.records import (
     AlertRecord,
     Frame,
@@ -38,6 +26,18 @@ from gripmon.model.records import (
     State,
     StateRecord,
     Verdict,
+)
+from gripmon.record.write.health import Health
+from gripmon.record.write.process import WorkerProcess
+from gripmon.record.write.recorder import Notes, Trace
+from gripmon.record.write.wire import (
+    EncodedBatch,
+    Events,
+    FrameNote,
+    ImageNote,
+    ImageRing,
+    Scene,
+    pack_trace,
 )
 
 _log = logging.getLogger(__name__)

@@ -16,6 +16,8 @@ from typing import Any
 
 import rerun as rr
 
+from gripmon.model.records import AlertRecord
+from gripmon.record.rerun_private import free_closed_streams
 from gripmon.record.write.budget import DiskBudget, claim, is_being_written, space_missing
 from gripmon.record.write.columns import AnyRow
 from gripmon.record.write.layout import layout_file
@@ -24,8 +26,6 @@ from gripmon.record.write.repair import is_complete, repair
 from gripmon.record.write.ring import Moments
 from gripmon.record.write.wire import Events, Scene
 from gripmon.record.write.writers import Writer, make_writer
-from gripmon.model.records import AlertRecord
-from gripmon.record.rerun_private import free_closed_streams
 
 APPLICATION_ID = "gripmon"
 _FIRST_RETRY_S = 1.0

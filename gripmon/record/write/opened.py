@@ -10,12 +10,12 @@ import msgspec
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
+from gripmon.model.records import RecordedConfiguration, ReferenceRecord
 from gripmon.record.write.feed import ProcessRecorder, Truth
 from gripmon.record.write.recorder import NullRecorder, Recorder, SpotRecorder
 from gripmon.record.write.settings import RecordingSettings
 from gripmon.record.write.view import ViewSettings
 from gripmon.record.write.wire import make_scene, make_spot_scene
-from gripmon.model.records import RecordedConfiguration, ReferenceRecord
 
 
 def open_recorder(

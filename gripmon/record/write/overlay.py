@@ -9,9 +9,9 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from gripmon.model.records import FrameRecord
 from gripmon.record.write import palette
 from gripmon.record.write.wire import Scene, TraceNote, pairs
-from gripmon.model.records import FrameRecord
 
 if TYPE_CHECKING:
     from gripmon.record.write.columns import Row, Sender

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import msgspec
 
+from gripmon.model.records import Limits
 from gripmon.record.write.health import SILENT_AFTER_S, stands_still
 from gripmon.record.write.wire import ImageRing, Scene, Status, framed
-from gripmon.model.records import Limits
 
 # The working directory must not be searched for modules (-P), but where this package came from must.
 _BOOTSTRAP = (

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import rerun as rr
 
+from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Verdict
 from gripmon.record.write import palette
 from gripmon.record.write.wire import Scene
-from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Verdict
 
 if TYPE_CHECKING:
     from gripmon.record.write.columns import Row, Sender

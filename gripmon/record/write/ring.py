@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from gripmon.record.write.columns import AnyRow
 from gripmon.model.records import Alert, AlertEvent, AlertKind, AlertRecord, Severity
+from gripmon.record.write.columns import AnyRow
 
 _RANK = {Severity.INFO: 0, Severity.WARNING: 1, Severity.ERROR: 2}
 _MOMENTS_KEPT = 64

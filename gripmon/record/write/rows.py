@@ -26,6 +26,7 @@ from collections.abc import Sequence
 
 import rerun as rr
 
+from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 from gripmon.record.write.columns import Row, Sender
 from gripmon.record.write.curves import CurveWriter
 from gripmon.record.write.events import EventWriter, Line
@@ -33,7 +34,6 @@ from gripmon.record.write.overlay import OverlayWriter
 from gripmon.record.write.rig import RigWriter
 from gripmon.record.write.settings import RecordingSettings
 from gripmon.record.write.wire import Events, Scene
-from gripmon.model.records import FrameRecord, Meta, ReferenceRecord, to_json
 
 
 class RowWriter:

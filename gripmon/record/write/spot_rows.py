@@ -26,6 +26,7 @@ import rerun as rr
 from gripmon.laser.pointer.document import LaserCalibration, setup_of
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
+from gripmon.model.records import Array, SpotRecord, to_json
 from gripmon.record.write import palette
 from gripmon.record.write.columns import Sender, SpotRow
 from gripmon.record.write.events import EventWriter
@@ -33,7 +34,6 @@ from gripmon.record.write.laser_scene import plane_corners
 from gripmon.record.write.rows import log_origin
 from gripmon.record.write.spot_layout import IMAGE
 from gripmon.record.write.wire import Events, Scene
-from gripmon.model.records import Array, SpotRecord, to_json
 
 _AXIS_M, _SIDE = 0.1, 0.4
 _SPOT_PX = 2.5

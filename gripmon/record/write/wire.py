@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
-from gripmon.record.write.settings import RecordingSettings
-from gripmon.record.write.view import ViewSettings
 from gripmon.model.records import (
     AlertRecord,
     Array,
@@ -28,6 +26,8 @@ from gripmon.model.records import (
     SpotRecord,
     StateRecord,
 )
+from gripmon.record.write.settings import RecordingSettings
+from gripmon.record.write.view import ViewSettings
 
 _JAW_SAMPLES = 33
 _LENGTH_BYTES = 4

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
 from gripmon.record.write.columns import AnyRow, Picture, Row, SpotRow
 from gripmon.record.write.files import FileSeries
 from gripmon.record.write.live import LiveStream, NoFiles
@@ -22,7 +23,6 @@ from gripmon.record.write.pins import pinned_by
 from gripmon.record.write.ring import Moments, PictureRing, Trigger
 from gripmon.record.write.settings import RecordingSettings
 from gripmon.record.write.wire import Batch, FrameNote, ImageRing, Scene, Status, Unframer
-from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
 
 _NICENESS = 5  # the loop goes first when both want the same core; at 10 a busy machine kept it waiting for seconds
 _STDIN = 0

@@ -11,17 +11,17 @@ import msgspec
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges import TaughtEdges
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper
-from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Array, Image, ReferenceRecord
+from gripmon.monitor import MonitorSettings
 from gripmon.teach.edges.corner_pose import CameraError, CornerPose, PoseRefused, pose_from_corners
 from gripmon.teach.edges.measure import Taught, teach
 from gripmon.teach.edges.placing import Prior, place, prior_of, usual_view
 from gripmon.teach.edges.prospects import Prospects, prospects
 from gripmon.teach.edges.snapping import Snapped, Snapper
 from gripmon.teach.edges.views import TeachingImage, TeachingRefused
+from gripmon.track.edges import TaughtEdges
 
 LARGEST_OFF_PX = 100_000.0
 """Corners are put in the image, or beside it; nothing farther is meant."""

@@ -14,10 +14,10 @@ import numpy as np
 
 from gripmon.calibrate.intrinsics import lens_vector, model_of
 from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.records import Array
 from gripmon.teach.edges.snapping import Snapped
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from gripmon.track.edges.taught import TaughtEdge, sight_axes
 from gripmon.model.records import Array
 from gripmon.teach.edges.lines import Line
 from gripmon.teach.edges.pooling import Pooled, pool
 from gripmon.teach.edges.shape import SLOPE_SHARE, UNKNOWN_SLOPE, slopes
 from gripmon.teach.edges.views import Sampled, Viewer
+from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
 """So far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.edges.prediction import STRETCH
 from gripmon.model.records import Array
+from gripmon.track.edges.prediction import STRETCH
 
 _TUKEY = 4.685
 _START_PX = 1.0  # half width of a line while it is looked for: two lines closer than this are one to a blurred image

@@ -8,12 +8,12 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.edges.prediction import STEP_PX
-from gripmon.track.edges.profiles import full_scale
-from gripmon.track.edges.taught import Look
 from gripmon.model.records import Array
 from gripmon.teach.edges.estimate import EdgeLines
 from gripmon.teach.edges.views import View, Viewer
+from gripmon.track.edges.prediction import STEP_PX
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import Look
 
 NEAR_PX, FAR_PX = 1.5, 3.0
 """Where a side's grey level is taken: beyond the edge's blur, before the next feature (px, times the zoom)."""

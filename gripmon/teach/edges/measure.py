@@ -18,18 +18,18 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
+from gripmon.judge.smoothing import GATE
 from gripmon.model.camera import Camera
-from gripmon.track.edges import Measurement, MeasurementSettings
-from gripmon.track.edges.taught import TaughtCorner, TaughtEdge, TaughtEdges
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord
-from gripmon.judge.smoothing import GATE
 from gripmon.teach.edges.checks import check_edges, check_enough, check_reference, check_standing
 from gripmon.teach.edges.estimate import SHAPE_M, EdgeLines, estimate_edges
 from gripmon.teach.edges.lines import find_line, of_image, settle_line
 from gripmon.teach.edges.looks import edge_looks
 from gripmon.teach.edges.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
+from gripmon.track.edges import Measurement, MeasurementSettings
+from gripmon.track.edges.taught import TaughtCorner, TaughtEdge, TaughtEdges
 
 T = TypeVar("T")
 

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges.profiles import full_scale
-from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
 from gripmon.teach.edges.views import TeachingImage
+from gripmon.track.edges.profiles import full_scale
+from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 
 Picture = Image
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.recalibrate import RecalibrationRefused, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
-from gripmon.judge.recalibrate import RecalibrationRefused, solutions
 from gripmon.model.records import Array, ReferenceRecord
 
 ROUGH_SHARE = 0.006

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gripmon.model.camera import Camera
-from gripmon.track.edges import TaughtEdges
 from gripmon.judge.drift import foresee
+from gripmon.judge.recalibrate import refusal
+from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, ReferenceRecord
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings
 from gripmon.teach.forecast import FEWEST_EDGES, Promise, expect, promise
-from gripmon.judge.recalibrate import refusal
-from gripmon.model.records import Array, ReferenceRecord
+from gripmon.track.edges import TaughtEdges
 
 
 @dataclass(frozen=True, slots=True)

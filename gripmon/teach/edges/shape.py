@@ -28,7 +28,7 @@ def slopes(
     """(e,) depth of an edge's rim for each metre of its offset across the line of sight (e,); NaN where the gripper
     file has no two faces at the edge.
 
-    ``axes`` as :func:`gripmon.track.edges.taught.sight_axes` gives them.  An outline of equal bevels is the rim that lies
+    ``axes`` as :func:`sight_axes` gives them.  An outline of equal bevels is the rim that lies
     farther out, a crease shows the rim on the side to which it is shifted.
     """
     across, depth = axes

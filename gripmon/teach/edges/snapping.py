@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
-from gripmon.track.edges.settling import ZOOMS, Expected
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image
 from gripmon.teach.edges.placing import Placed, Prior, place, rough_sigma_px
+from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.track.edges.settling import ZOOMS, Expected
 
 FEWEST_PUT = 4
 """Corners that must be put by hand before edges are looked for, where there is no reference."""

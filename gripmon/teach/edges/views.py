@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image, ReferenceRecord
+from gripmon.teach.edges.lines import EdgePoints
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import (
@@ -24,10 +28,6 @@ from gripmon.track.edges.profiles import (
     read_profiles,
 )
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
-from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image, ReferenceRecord
-from gripmon.teach.edges.lines import EdgePoints
 
 USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected: before clutter, or with bevels, fewer agree than in quiet images."""

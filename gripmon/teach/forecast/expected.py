@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.geometry import from_record, invert
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image, Protection, ReferenceRecord
+from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
+from gripmon.teach.forecast.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.track.edges.consensus import Consensus, Votes
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import Candidates
 from gripmon.track.edges.uncertainty import Uncertainty, assess
-from gripmon.model.geometry import from_record, invert
-from gripmon.model.gripper import Gripper
-from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
-from gripmon.teach.forecast.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
-from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 
 EDGE_POINT_SIGMA_PX = 0.05
 """Assumed of every edge point, beside the floors in the settings: steps of 40 grey levels in noise of 1.5 give it."""

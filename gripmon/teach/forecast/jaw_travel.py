@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.records import Array
 from gripmon.teach.forecast.expected import foresee_frame
 from gripmon.teach.forecast.promise import Promise, promise
 from gripmon.teach.forecast.visibility import Rig, Sight, see
-from gripmon.model.records import Array
 
 OPENINGS = 121
 """Openings that are looked at; where the view fails between two that both suffice is not seen."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.model.geometry import exp_rotation, make_transform
-from gripmon.teach.forecast.visibility import Rig, Sight, see
 from gripmon.model.records import Array
+from gripmon.teach.forecast.visibility import Rig, Sight, see
 
 SOUGHT_M = 1.0
 """How far a shift of the camera is followed."""

@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.drift import DriftSettings, foresee
+from gripmon.judge.recalibrate import refusal
+from gripmon.model.records import Array
 from gripmon.monitor import CORNER_COUNTS
 from gripmon.teach.forecast.expected import Foreseen, foresee_frame
 from gripmon.teach.forecast.margins import border, moved_camera, sideways_m
 from gripmon.teach.forecast.mounts import Mount
 from gripmon.teach.forecast.promise import Promise, promise
 from gripmon.teach.forecast.visibility import Rig, Sight, see
-from gripmon.judge.recalibrate import refusal
-from gripmon.model.records import Array
 
 OPENINGS = 25
 """Openings over the jaw's travel at which a mount's view is looked at."""

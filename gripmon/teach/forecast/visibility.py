@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges import TaughtEdges
-from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
 from gripmon.model.geometry import invert
 from gripmon.model.gripper import Gripper
-from gripmon.monitor import MonitorSettings
 from gripmon.model.records import Array
+from gripmon.monitor import MonitorSettings
+from gripmon.track.edges import TaughtEdges
+from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
 
 FEWEST_EDGES = 3
 """Edges that must be seen for a fit to be believed."""

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from gripmon.track.edges.profiles import read_profiles
-from gripmon.teach.onboarding.plate_print import PlatePrint
 from gripmon.model.records import Array, Image
+from gripmon.teach.onboarding.plate_print import PlatePrint
+from gripmon.track.edges.profiles import read_profiles
 
 _FINE = 3
 """Samples of the prediction a pixel."""

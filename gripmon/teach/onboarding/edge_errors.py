@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.track.edges.consensus import ConsensusSettings
-from gripmon.track.edges.prediction import STRETCH
 from gripmon.model.records import Array
 from gripmon.teach.edges.lines import EdgePoints, Line
+from gripmon.track.edges.consensus import ConsensusSettings
+from gripmon.track.edges.prediction import STRETCH
 
 _FEWEST_FREE = 3.0
 _LEAST_PX = 0.01

@@ -12,12 +12,12 @@ from gripmon.calibrate.plane import FingerCorners
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS, stand
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
-from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 from gripmon.teach.onboarding.outlines import Outline
 from gripmon.teach.onboarding.plate_print import PlatePrint
 from gripmon.teach.onboarding.snapping import Snapped, snap
-from gripmon.model.records import Array, Image
+from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 
 JAW_SIGMA_M = 2e-4
 USUAL_SHARE = 0.6

@@ -14,6 +14,8 @@ from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.calibrate.targets import Target
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Image
 from gripmon.teach.onboarding.measuring import (
     check_rough,
     contact_height_m,
@@ -23,8 +25,6 @@ from gripmon.teach.onboarding.measuring import (
 )
 from gripmon.teach.onboarding.outlines import Outline, inferred_model, outlines_of, points_in_gripper
 from gripmon.teach.onboarding.plate_print import plate_print
-from gripmon.model.provenance import Provenance
-from gripmon.model.records import Array, Image
 
 Rough = Mapping[str, tuple[float, float]]
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from gripmon.calibrate.plane import Coincidence
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.track.edges.profiles import full_scale
 from gripmon.model.records import Array, Image
+from gripmon.track.edges.profiles import full_scale
 
 _WIDTH_PX = 1400
 _LARGEST_ZOOM = 4

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from gripmon.calibrate.sighting import Sighting
 from gripmon.calibrate.targets import Charuco, Chequerboard, Target
 from gripmon.model.camera import Camera
-from gripmon.track.edges.profiles import read_profiles
 from gripmon.model.records import Array, Image
+from gripmon.track.edges.profiles import read_profiles
 
 _BESIDE = 0.1
 """Of a square, from a corner along both axes: so near a square shows its own colour, before any mark in it."""

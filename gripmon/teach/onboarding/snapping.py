@@ -12,6 +12,12 @@ import numpy as np
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
+from gripmon.model.records import Array, Image
+from gripmon.teach.edges.lines import EdgePoints, settle_line
+from gripmon.teach.onboarding.before_print import look_at, moves, rough_line, sharpness
+from gripmon.teach.onboarding.edge_errors import SeenEdge, line_covariances
+from gripmon.teach.onboarding.outlines import INNERMOST, Outline
+from gripmon.teach.onboarding.plate_print import PlatePrint
 from gripmon.track.edges.prediction import ROWS
 from gripmon.track.edges.profiles import (
     EdgeSettings,
@@ -22,12 +28,6 @@ from gripmon.track.edges.profiles import (
     quantum,
     read_profiles,
 )
-from gripmon.teach.onboarding.before_print import look_at, moves, rough_line, sharpness
-from gripmon.teach.onboarding.edge_errors import SeenEdge, line_covariances
-from gripmon.teach.onboarding.outlines import INNERMOST, Outline
-from gripmon.teach.onboarding.plate_print import PlatePrint
-from gripmon.model.records import Array, Image
-from gripmon.teach.edges.lines import EdgePoints, settle_line
 
 REACH_PX = 10.0
 """So far from its rough ends an edge is looked for."""

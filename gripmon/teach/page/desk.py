@@ -16,11 +16,11 @@ import cv2
 import numpy as np
 
 from gripmon import __version__
-from gripmon.model.geometry import from_record, rotation_angle
+from gripmon.io.sources import Source, Waiting
 from gripmon.judge.inspection import inspect
+from gripmon.model.geometry import from_record, rotation_angle
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image
-from gripmon.io.sources import Source, Waiting
 from gripmon.teach.edges.bench import Bench, Found, rough_fault
 from gripmon.teach.edges.snapping import FEWEST_PUT, SnappedCorner
 from gripmon.teach.page.messages import (

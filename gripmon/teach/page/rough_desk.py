@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from gripmon import __version__
-from gripmon.model.atomic import write_atomically
 from gripmon.calibrate.sighting import CalibrationError
+from gripmon.model.atomic import write_atomically
 from gripmon.teach.onboarding.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
 from gripmon.teach.page.desk import BadRequest, Picture, encoded
 from gripmon.teach.page.messages import PictureInfo, Place, Put, Reply, Saved, SaveOrder, State

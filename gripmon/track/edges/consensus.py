@@ -17,9 +17,9 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
+from gripmon.model.records import Array
 from gripmon.track.edges.prediction import Prediction
 from gripmon.track.edges.profiles import Candidates
-from gripmon.model.records import Array
 
 
 class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

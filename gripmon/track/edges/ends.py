@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import END_CORNERS, Array, Image
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import EdgeSettings, find_candidates, read_profiles
 from gripmon.track.edges.settling import Measurement
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import END_CORNERS, Array, Image
 
 ALONG_COSINE = 0.87
 """Edges within 30 degrees of the fingers' direction run along them."""

@@ -18,12 +18,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.records import Array, EdgeEvidence, Image
 from gripmon.track.edges.consensus import Consensus, Prior, Votes, agree
 from gripmon.track.edges.ends import FingerEnds
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
 from gripmon.track.edges.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.records import Array, EdgeEvidence, Image
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""

@@ -14,6 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert, skew
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array
 from gripmon.track.edges.reduced import (
     LEVELS,
     ORIENTATIONS,
@@ -24,9 +27,6 @@ from gripmon.track.edges.reduced import (
     evidence_table,
     gradients,
 )
-from gripmon.model.geometry import invert, skew
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array
 
 DENSITY = 0.75
 """Exponent of the length in an edge's number of points: short edges across the fingers tell what long ones don't."""

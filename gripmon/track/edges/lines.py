@@ -16,10 +16,10 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from gripmon.track.edges.consensus import Consensus, Votes
-from gripmon.track.edges.prediction import Prediction
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
+from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.prediction import Prediction
 
 
 class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

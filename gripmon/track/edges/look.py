@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from gripmon.model.records import Image
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.profiles import read_profiles
-from gripmon.model.records import Image
 
 BESIDE_PX = (2.0, 5.0)
 """From where to where the grey levels beside an edge are averaged, px of the zoomed image: clear of its blur."""

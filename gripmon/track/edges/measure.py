@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.geometry import perturbation_between
+from gripmon.model.records import Array, Image
 from gripmon.track.edges.consensus import (
     Consensus,
     agree,
@@ -24,8 +26,6 @@ from gripmon.track.edges.look import unevenness
 from gripmon.track.edges.prediction import EdgeLayout, Prediction
 from gripmon.track.edges.search import search_poses
 from gripmon.track.edges.settling import ZOOMS, Effort, Expected, Measurement
-from gripmon.model.geometry import perturbation_between
-from gripmon.model.records import Array, Image
 
 FOUND_EDGES = 0.85
 """Part of the sampled edges that must be seen where the gripper was looked for."""

@@ -17,9 +17,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from gripmon.model.records import Array, Image
 from gripmon.track.edges.prediction import STEP_PX, Prediction
 from gripmon.track.edges.saturation import SPREAD, doubt
-from gripmon.model.records import Array, Image
 
 GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
 """Luma weights of ITU-R BT.601 in OpenCV's channel order."""

@@ -17,6 +17,8 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 from gripmon.track.edges.hypotheses import (
     MapScore,
     OutlinePoints,
@@ -29,8 +31,6 @@ from gripmon.track.edges.hypotheses import (
     rotations,
 )
 from gripmon.track.edges.reduced import ORIENTATIONS, SIDE, Floats, Window, evidence_maps, rectify, window_about
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image
 
 POINTS, FINE_POINTS = 80, 120
 """Points on the outlines that are looked at in the reduced image, and in the finer one."""

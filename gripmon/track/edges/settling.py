@@ -12,6 +12,9 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
 from gripmon.track.edges.consensus import (
     AGAIN_PX,
     Consensus,
@@ -39,9 +42,6 @@ from gripmon.track.edges.profiles import (
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.taught import TaughtEdges
 from gripmon.track.edges.uncertainty import CONTRADICTION, NormalEquations, Uncertainty, assess, without_one_edge
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Image
 
 RELAYOUT_PX = 6.0
 """Motion of the prediction after which the sampled parts of the edges are chosen anew, px."""

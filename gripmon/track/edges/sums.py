@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from gripmon.track.edges.settling import Measurement
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeSums
+from gripmon.track.edges.settling import Measurement
 
 
 def edge_sums(measurement: Measurement, gripper: Gripper, cam_T_grip: Array, jaw_opening_m: float) -> EdgeSums:

@@ -26,10 +26,10 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera, LensSettings
-from gripmon.track.edges.profiles import EdgeSettings
 from gripmon.model.geometry import from_record, invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper, contents_of
 from gripmon.model.records import Array, Transform
+from gripmon.track.edges.profiles import EdgeSettings
 
 LARGEST_OFFSET_M = 0.02
 SAME_POSE = 1e-6

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
-from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
 from gripmon.model.records import Array
+from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Prior, Votes, agree
 
 CONTRADICTION = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from gripmon.model.camera import Camera
-from gripmon.track.edges.settling import Measurement
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import MeasurementTrace
+from gripmon.track.edges.settling import Measurement
 
 
 def trace_of(measurement: Measurement, camera: Camera, gripper: Gripper) -> MeasurementTrace:

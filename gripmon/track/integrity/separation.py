@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.track.integrity.quantiles import Tails
 from gripmon.model.records import Array
+from gripmon.track.integrity.quantiles import Tails
 
 NEAR = 1.02
 """Factor within which a protection level is found; the larger end counts."""

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, to_record
 from gripmon.model.gripper import Gripper, contents_of
+from gripmon.model.records import Array, Image, LookRecord
 from gripmon.track.look.agreement import AGREES, LookAgreement, patch_evidence
 from gripmon.track.look.layout import POINTS, SIDE, Layout, lay_out
-from gripmon.model.records import Array, Image, LookRecord
 
 FORGET_S = 4.0 * 3600.0
 """Time after which a frame counts 1/e, s: a shift of work; dirt and wear take hours, lamps and daylight minutes."""
