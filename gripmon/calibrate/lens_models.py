@@ -54,8 +54,8 @@ class LensModel:
         return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
 
     def camera(self, parameters: Array) -> Camera:
-        """The same, ready to project; unlike :func:`~gripmon.model.camera.make_camera` it refuses nothing, as an estimate
-        on its way may pass through absurd values.  Points outside the lens's domain project to NaN.
+        """The same, ready to project; unlike :func:`~gripmon.model.camera.make_camera` it refuses nothing: an estimate
+        on its way may pass absurd values.  Points outside the lens's domain project to NaN.
         """
         return _camera(self, tuple(parameters.tolist()))
 

@@ -93,7 +93,7 @@ class Client:
         """The newest record, at once; the same one again while no newer one came; None before the first.
 
         It may be old: compare ``stamp_ns``, or ask :meth:`alive`.  Raises
-        :class:`gripmon.model.records.MessageRefused` for a message that is not a record, or of an unknown major version.
+        :class:`gripmon.model.records.MessageRefused` for a message that is not a record or of an unknown version.
         """
         newest: zenoh.Sample | None = None
         while (sample := self._samples.try_recv()) is not None:
