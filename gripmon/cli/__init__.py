@@ -26,7 +26,8 @@ from gripmon.cli import (
     view,
     watch,
 )
-from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
+from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandFailedError
+from gripmon.model.errors import InputError, NoResultError
 
 _COMMANDS = (
     demo,
@@ -103,6 +104,9 @@ def main(arguments: list[str] | None = None) -> int:
     except CommandFailedError as error:
         print(error, file=sys.stderr)
         return error.exit_code
+    except (InputError, NoResultError) as error:
+        print(error, file=sys.stderr)
+        return EXIT_USAGE if isinstance(error, InputError) else EXIT_FAILED
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
