@@ -121,7 +121,7 @@ class PayloadDecoder:
         return "raw"
 
     def _of_ros(self, payload: bytes) -> Content:
-        from gripmon import ros2
+        from gripmon.io import ros2
 
         try:
             if self._format == "ros2_image":
@@ -323,7 +323,7 @@ def network_key(settings: NetworkSettings, image_key: str) -> str:
         raise SourceError("topic: has no effect beside key; one of them")
     if not ros:
         raise SourceError(f"format: {settings.format} doesn't come on a ROS 2 topic; {' or '.join(ROS_FORMATS)}")
-    from gripmon import ros2
+    from gripmon.io import ros2
 
     message = ros2.IMAGE if settings.format == "ros2_image" else ros2.COMPRESSED_IMAGE
     try:
