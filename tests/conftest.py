@@ -11,10 +11,10 @@ from pathlib import Path
 import hypothesis
 import pytest
 import zenoh
-from commanded import Loop, reply_to
-from long_files import LONGEST
-from loopback import free_endpoint, plain_session
-from published import Published
+from support.commanded import Loop, reply_to
+from support.long_files import LONGEST
+from support.loopback import free_endpoint, plain_session
+from support.published import Published
 
 from gripmon.io.wire import PublishSettings
 

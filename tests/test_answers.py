@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 import zenoh
-from loopback import WAIT_S, ask, frame_record, free_endpoint, plain_session, wait_until
-from published import Published
+from support.loopback import WAIT_S, ask, frame_record, free_endpoint, plain_session, wait_until
+from support.published import Published
 
 from gripmon.io.publish.answers import _WAITING_MOST, Answers
 from gripmon.io.publish.commands import PendingCommand

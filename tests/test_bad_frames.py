@@ -9,9 +9,9 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 import pytest
-from box_models import cube_model
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import frames_of, new_monitor, reference_of, replaced
+from support.box_models import cube_model
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import frames_of, new_monitor, reference_of, replaced
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import gripper_from_dict

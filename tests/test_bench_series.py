@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.simulate.scenario import Pairs
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plates import pose, true_uv
-from simulated import PAPER_LENS, STRONG_LENS
+from support.plates import pose, true_uv
+from support.simulated import PAPER_LENS, STRONG_LENS
 
 from gripmon.calibrate.bending import FEWEST, bends
 from gripmon.calibrate.targets import Chequerboard

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from taught_by_hand import make_rig
+from support.taught_by_hand import make_rig
 
 from gripmon.cli import main
 

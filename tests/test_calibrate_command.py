@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from plates import Look, fingers, pose, render
+from support.plates import Look, fingers, pose, render
 
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.intrinsics import lens_vector

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from plate_fingers import DISCS, OPENING_M, box_gripper, standing
-from plates import Look
-from sample_messages import MEASURED, NOTHING
-from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
+from support.plate_fingers import DISCS, OPENING_M, box_gripper, standing
+from support.plates import Look
+from support.sample_messages import MEASURED, NOTHING
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
 from urdf_parser_py.urdf import URDF
 
 from gripmon.calibrate.documents import (

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from sightings import CAMERAS, PLATE_M, poses, seen
+from support.sightings import CAMERAS, PLATE_M, poses, seen
 
 from gripmon.calibrate.intrinsics import (
     calibrate,

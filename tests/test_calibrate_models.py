@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from sightings import CAMERAS, poses, seen
+from support.sightings import CAMERAS, poses, seen
 
 from gripmon.calibrate.intrinsics import calibrate, lens_vector, plate_pose
 from gripmon.calibrate.lens_models import MODELS, LensModel, ModelName, parameter_names

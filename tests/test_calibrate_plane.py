@@ -9,10 +9,10 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from plate_fingers import DISCS, OPENING_M, box_gripper, outline_pixels, rough, standing, true_corners
-from plates import Look
 from scipy.stats import chi2
-from simulated import PAPER_LENS, nominal_cam_T_grip
+from support.plate_fingers import DISCS, OPENING_M, box_gripper, outline_pixels, rough, standing, true_corners
+from support.plates import Look
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals, HandEyeCalibration
 from gripmon.cli import main

@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from box_models import cube_model
-from shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_seen, knocked, told, two_fingers
-from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
+from support.box_models import cube_model
+from support.shown_edges import FRAMES, OPENING_M, REFERENCE_SIGMA, Shown, bend, ill_seen, knocked, told, two_fingers
+from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.judge.causes import CauseSettings
 from gripmon.model.camera import LensSettings, PaperLens, make_camera

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 from scipy.stats import norm
-from shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
-from simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
+from support.shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
+from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
 from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State

@@ -8,10 +8,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from meters import JAW_SIGMA_M, NARROW, box_gripper, meter
-from shown_edges import OPENING_M, REFERENCE_SIGMA
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import new_monitor
+from support.meters import JAW_SIGMA_M, NARROW, box_gripper, meter
+from support.shown_edges import OPENING_M, REFERENCE_SIGMA
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import new_monitor
 
 from gripmon.judge.causes import CauseJudge, CauseSettings
 from gripmon.model.camera import make_camera

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from shown_edges import OPENING_M
+from support.shown_edges import OPENING_M
 
 from gripmon.judge.causes import BlurWatch, FingerWatch, JawWatch, ResidualWatch
 

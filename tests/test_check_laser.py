@@ -10,9 +10,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from laser_images import spot_image
-from pulsed_laser import AXES, calibration, poses, pulses, true_world
 from scipy.spatial.transform import Rotation
+from support.laser_images import spot_image
+from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml

@@ -17,7 +17,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from gripmon_process import GRIPMON, ROOT, gripmon, start
+from support.gripmon_process import GRIPMON, ROOT, gripmon, start
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config

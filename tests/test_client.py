@@ -6,8 +6,8 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
-from published import Published
+from support.loopback import frame_record, free_endpoint, plain_session, reference_record, state_record, wait_until
+from support.published import Published
 
 from gripmon.client import Client, MonitorName, TransformClient
 from gripmon.io.wire import PublishError, PublishSettings

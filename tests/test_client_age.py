@@ -7,8 +7,8 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from loopback import frame_record
-from timely import clock
+from support.loopback import frame_record
+from support.timely import clock
 
 from gripmon.client import MonitorName, Policy, Reading, Unusable
 from gripmon.client.age import NO_LEADS, Leads, Sent, waited_s, with_answer, without_contradicted

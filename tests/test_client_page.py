@@ -9,8 +9,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from loopback import WAIT_S, frame_record, free_endpoint, wait_until
-from remote_monitor import remote_monitor
+from support.loopback import WAIT_S, frame_record, free_endpoint, wait_until
+from support.remote_monitor import remote_monitor
 
 from gripmon.client import Policy, Unusable
 from gripmon.model.records import Verdict

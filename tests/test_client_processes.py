@@ -11,8 +11,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from loopback import ask, frame_record, free_endpoint, plain_session, wait_until
-from remote_monitor import remote_monitor, router
+from support.loopback import ask, frame_record, free_endpoint, plain_session, wait_until
+from support.remote_monitor import remote_monitor, router
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
 from gripmon.model.records import Verdict, to_json

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from loopback import frame_record
 from scipy.spatial.transform import Rotation
-from timely import TimelyInbox as Inbox
+from support.loopback import frame_record
+from support.timely import TimelyInbox as Inbox
 
 from gripmon.client import MonitorName, NotUsable, Policy, Reading, TransformClient, Unusable
 from gripmon.client.inbox import MOST_PRESENT

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-import router_process
-from loopback import frame_record, free_endpoint, wait_until
-from published import Published
+from support import router_process
+from support.loopback import frame_record, free_endpoint, wait_until
+from support.published import Published
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
 from gripmon.client.inbox import Entry

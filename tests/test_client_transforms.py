@@ -8,8 +8,8 @@ import threading
 from collections.abc import Callable, Iterator
 
 import pytest
-from loopback import WAIT_S, frame_record, free_endpoint, wait_until
-from published import Published
+from support.loopback import WAIT_S, frame_record, free_endpoint, wait_until
+from support.published import Published
 
 from gripmon.client import Policy, Reading, TransformClient, Unusable
 from gripmon.io.wire import PublishSettings

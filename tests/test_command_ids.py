@@ -10,9 +10,9 @@ from collections import Counter
 
 import pytest
 import zenoh
-from commanded import CMD, Loop, answers, reply_to
-from loopback import plain_session, wait_until
-from published import Published
+from support.commanded import CMD, Loop, answers, reply_to
+from support.loopback import plain_session, wait_until
+from support.published import Published
 
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut

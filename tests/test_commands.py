@@ -9,9 +9,9 @@ import threading
 import msgspec
 import pytest
 import zenoh
-from commanded import CMD, Loop, answers, reply_to
-from loopback import WAIT_S, free_endpoint, plain_session, reference_record, wait_until
-from published import Published
+from support.commanded import CMD, Loop, answers, reply_to
+from support.loopback import WAIT_S, free_endpoint, plain_session, reference_record, wait_until
+from support.published import Published
 
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut

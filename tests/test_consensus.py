@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meters import JAW_SIGMA_M, box_gripper
-from simulated import PAPER_LENS, nominal_cam_T_grip
+from support.meters import JAW_SIGMA_M, box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import make_camera
 from gripmon.track.edges.consensus import (

@@ -6,10 +6,21 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from box_models import cube_model
-from meters import FISHEYE_LENS, NARROW, box_gripper, corners_px, difference, measure, meter, moved, picture, simulated
 from scipy.spatial.transform import Rotation
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
+from support.box_models import cube_model
+from support.meters import (
+    FISHEYE_LENS,
+    NARROW,
+    box_gripper,
+    corners_px,
+    difference,
+    measure,
+    meter,
+    moved,
+    picture,
+    simulated,
+)
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper, gripper_from_dict

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from daemon_bench import NEVER, Bench, pause
-from loopback import frame_record, reference_record
-from stand_ins import REFUSED, ScriptedMonitor
+from support.daemon_bench import NEVER, Bench, pause
+from support.loopback import frame_record, reference_record
+from support.stand_ins import REFUSED, ScriptedMonitor
 
 from gripmon.daemon import EstimatesFile, Reports, log_to_stderr
 from gripmon.io.sources import Waiting

@@ -6,8 +6,8 @@ import logging
 from pathlib import Path
 
 import pytest
-from daemon_bench import Bench
-from stand_ins import Listener, ScriptedMonitor
+from support.daemon_bench import Bench
+from support.stand_ins import Listener, ScriptedMonitor
 
 from gripmon.model.records import (
     Alert,

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from daemon_process import ROTATION, TRANSLATION_M
-from loopback import WAIT_S, accepts, ask, can_bind, free_endpoint, plain_session, wait_until
 from scipy.spatial.transform import Rotation
+from support.daemon_process import ROTATION, TRANSLATION_M
+from support.loopback import WAIT_S, accepts, ask, can_bind, free_endpoint, plain_session, wait_until
 
 HERE = Path(__file__).resolve().parent
 PREFIX = "gripmon/arm/wrist"
@@ -26,8 +26,8 @@ PREFIX = "gripmon/arm/wrist"
 @contextmanager
 def daemon(endpoint: str, kind: str = "ticking", *rest: str) -> Iterator[subprocess.Popen[str]]:
     """A daemon process that listens; it is killed at the end if it still runs."""
-    command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, kind, *rest]
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, kind, *rest]
+    environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         wait_until(lambda: process.poll() is not None or accepts(endpoint), "the daemon to listen")
@@ -40,7 +40,7 @@ def daemon(endpoint: str, kind: str = "ticking", *rest: str) -> Iterator[subproc
 
 def subscribe(endpoint: str, key: str, count: int) -> list[dict[str, object]]:
     """So many messages as a subscriber in another process gets them."""
-    command = [sys.executable, str(HERE / "plain_subscriber.py"), endpoint, key, str(count)]
+    command = [sys.executable, str(HERE / "support" / "plain_subscriber.py"), endpoint, key, str(count)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60.0)
     assert done.returncode == 0, done.stderr
     return [json.loads(line) for line in done.stdout.splitlines()]
@@ -128,8 +128,8 @@ def test_sigterm_before_the_loop_runs_ends_it_too(endpoint: str):
 
 
 def test_a_process_that_forgets_to_close_its_publisher_ends(endpoint: str):
-    command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, "forgetful"]
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "forgetful"]
+    environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
     assert subprocess.run(command, timeout=WAIT_S, env=environment).returncode == 5
 
 
@@ -146,8 +146,8 @@ def test_a_missing_camera_is_said_on_the_network(endpoint: str):
 
 def test_a_second_daemon_on_the_same_port_says_so(endpoint: str):
     with daemon(endpoint):
-        command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, "ticking"]
-        environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+        command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "ticking"]
+        environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
         second = subprocess.run(command, capture_output=True, text=True, timeout=60.0, env=environment)
     assert second.returncode == 1
     assert second.stderr.splitlines()[-1].endswith(

@@ -7,9 +7,9 @@ import time
 from collections.abc import Iterable
 
 import pytest
-from daemon_bench import Bench
-from loopback import frame_record, reference_record, wait_until
-from stand_ins import ScriptedMonitor
+from support.daemon_bench import Bench
+from support.loopback import frame_record, reference_record, wait_until
+from support.stand_ins import ScriptedMonitor
 
 from gripmon.daemon import StateKeeper, supervised
 from gripmon.io.sources import Waiting

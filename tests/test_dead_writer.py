@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import Recorded, frame, record, recorder, trace, wait_until
-from small_disks import fill, small_disk
+from support.recorded import Recorded, frame, record, recorder, trace, wait_until
+from support.small_disks import fill, small_disk
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from gripmon_process import gripmon
+from support.gripmon_process import gripmon
 
 from gripmon.cli import demo
 from gripmon.cli.comparison import compare

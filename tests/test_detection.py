@@ -8,8 +8,8 @@ import re
 import cv2
 import numpy as np
 import pytest
-from plates import Look, fingers, points_of, pose, render, true_uv
 from scipy.spatial import cKDTree
+from support.plates import Look, fingers, points_of, pose, render, true_uv
 
 from gripmon.calibrate.chequers import _Turns
 from gripmon.calibrate.detection import detect

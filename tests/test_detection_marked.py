@@ -5,8 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from plates import Look, fingers, points_of, pose, render, true_uv
 from scipy.spatial import cKDTree
+from support.plates import Look, fingers, points_of, pose, render, true_uv
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.discs import centre_offsets_px

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
-from simulated import nominal_cam_T_grip
+from support.simulated import nominal_cam_T_grip
 
 from gripmon.track.differential import DegenerateGeometry, differential_update, equation_17
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from daemon_bench import Bench, pause
-from stand_ins import ScriptedSource
+from support.daemon_bench import Bench, pause
+from support.stand_ins import ScriptedSource
 
 from gripmon.daemon.drops import OVER_S, Drops
 from gripmon.daemon.settings import DaemonSettings

@@ -18,8 +18,8 @@ import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 import pytest
-import sample_messages
-from loopback import frame_record, reference_record, state_record
+from support import sample_messages
+from support.loopback import frame_record, reference_record, state_record
 
 from gripmon.model.records import (
     AlertEvent,

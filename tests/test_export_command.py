@@ -12,8 +12,8 @@ from pathlib import Path
 import duckdb
 import msgspec
 import pytest
-from loopback import WAIT_S, state_record
-from recorded import INTERVAL_NS, frame, record, recorder, trace, wait_until
+from support.loopback import WAIT_S, state_record
+from support.recorded import INTERVAL_NS, frame, record, recorder, trace, wait_until
 
 from gripmon.cli import main
 from gripmon.model.records import Alert, AlertKind, Cause, FrameRecord, Severity, State, to_json

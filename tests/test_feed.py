@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from loopback import free_endpoint, wait_until
+from support.loopback import free_endpoint, wait_until
 
 from gripmon.cli import main
 from gripmon.io.sources import NetworkCamera, NetworkSettings

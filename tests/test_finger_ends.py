@@ -7,9 +7,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from box_models import cube_model, two_fingers_model
-from meters import NARROW, box_gripper, measure, meter, picture
-from simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
+from support.box_models import cube_model, two_fingers_model
+from support.meters import NARROW, box_gripper, measure, meter, picture
+from support.simulated import PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper

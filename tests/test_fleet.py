@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
-from published import Published
-from router_process import ROOT, RouterProcess, running
+from support.loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
+from support.published import Published
+from support.router_process import ROOT, RouterProcess, running
 
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut

@@ -9,7 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from long_files import LONGEST
+from support.long_files import LONGEST
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "gripmon"
@@ -118,7 +118,7 @@ def test_every_import_points_downward():
         ("daemon", "import rerun as rr", 1),
         ("record", "from rerun import log", 0),
         ("record", "from gripmon.io.wire import Keys", 1),
-        ("judge", "from .track import x", 1),
+        ("track", "from .judge import x", 1),
         ("cli", "from gripmon import __version__", 0),
         ("judge", "from gripmon.nowhere import x", 1),
     ],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE
+from support.drift_noise import COVARIANCE
 
 from gripmon.judge.drift import CORRELATION_FRAMES, DriftSettings, SequentialTest, foresee
 from gripmon.judge.drift.foresight import _variance_of_means

@@ -7,11 +7,11 @@ from dataclasses import replace
 import cv2
 import msgspec
 import numpy as np
-from plate_fingers import DISCS, OPENING_M, box_gripper, rough, standing, true_corners
-from plate_views import LENS, solved, trial
-from plates import Look
 from scipy.stats import chi2
-from simulated import PAPER_LENS, nominal_cam_T_grip
+from support.plate_fingers import DISCS, OPENING_M, box_gripper, rough, standing, true_corners
+from support.plate_views import LENS, solved, trial
+from support.plates import Look
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.free_pose import FreePose, off_plate

@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from gripmon_process import GRIPMON, ROOT
-from kept_states import configuration, make_pictures
-from loopback import ask, free_endpoint, plain_session, wait_until
-from meters import box_gripper
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from small_disks import fill, small_disk
+from support.gripmon_process import GRIPMON, ROOT
+from support.kept_states import configuration, make_pictures
+from support.loopback import ask, free_endpoint, plain_session, wait_until
+from support.meters import box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.small_disks import fill, small_disk
+from support.watched import frames_of, reference_of
 from test_killed import PREFIX, Witness
-from watched import frames_of, reference_of
 
 from gripmon.judge.recalibrate import RecalibrationSettings
 from gripmon.model.camera import make_camera

@@ -13,7 +13,7 @@ import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
-from rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
+from support.rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
 
 from gripmon.io.publish.commands import _name, _request
 from gripmon.io.publish.jaw import JawError, opening_of_joints, opening_of_json

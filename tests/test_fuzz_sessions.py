@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from loopback import ask, free_endpoint, plain_session, wait_until
-from network_daemon import ENVIRONMENT, PREFIX, ROOT, network_config, network_daemon
+from support.loopback import ask, free_endpoint, plain_session, wait_until
+from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, network_config, network_daemon
 
 from gripmon.cli import main
 
@@ -29,7 +29,7 @@ def sequence(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def in_another_process(script: str, *arguments: object) -> str:
-    command = [sys.executable, str(ROOT / "tests" / script), *map(str, arguments)]
+    command = [sys.executable, str(ROOT / "tests" / "support" / script), *map(str, arguments)]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, timeout=300.0)
     assert done.returncode == 0, done.stderr
     return done.stdout

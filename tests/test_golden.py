@@ -8,8 +8,8 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from golden_images import FOLDER, SCENES, load, simulator
-from meters import EVERYWHERE, USUAL_SHARE, difference
+from support.golden_images import FOLDER, SCENES, load, simulator
+from support.meters import EVERYWHERE, USUAL_SHARE, difference
 
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings

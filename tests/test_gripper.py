@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from box_models import Model, cube_model, two_fingers_model
 from scipy.spatial import ConvexHull
+from support.box_models import Model, cube_model, two_fingers_model
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config

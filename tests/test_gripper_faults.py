@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from box_models import Model, cube_model, two_fingers_model
+from support.box_models import Model, cube_model, two_fingers_model
 
 from gripmon.model.gripper import GripperError, gripper_from_dict, load_gripper
 

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from meters import box_gripper, difference, picture
-from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
-from watched import pose_of, reference_of
+from support.meters import box_gripper, difference, picture
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from support.watched import pose_of, reference_of
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import make_camera

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from gripmon_process import gripmon
+from support.gripmon_process import gripmon
 
 from gripmon.calibrate.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
 from gripmon.cli import main

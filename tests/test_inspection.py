@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_models import cube_model
-from simulated import PAPER_LENS, sharp_gripper
+from support.box_models import cube_model
+from support.simulated import PAPER_LENS, sharp_gripper
 
 from gripmon.judge.inspection import inspect
 from gripmon.model.camera import make_camera

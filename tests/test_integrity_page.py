@@ -8,8 +8,8 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
-from loopback import free_endpoint
-from remote_monitor import remote_monitor
+from support.loopback import free_endpoint
+from support.remote_monitor import remote_monitor
 
 from gripmon.cli import main
 from gripmon.client import Policy, TransformClient

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import msgspec
 import zenoh
-from kept_states import configuration, keep, make_pictures
-from loopback import free_endpoint, plain_session, wait_until
+from support.kept_states import configuration, keep, make_pictures
+from support.loopback import free_endpoint, plain_session, wait_until
 
 from gripmon.judge.references import state_fault
 from gripmon.judge.statefile import unpack
@@ -98,9 +98,13 @@ class Forks:
     """Processes of ``gripmon run``, one after the other."""
 
     def __init__(self, config: Path) -> None:
-        environment = os.environ | {"PYTHONPATH": str(HERE.parent), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+        environment = os.environ | {
+            "PYTHONPATH": f"{HERE.parent}:{HERE}",
+            "OPENBLAS_NUM_THREADS": "1",
+            "OMP_NUM_THREADS": "1",
+        }
         self._parent = subprocess.Popen(
-            [sys.executable, str(HERE / "forked_daemons.py"), str(config)],
+            [sys.executable, str(HERE / "support" / "forked_daemons.py"), str(config)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=(config.parent / "log.txt").open("wb"),
             text=True, env=environment,
         )  # fmt: skip

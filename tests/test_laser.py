@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
 from scipy.spatial.transform import Rotation
+from support.laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import closed_form, common_plane

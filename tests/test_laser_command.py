@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from laser_images import spot_image
-from laser_scenes import PAPER_LENS, paper_setup, sampled
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
+from support.laser_images import spot_image
+from support.laser_scenes import PAPER_LENS, paper_setup, sampled
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main

@@ -6,7 +6,7 @@ import csv
 
 import numpy as np
 import pytest
-from laser_scenes import paper_setup, sampled
+from support.laser_scenes import paper_setup, sampled
 from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # noqa: F401 - camera is a fixture
 
 from gripmon.calibrate.sighting import CalibrationError

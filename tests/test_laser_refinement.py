@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from laser_scenes import PAPER_LENS, assert_same, numeric, scene
 from scipy.stats import f as fisher_f
+from support.laser_scenes import PAPER_LENS, assert_same, numeric, scene
 
 from gripmon.calibrate.lens_models import LensModel
 from gripmon.calibrate.sighting import CalibrationError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from laser_images import cluttered, spot_image
+from support.laser_images import cluttered, spot_image
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.pointer.spots import find_spots

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from loopback import WAIT_S, free_endpoint, plain_session, wait_until
-from router_process import RouterProcess, plain_config, running
+from support.loopback import WAIT_S, free_endpoint, plain_session, wait_until
+from support.router_process import RouterProcess, plain_config, running
 
 from gripmon.client import Client
 from gripmon.io.wire import Link, PublishSettings
@@ -87,8 +87,8 @@ def test_which_far_end_is_which_endpoint(locator: str, endpoint: str, expected: 
 
 def test_daemon_and_client_outlive_their_router(router: RouterProcess, endpoint: str):
     """Killed, not stopped, and twice: transforms come again, from the same processes, and nobody has complained."""
-    command = [sys.executable, str(HERE / "daemon_process.py"), endpoint, "routed"]
-    environment = os.environ | {"PYTHONPATH": str(HERE.parent)}
+    command = [sys.executable, str(HERE / "support" / "daemon_process.py"), endpoint, "routed"]
+    environment = os.environ | {"PYTHONPATH": f"{HERE.parent}:{HERE}"}
     daemon = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         with Client("arm", "wrist", connect=[endpoint]) as client:

@@ -7,7 +7,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, simulator
+from support.simulated import BOX_FINGERS, PAPER_LENS, PLAIN_FINGERS, nominal_cam_T_grip, simulator
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, load_gripper

@@ -17,9 +17,10 @@ from pathlib import Path
 
 import msgspec
 import pytest
-import sample_messages
 import yaml
-from loopback import (
+from prometheus_client.parser import text_string_to_metric_families
+from support import sample_messages
+from support.loopback import (
     WAIT_S,
     accepts,
     alert_record,
@@ -31,7 +32,6 @@ from loopback import (
     state_record,
     wait_until,
 )
-from prometheus_client.parser import text_string_to_metric_families
 from test_run_on_the_network import PREFIX, configured, refused, running
 
 from gripmon.cli import main

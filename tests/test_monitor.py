@@ -6,10 +6,10 @@ import json
 
 import numpy as np
 import pytest
-from meters import difference, moved
 from scipy.spatial.transform import Rotation
-from simulated import nominal_cam_T_grip
-from watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, watch, watched
+from support.meters import difference, moved
+from support.simulated import nominal_cam_T_grip
+from support.watched import FPS, SCENES, frames_of, new_monitor, pose_of, reference_of, watch, watched
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings

@@ -5,10 +5,10 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from meters import moved
 from scipy.spatial.transform import Rotation
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import frames_of, new_monitor, replaced
+from support.meters import moved
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import frames_of, new_monitor, replaced
 
 from gripmon.judge.causes import CauseJudge
 from gripmon.model.records import AlertKind, Cause, Verdict, to_json

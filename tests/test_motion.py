@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE, SIGMA, autocorrelated, white
+from support.drift_noise import COVARIANCE, SIGMA, autocorrelated, white
 
 from gripmon.judge.drift import DriftSettings, MotionWatch
 from gripmon.model.records import AlertKind, Motion

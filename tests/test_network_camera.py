@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from frame_feeder import FORMATS
-from loopback import ask, free_endpoint, plain_session, wait_until
-from network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
-from router_process import plain_config, running
+from support.frame_feeder import FORMATS
+from support.loopback import ask, free_endpoint, plain_session, wait_until
+from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, network_config, network_daemon
+from support.router_process import plain_config, running
 
 from gripmon.cli import main
 from gripmon.io.ros2 import COMPRESSED_IMAGE, IMAGE
 from gripmon.io.ros2.types import type_hash
 
-FEEDER = ROOT / "tests" / "frame_feeder.py"
+FEEDER = ROOT / "tests" / "support" / "frame_feeder.py"
 FRAMES = 12
 TOPIC = "/wrist/image"
 SOURCES = {

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import zenoh
-from loopback import free_endpoint, plain_session, wait_until
+from support.loopback import free_endpoint, plain_session, wait_until
 
 from gripmon.io.publish import ZenohJaw
 from gripmon.io.publish.jaw import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from loopback import WAIT_S, free_endpoint, wait_until
+from support.loopback import WAIT_S, free_endpoint, wait_until
 
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.daemon.config.settings import JawSettings

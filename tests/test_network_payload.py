@@ -9,7 +9,7 @@ import zlib
 import cv2
 import numpy as np
 import pytest
-from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
+from support.sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from loopback import WAIT_S, free_endpoint, plain_session, wait_until
-from sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
+from support.loopback import WAIT_S, free_endpoint, plain_session, wait_until
+from support.sent_frames import HEIGHT, WIDTH, colour, grey, note, raw_note
 
 from gripmon.io.publish.frames import FramePublisher, raw_encoding
 from gripmon.io.sources import (

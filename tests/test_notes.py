@@ -8,8 +8,8 @@ import copy
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE, SIGMA, white
-from watched import frames_of, new_monitor
+from support.drift_noise import COVARIANCE, SIGMA, white
+from support.watched import frames_of, new_monitor
 
 from gripmon.judge.drift import DriftSettings, MotionWatch, SequentialTest
 from gripmon.model.records import Frame, Limits

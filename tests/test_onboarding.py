@@ -7,7 +7,8 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 import pytest
-from plate_fingers import (
+from scipy.stats import chi2
+from support.plate_fingers import (
     CHARUCO,
     CHEQUERBOARD,
     DISCS,
@@ -19,9 +20,8 @@ from plate_fingers import (
     true_corners,
     true_name,
 )
-from plates import Look
-from scipy.stats import chi2
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.plates import Look
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import Coincidence, GivenCamera

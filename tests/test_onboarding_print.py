@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import plate_fingers
 import pytest
-from plate_fingers import CHARUCO, CHEQUERBOARD, DISCS, outline_pixels, rough, standing
-from plates import Look
 from scipy.stats import chi2
-from simulated import PAPER_LENS, nominal_cam_T_grip
+from support import plate_fingers
+from support.plate_fingers import CHARUCO, CHEQUERBOARD, DISCS, outline_pixels, rough, standing
+from support.plates import Look
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import GivenCamera

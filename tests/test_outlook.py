@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
-from sampled import INDEPENDENT, OPENING_M, NoisyMeter
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
-from watched import reference_of, watched
+from support.meters import FISHEYE_LENS, JAW_SIGMA_M, box_gripper, difference, measure, meter, picture
+from support.sampled import INDEPENDENT, OPENING_M, NoisyMeter
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, plain_scenario
+from support.watched import reference_of, watched
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config

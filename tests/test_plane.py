@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from plate_views import CORNERS_M, EXACT, LENS, NAMES, Trial, moved, seen_by, solved, transform, trial
 from scipy.stats import binom, chi2
+from support.plate_views import CORNERS_M, EXACT, LENS, NAMES, Trial, moved, seen_by, solved, transform, trial
 
 from gripmon.calibrate.plane import FingerCorners, GivenCamera, corners_of, lengths_of
 from gripmon.calibrate.plane_equations import back_project, coincide_linear, infer_rectangle, stand

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from plate_views import CORNERS_M, LENS, NAMES, Trial, solved, transform, trial
 from scipy.stats import chi2, kstest
+from support.plate_views import CORNERS_M, LENS, NAMES, Trial, solved, transform, trial
 
 from gripmon.calibrate.plane import Coincidence, FingerCorners, GivenCamera
 from gripmon.calibrate.plane_average import PlaneCalibration, against, average

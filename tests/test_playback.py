@@ -10,7 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from playback_runs import (
+from support.playback_runs import (
     COMMAND,
     CONFIGURATION,
     FILES,
@@ -23,7 +23,7 @@ from playback_runs import (
     state_record,
     write_run,
 )
-from recorded import REFERENCE, frame, image, record, trace, wait_until
+from support.recorded import REFERENCE, frame, image, record, trace, wait_until
 
 from gripmon.model.records import to_json
 from gripmon.record.read import FrameTable, Recording, decode_image, open_recordings, recordings_below

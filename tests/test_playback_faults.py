@@ -11,7 +11,7 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from playback_runs import (
+from support.playback_runs import (
     Run,
     altered,
     lines,
@@ -21,7 +21,7 @@ from playback_runs import (
     write_rrd,
     write_run,
 )
-from recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
+from support.recorded import INTERVAL_NS, START_NS, frame, record, trace, wait_until
 
 from gripmon.model.records import FrameRecord, State, Verdict, to_json
 from gripmon.record.read import Collection, FrameTable, Recording, open_recordings

@@ -7,8 +7,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from playback_runs import lines, records_of_a_run
-from recorded import record
+from support.playback_runs import lines, records_of_a_run
+from support.recorded import record
 
 from gripmon.model.geometry import from_record
 from gripmon.model.records import FrameRecord, Origin, State, Verdict, to_json

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from policy_runs import (
+from support.policy_runs import (
     ACQUIRING,
     BENT,
     BEYOND,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from policy_runs import (
+from support.policy_runs import (
     BENT,
     CLEARED,
     KNOCKED,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from policy_runs import (
+from support.policy_runs import (
     CLEARED,
     DRIFTING,
     KNOCKED,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from policy_runs import (
+from support.policy_runs import (
     BENT,
     BLACK,
     CLEARED,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from box_models import cube_model
-from meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.box_models import cube_model
+from support.meters import FISHEYE_LENS, WIDE_LENS, box_gripper, measure, meter, moved
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper

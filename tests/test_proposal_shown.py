@@ -7,9 +7,9 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from daemon_bench import Bench
-from loopback import reference_record, state_record
-from stand_ins import ScriptedMonitor
+from support.daemon_bench import Bench
+from support.loopback import reference_record, state_record
+from support.stand_ins import ScriptedMonitor
 
 from gripmon.cli import fleet_table
 from gripmon.client import MonitorName, MonitorStatus

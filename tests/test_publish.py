@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pytest
 import zenoh
-from loopback import (
+from support.loopback import (
     alert_record,
     ask,
     can_bind,
@@ -20,7 +20,7 @@ from loopback import (
     state_record,
     wait_until,
 )
-from published import Published
+from support.published import Published
 
 from gripmon.io.publish import NullPublisher, Publisher, SpotPublisher, StatePublisher
 from gripmon.io.wire import Keys, PublishError, PublishSettings

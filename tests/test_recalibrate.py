@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from box_models import random_rotation
 from scipy.spatial.transform import Rotation
-from simulated import nominal_cam_T_grip
+from support.box_models import random_rotation
+from support.simulated import nominal_cam_T_grip
 
 from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, rivals, solutions
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated import BOX_FINGERS, nominal_cam_T_grip
-from still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
+from support.simulated import BOX_FINGERS, nominal_cam_T_grip
+from support.still_frames import CHANGING, LASTING, REFERENCE_T, TRUE_T, Scene, image, moved, reference
 
 from gripmon.judge.recalibrate import Proposal, RecalibrationSettings, Recalibrator, Refusal, RefusalReason, StillFrame
 from gripmon.judge.recalibrate.edges import fingers_disagree, leave_one_out, pool

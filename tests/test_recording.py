@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from recorded import (
+from support.recorded import (
     CAMERA,
     GRIPPER,
     HEIGHT_PX,

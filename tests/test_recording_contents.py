@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from recorded import (
+from support.recorded import (
     GRIPPER,
     INTERVAL_NS,
     REFERENCE,

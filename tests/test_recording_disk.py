@@ -14,9 +14,9 @@ from pathlib import Path
 
 import psutil
 import pytest
-from daemon_bench import Bench
-from loopback import alert_record
-from recorded import Recorded, frame, record, recorder, trace, wait_until
+from support.daemon_bench import Bench
+from support.loopback import alert_record
+from support.recorded import Recorded, frame, record, recorder, trace, wait_until
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
-from recorded import (
+from support.recorded import (
     CAMERA,
     GRIPPER,
     INTERVAL_NS,

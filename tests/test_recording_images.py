@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recorded import (
+from support.recorded import (
     HEIGHT_PX,
     OVERLAY,
     WIDTH_PX,

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from recorded import (
+from support.recorded import (
     CAMERA,
     GRIPPER,
     INTERVAL_NS,

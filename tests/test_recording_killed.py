@@ -17,7 +17,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
+from support.recorded import CAMERA, GRIPPER, REFERENCE, Recorded, frame, record, recorder, settings, wait_until
 
 from gripmon.record.read import open_recordings
 from gripmon.record.write.columns import Row
@@ -33,7 +33,7 @@ RECORDER = """
 import sys, time
 sys.path[:0] = sys.argv[2:]
 from pathlib import Path
-from recorded import *
+from support.recorded import *
 w = recorder(Path(sys.argv[1]), flush_period_s=0.5, image_rate_hz=30.0)
 wait_until(lambda: w.path is not None, 60.0)
 print(w.process_id, flush=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 import psutil
 import pytest
 import yaml
-from gripmon_process import gripmon
-from recorded import Recorded, frame, image, record, recorder, trace, wait_until
+from support.gripmon_process import gripmon
+from support.recorded import Recorded, frame, image, record, recorder, trace, wait_until
 
 from gripmon.daemon.config import builtin_config
 from gripmon.model.records import Alert, AlertKind, Cause, Severity

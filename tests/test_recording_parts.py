@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from recorded import HEIGHT_PX, WIDTH_PX
+from support.recorded import HEIGHT_PX, WIDTH_PX
 
 from gripmon.model.records import State, Verdict
 from gripmon.record.write import palette

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meters import box_gripper
-from policy_runs import explained
-from simulated import nominal_cam_T_grip
-from watched import reference_of
+from support.meters import box_gripper
+from support.policy_runs import explained
+from support.simulated import nominal_cam_T_grip
+from support.watched import reference_of
 
 from gripmon.judge.policy import Policy
 from gripmon.judge.recalibrate import Proposal, Refusal

@@ -15,8 +15,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from gripmon_process import GRIPMON
-from loopback import frame_record
+from support.gripmon_process import GRIPMON
+from support.loopback import frame_record
 
 from gripmon.cli import main
 from gripmon.cli.replay import _Counts

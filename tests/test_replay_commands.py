@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 import zenoh
-from loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
-from network_daemon import ENVIRONMENT
-from replayed import EVERY_FRAME, replayed, without_latency
+from support.loopback import WAIT_S, accepts, ask, free_endpoint, plain_session, wait_until
+from support.network_daemon import ENVIRONMENT
+from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.daemon.config import builtin_config
 from gripmon.judge.statefile import unpack

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from gripmon_process import GRIPMON
-from small_disks import small_disk
+from support.gripmon_process import GRIPMON
+from support.small_disks import small_disk
 
 from gripmon.cli import main
 from gripmon.record.read import open_recordings

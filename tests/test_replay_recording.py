@@ -13,10 +13,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-import recorded
 import rerun as rr
-from replayed import EVERY_FRAME, replayed, without_latency
 from rerun.chunk import RrdReader
+from support import recorded
+from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.cli import main
 from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds

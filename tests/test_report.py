@@ -10,8 +10,8 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
-from loopback import state_record
-from reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
+from support.loopback import state_record
+from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, records, said, stepped
 
 from gripmon.analyse.report import Report, build
 from gripmon.analyse.report.page import page

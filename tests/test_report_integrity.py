@@ -8,7 +8,7 @@ import re
 import msgspec
 import numpy as np
 import pytest
-from reported import Run, records, stepped
+from support.reported import Run, records, stepped
 
 from gripmon.analyse.report import build
 from gripmon.analyse.report.page import page

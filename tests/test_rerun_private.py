@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
-from recorded import frame, record, recorder
 from rerun.chunk import LazyStore
+from support.recorded import frame, record, recorder
 
 from gripmon.record.read import open_recordings
 from gripmon.record.rerun_private import RerunChangedError
@@ -41,7 +41,7 @@ def test_without_its_chunk_index_files_are_read_all_the_same(tmp_path: Path, mon
 
 
 def test_a_recorder_that_could_not_free_its_files_does_not_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from recorded import CAMERA, GRIPPER, REFERENCE, settings
+    from support.recorded import CAMERA, GRIPPER, REFERENCE, settings
 
     monkeypatch.delattr(rr.bindings, "flush_and_cleanup_orphaned_recordings")
     scene = wire.make_scene(settings(), str(tmp_path), "run", "arm", "wrist", CAMERA, GRIPPER, REFERENCE)

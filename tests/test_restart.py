@@ -18,11 +18,11 @@ import msgspec
 import numpy as np
 import pytest
 import zenoh
-from kept_states import configuration, keep, make_pictures
-from loopback import ask, free_endpoint, plain_session, wait_until
-from meters import box_gripper
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import frames_of, new_monitor, pose_of, reference_of
+from support.kept_states import configuration, keep, make_pictures
+from support.loopback import ask, free_endpoint, plain_session, wait_until
+from support.meters import box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import frames_of, new_monitor, pose_of, reference_of
 
 from gripmon.daemon.config import load_config
 from gripmon.judge.references import ReferenceBook

@@ -9,7 +9,7 @@ import cv2
 import msgspec
 import numpy as np
 import yaml
-from plates import pose, render
+from support.plates import pose, render
 from test_robot_world import columns, transform
 
 from gripmon.calibrate.detection import detect

@@ -9,10 +9,10 @@ import struct
 import cv2
 import numpy as np
 import pytest
-import ros2_idl as idl
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support import ros2_idl as idl
 
 from gripmon.io.ros2 import (
     JointOpening,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-import ros2_idl as idl
-from loopback import frame_record, state_record
 from scipy.spatial.transform import Rotation
+from support import ros2_idl as idl
+from support.loopback import frame_record, state_record
 
 from gripmon.io.ros2.messages import ERROR, OK, STALE, WARN, Messages, inverse
 from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF, typestore

@@ -11,7 +11,7 @@ import struct
 import pytest
 import xxhash
 import zenoh
-from ros2_definitions import DEFINITIONS
+from support.ros2_definitions import DEFINITIONS
 from zenoh_ros2_sdk import attachment as other_attachment
 from zenoh_ros2_sdk import entity as other_entity
 from zenoh_ros2_sdk import keyexpr as other_keys

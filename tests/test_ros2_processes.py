@@ -16,10 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import ros2_idl as idl
 import yaml
 import zenoh
-from loopback import free_endpoint, plain_session, wait_until
+from support import ros2_idl as idl
+from support.loopback import free_endpoint, plain_session, wait_until
 from test_ros2_names import JAZZY_HASHES
 
 from gripmon.daemon.config import builtin_config
@@ -98,7 +98,7 @@ def node(endpoint: str, folder: Path, *keys: str) -> Iterator[Heard]:
     """A node on plain Zenoh that listens."""
     out = folder / "heard.jsonl"
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    with process(str(HERE / "ros2_node.py"), endpoint, str(out), *keys, **pipes) as started:
+    with process(str(HERE / "support" / "ros2_node.py"), endpoint, str(out), *keys, **pipes) as started:
         assert started.stdout.readline() == "listening\n"
         yield Heard(out)
 
@@ -149,7 +149,7 @@ def test_another_implementation_knows_the_node_and_decodes_tf(router: tuple[str,
 
     subscriber = session.declare_subscriber(JSON_KEY, remember)
     with daemon(endpoint, tmp_path):
-        command = [sys.executable, str(HERE / "ros2_other_node.py"), endpoint.rsplit(":", 1)[1], "5"]
+        command = [sys.executable, str(HERE / "support" / "ros2_other_node.py"), endpoint.rsplit(":", 1)[1], "5"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=120.0, env=ENVIRONMENT, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
         *topics, first, second, third, fourth, fifth = map(json.loads, done.stdout.splitlines())

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterator
 
 import msgspec
 import pytest
-import ros2_idl as idl
 import zenoh
-from loopback import (
+from support import ros2_idl as idl
+from support.loopback import (
     alert_record,
     frame_record,
     free_endpoint,
@@ -17,7 +17,7 @@ from loopback import (
     state_record,
     wait_until,
 )
-from ros2_graph import ON, layout, tokens
+from support.ros2_graph import ON, layout, tokens
 
 from gripmon.io.ros2 import (
     HeardTopic,

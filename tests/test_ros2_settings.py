@@ -8,15 +8,15 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from loopback import (
+from support.loopback import (
     alert_record,
     frame_record,
     free_endpoint,
     reference_record,
     state_record,
 )
-from ros2_graph import ON, layout, tokens
-from stand_ins import Listener, ScriptedMonitor, TickingSource
+from support.ros2_graph import ON, layout, tokens
+from support.stand_ins import Listener, ScriptedMonitor, TickingSource
 
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
 from gripmon.daemon.config import ConfigError, builtin_config, load_config

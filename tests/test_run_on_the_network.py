@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
+from support.loopback import WAIT_S, ask, free_endpoint, plain_session, wait_until
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
@@ -158,7 +158,7 @@ def test_a_killed_monitor_is_missed(tmp_path: Path, endpoint: str):
 
 @contextmanager
 def opened_when_it_listens(process: subprocess.Popen[str], endpoint: str) -> Iterator[zenoh.Session]:
-    from loopback import accepts
+    from support.loopback import accepts
 
     wait_until(lambda: process.poll() is not None or accepts(endpoint), "the daemon to listen", 60.0)
     assert process.poll() is None

@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meters import FISHEYE_LENS, JAW_SIGMA_M, difference
-from sampled import OPENING_M, NoisyMeter
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.meters import FISHEYE_LENS, JAW_SIGMA_M, difference
+from support.sampled import OPENING_M, NoisyMeter
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.judge.recalibrate import recalibrate
 from gripmon.model.camera import LensSettings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE, autocorrelated, claimed
+from support.drift_noise import COVARIANCE, autocorrelated, claimed
 
 from gripmon.judge.drift.scatter import PRIOR_SHARE, PRIOR_WINDOWS, Scatter
 from gripmon.judge.drift.windows import LENGTHS, Windows

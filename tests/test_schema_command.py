@@ -10,7 +10,7 @@ import jsonschema
 import msgspec
 import pytest
 import zenoh
-from loopback import (
+from support.loopback import (
     alert_record,
     frame_record,
     free_endpoint,
@@ -19,7 +19,7 @@ from loopback import (
     state_record,
     wait_until,
 )
-from published import Published
+from support.published import Published
 from test_schemas import ONE_OF_EACH
 
 from gripmon.cli import main

@@ -6,8 +6,8 @@ import json
 
 import msgspec
 import pytest
-from loopback import alert_record, frame_record, reference_record, state_record
-from sample_messages import SAMPLES
+from support.loopback import alert_record, frame_record, reference_record, state_record
+from support.sample_messages import SAMPLES
 
 from gripmon.model.records import (
     MESSAGES,

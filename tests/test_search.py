@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from meters import (
+from support.meters import (
     EVERYWHERE,
     NARROW,
     box_gripper,
@@ -17,7 +17,7 @@ from meters import (
     picture,
     simulated,
 )
-from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario
 
 from gripmon.model.camera import make_camera
 from gripmon.simulate import make_scenario

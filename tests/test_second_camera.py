@@ -12,11 +12,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from loopback import WAIT_S, free_endpoint, wait_until
-from network_daemon import ENVIRONMENT
-from pulse_feeder import MARGIN_S, NOT_PULSES
-from pulsed_scenes import MOVED, PREFIX, cell, write_config, write_folder
 from rerun.chunk import RrdReader
+from support.loopback import WAIT_S, free_endpoint, wait_until
+from support.network_daemon import ENVIRONMENT
+from support.pulse_feeder import MARGIN_S, NOT_PULSES
+from support.pulsed_scenes import MOVED, PREFIX, cell, write_config, write_folder
 
 from gripmon.cli import main
 from gripmon.client import Fleet
@@ -152,7 +152,14 @@ class Daemon:
 
     def feed(self, folder: Path, rubbish: int = 0) -> list[SpotRecord]:
         """What became of all pulses; frames go on until the end."""
-        command = [sys.executable, str(HERE / "pulse_feeder.py"), self.endpoint, PREFIX, str(folder), str(rubbish)]
+        command = [
+            sys.executable,
+            str(HERE / "support" / "pulse_feeder.py"),
+            self.endpoint,
+            PREFIX,
+            str(folder),
+            str(rubbish),
+        ]
         self.feeder = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=ENVIRONMENT)
         assert self.feeder.stdout is not None
         lines = [line for _, line in zip(range(PULSES), self.feeder.stdout, strict=False)]

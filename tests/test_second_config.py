@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from pulsed_scenes import PULSE_NS, Cell, cell, write_config, write_folder, write_table
+from support.pulsed_scenes import PULSE_NS, Cell, cell, write_config, write_folder, write_table
 
 from gripmon.cli import main
 from gripmon.daemon.config import ConfigError, builtin_config, load_config, load_second

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pulsed_scenes import PULSE_NS, cell, dark, lit
-from rubbish import broken_json
-from stand_ins import Listener, ScriptedSource
+from support.pulsed_scenes import PULSE_NS, cell, dark, lit
+from support.rubbish import broken_json
+from support.stand_ins import Listener, ScriptedSource
 
 from gripmon.daemon import DaemonSettings, run_second
 from gripmon.daemon.config.second import read_laser

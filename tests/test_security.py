@@ -16,10 +16,10 @@ import cv2
 import numpy as np
 import pytest
 import zenoh
-from loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
-from published import Published
-from router_process import ROOT, running
-from sample_messages import SAMPLES, payload
+from support.loopback import alert_record, ask, frame_record, free_endpoint, reference_record, state_record, wait_until
+from support.published import Published
+from support.router_process import ROOT, running
+from support.sample_messages import SAMPLES, payload
 
 from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from loopback import accepts, free_endpoint
-from router_process import ROOT, plain_config, running
+from support.loopback import accepts, free_endpoint
+from support.router_process import ROOT, plain_config, running
 
 from gripmon.cli import main
 from gripmon.daemon.config import is_second, load_config, load_second

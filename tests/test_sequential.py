@@ -6,8 +6,8 @@ import copy
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE, SIGMA, autocorrelated, claimed, feed, vibrating, white
 from scipy import stats
+from support.drift_noise import COVARIANCE, SIGMA, autocorrelated, claimed, feed, vibrating, white
 
 from gripmon.judge.drift import DriftSettings, SequentialTest
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from simulated import simulator
+from support.simulated import simulator
 
 from gripmon.simulate import Simulator, make_scenario
 

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.simulate import SCENARIO_NAMES, Hidden, Scenario, make_scenario, write_sequence
 from gripmon.simulate.disturbance import exposure, jaw_opening_m, law

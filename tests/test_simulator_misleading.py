@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import PLAIN_FINGERS, nominal_cam_T_grip, plain_scenario, simulator
 
 from gripmon.simulate import Hidden
 from gripmon.simulate.scenario import (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import msgspec
 import numpy as np
-from simulated import PLAIN_FINGERS, plain_scenario, simulator
+from support.simulated import PLAIN_FINGERS, plain_scenario, simulator
 
 from gripmon.simulate import Hidden
 from gripmon.simulate.scenario import Cover, GraspedObject, JawScript

@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import brentq, curve_fit
 from scipy.special import erf
-from simulated import (
+from support.simulated import (
     IDEAL_SENSOR,
     PAPER_LENS,
     STRONG_LENS,

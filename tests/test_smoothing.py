@@ -9,10 +9,10 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from box_models import random_rotation
 from scipy.linalg import solve_discrete_are
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
+from support.box_models import random_rotation
 
 from gripmon.judge.smoothing import SETTLING, PoseAverage, PoseFilter, QuietTime, SmoothingSettings
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import router_process
-from daemon_bench import NEVER
-from loopback import WAIT_S, free_endpoint, wait_until
-from published import Published
-from stand_ins import Listener, ScriptedMonitor, ScriptedSource
+from support import router_process
+from support.daemon_bench import NEVER
+from support.loopback import WAIT_S, free_endpoint, wait_until
+from support.published import Published
+from support.stand_ins import Listener, ScriptedMonitor, ScriptedSource
 from test_security import own_files
 
 import gripmon.daemon.snapshots as snapshots

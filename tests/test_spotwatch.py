@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
+from support.pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.pointer.spots import Spot

@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
-from pulsed_laser import calibration, drawn_world, poses, true_world
+from support.pulsed_laser import calibration, drawn_world, poses, true_world
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.document import setup_of

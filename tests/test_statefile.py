@@ -14,8 +14,8 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated import BOX_FINGERS
-from state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
+from support.simulated import BOX_FINGERS
+from support.state_files import DATA, OWNER, STATE, beside, opened, read_once, state_of, write
 from test_references import adopt, broken, configured
 
 from gripmon.judge.references import KEPT, ReferenceBook

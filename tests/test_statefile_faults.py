@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
-from state_files import DATA, STATE, beside, opened, read_once, state_of, write
+from support.state_files import DATA, STATE, beside, opened, read_once, state_of, write
 from test_references import broken
 
 from gripmon.judge.statefile import (

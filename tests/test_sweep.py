@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from meters import FISHEYE_LENS, box_gripper, difference
 from scipy.spatial.transform import Rotation
-from simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
-from watched import reference_of
+from support.meters import FISHEYE_LENS, box_gripper, difference
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.watched import reference_of
 
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import load_gripper

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from simulated import STRONG_LENS
+from support.simulated import STRONG_LENS
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main

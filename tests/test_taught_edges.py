@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from meters import box_gripper, moved
-from simulated import nominal_cam_T_grip
-from taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
+from support.meters import box_gripper, moved
+from support.simulated import nominal_cam_T_grip
+from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of, measured, taught_from
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids

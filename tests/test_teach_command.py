@@ -15,9 +15,9 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from meters import moved
-from simulated import BOX_FINGERS, nominal_cam_T_grip
-from taught_scenes import OPENING_M, image_of, scene
+from support.meters import moved
+from support.simulated import BOX_FINGERS, nominal_cam_T_grip
+from support.taught_scenes import OPENING_M, image_of, scene
 
 from gripmon.cli import main
 from gripmon.daemon.config import ConfigError, builtin_config, load_config

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from meters import WIDE_LENS
-from simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
-from taught_by_hand import Rig, make_rig
+from support.meters import WIDE_LENS
+from support.simulated import IDEAL_SENSOR, PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
+from support.taught_by_hand import Rig, make_rig
 
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
 from gripmon.cli import main

@@ -15,8 +15,8 @@ import numpy as np
 import psutil
 import pytest
 import yaml
-from taught_by_hand import Rig, make_rig
-from teach_page_browser import DEADLINE_S, Visitor, browser, page
+from support.taught_by_hand import Rig, make_rig
+from support.teach_page_browser import DEADLINE_S, Visitor, browser, page
 from test_live_camera import MjpegServer
 
 from gripmon.cli import main

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from simulated import PAPER_LENS
-from taught_by_hand import Rig, make_rig
+from support.simulated import PAPER_LENS
+from support.taught_by_hand import Rig, make_rig
 
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.cli.plane_inputs import _read_rough

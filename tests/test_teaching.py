@@ -7,9 +7,9 @@ import re
 
 import numpy as np
 import pytest
-from meters import box_gripper, moved
-from simulated import nominal_cam_T_grip
-from taught_scenes import (
+from support.meters import box_gripper, moved
+from support.simulated import nominal_cam_T_grip
+from support.taught_scenes import (
     CAMERA,
     OPENING_M,
     arrays,

@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from meters import JAW_SIGMA_M, box_gripper
-from simulated import nominal_cam_T_grip
-from taught_scenes import CAMERA, arrays, bevelled, image_of, reference, scene, table, taught_from
+from support.meters import JAW_SIGMA_M, box_gripper
+from support.simulated import nominal_cam_T_grip
+from support.taught_scenes import CAMERA, arrays, bevelled, image_of, reference, scene, table, taught_from
+from support.watched import pose_of, reference_of
 from test_teaching import silhouette_offsets_m
-from watched import pose_of, reference_of
 
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.judge.drift import DriftSettings

@@ -12,9 +12,9 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 import pytest
-from meters import box_gripper
-from simulated import PAPER_LENS, nominal_cam_T_grip
-from watched import Watched, new_monitor, reference_of, watch
+from support.meters import box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import Watched, new_monitor, reference_of, watch
 
 from gripmon.judge.policy import PolicySettings
 from gripmon.judge.recalibrate import RecalibrationSettings

@@ -8,14 +8,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from commanded import CMD, Loop, answers, reply_to
-from daemon_bench import Bench
-from loopback import frame_record, free_endpoint, plain_session, state_record, wait_until
-from published import Published
-from router_process import plain_config
-from router_process import running as router_running
+from support.commanded import CMD, Loop, answers, reply_to
+from support.daemon_bench import Bench
+from support.loopback import frame_record, free_endpoint, plain_session, state_record, wait_until
+from support.published import Published
+from support.router_process import plain_config
+from support.router_process import running as router_running
+from support.timely import TimelyInbox
 from test_run_on_the_network import configured, running
-from timely import TimelyInbox
 
 from gripmon.cli import main
 from gripmon.client import Ambiguous, Client, Condition, Fleet, NotCarriedOut, Policy, TransformClient, Unusable

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from box_models import cube_model, two_fingers_model
-from simulated import BOX_FINGERS
-from watched import Watched, frames_of, new_monitor, watch
+from support.box_models import cube_model, two_fingers_model
+from support.simulated import BOX_FINGERS
+from support.watched import Watched, frames_of, new_monitor, watch
 
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.model.gripper import Gripper, gripper_from_dict, load_gripper

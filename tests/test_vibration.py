@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from drift_noise import COVARIANCE, SIGMA
+from support.drift_noise import COVARIANCE, SIGMA
 
 from gripmon.judge.drift.vibration import VibrationWatch
 from gripmon.model.records import Vibration

@@ -19,13 +19,13 @@ import msgspec
 import numpy as np
 import psutil
 import pytest
-import recorded
 import rerun_cli
-from gripmon_process import GRIPMON
-from headless import needs_chromium, picture_of
-from loopback import WAIT_S, free_endpoint, wait_until
-from network_daemon import ENVIRONMENT
 from rerun.chunk import RrdReader
+from support import recorded
+from support.gripmon_process import GRIPMON
+from support.headless import needs_chromium, picture_of
+from support.loopback import WAIT_S, free_endpoint, wait_until
+from support.network_daemon import ENVIRONMENT
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config

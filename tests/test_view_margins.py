@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from meters import FISHEYE_LENS, box_gripper, moved
 from scipy.spatial.transform import RigidTransform, Rotation
-from simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.meters import FISHEYE_LENS, box_gripper, moved
+from support.simulated import PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config

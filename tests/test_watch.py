@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from loopback import frame_record
-from stand_ins import REFUSED
+from support.loopback import frame_record
+from support.stand_ins import REFUSED
 
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch

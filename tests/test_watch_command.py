@@ -14,9 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from loopback import WAIT_S, alert_record, free_endpoint, plain_session, wait_until
-from published import Published
-from remote_monitor import remote_monitor, router
+from support.loopback import WAIT_S, alert_record, free_endpoint, plain_session, wait_until
+from support.published import Published
+from support.remote_monitor import remote_monitor, router
 
 from gripmon.client import Condition, Fleet
 from gripmon.io.wire import PublishSettings

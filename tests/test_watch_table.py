@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from loopback import alert_record, state_record
+from support.loopback import alert_record, state_record
 
 from gripmon.cli import fleet_table
 from gripmon.cli.alert_log import AlertLog

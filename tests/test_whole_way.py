@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import new_user
 import numpy as np
 import pytest
-from teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
+from support import new_user
+from support.teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
 from gripmon.cli import main

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 
 import msgspec
 import pytest
-import wire_page
 import zenoh
-from loopback import (
+from support import wire_page
+from support.loopback import (
     alert_record,
     frame_record,
     free_endpoint,
@@ -19,8 +19,8 @@ from loopback import (
     state_record,
     wait_until,
 )
-from published import Published
-from sample_messages import FOLDER, SAMPLES, kept, payload
+from support.published import Published
+from support.sample_messages import FOLDER, SAMPLES, kept, payload
 
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name

@@ -1,0 +1,128 @@
+"""A camera driver in a process of its own, in step with the monitor: ENDPOINT FOLDER KEY FORMAT PREFIX [FIRST LAST].
+
+With a part of the frames their stamps are the time of sending.
+
+It knows plain Zenoh, JSON and the libraries that make images and ROS 2 messages, nothing of gripmon.  After each frame
+it waits for the transform of that frame, so that none is dropped however slow the machine is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import json
+import queue
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import zenoh
+
+from support.loopback import WAIT_S, plain_session, wait_until
+
+JOINTS_KEY = "7/joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_of_another_distribution"
+
+Sent = tuple[bytes, zenoh.Encoding | None, bytes | None]
+"""Payload, encoding and attachment."""
+
+
+def _note(row: dict[str, str], **more: Any) -> bytes:
+    return json.dumps({"stamp_ns": int(row["stamp_ns"]), "jaw_opening_m": float(row["jaw_opening_m"]), **more}).encode()
+
+
+def raw(image: np.ndarray, row: dict[str, str]) -> Sent:
+    height, width = image.shape
+    return image.tobytes(), None, _note(row, width=width, height=height, encoding="mono8")
+
+
+def raw_padded(image: np.ndarray, row: dict[str, str]) -> Sent:
+    """Rows with a gap of noise behind each, and a field of a later version."""
+    height, width = image.shape
+    gap = np.random.default_rng(1).integers(0, 256, (height, 40), np.uint8)
+    note = _note(row, width=width, height=height, encoding="mono8", step=width + 40, schema="gripmon.frame/1", x=[1])
+    return np.hstack([image, gap]).tobytes(), None, note
+
+
+def png(image: np.ndarray, row: dict[str, str]) -> Sent:
+    return cv2.imencode(".png", image)[1].tobytes(), zenoh.Encoding.IMAGE_PNG, _note(row)
+
+
+def jpeg(image: np.ndarray, row: dict[str, str]) -> Sent:
+    """Without an encoding: it is known by how it begins."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes(), None, _note(row)
+
+
+def ros2_image(image: np.ndarray, row: dict[str, str]) -> Sent:
+    height, width = image.shape
+    message = _ros("Image", row, height=height, width=width, encoding="mono8", is_bigendian=0, step=width)
+    return message(data=image.ravel()), None, bytes(33)
+
+
+def ros2_compressed(image: np.ndarray, row: dict[str, str]) -> Sent:
+    message = _ros("CompressedImage", row, format="mono8; png compressed mono8")
+    return message(data=np.frombuffer(cv2.imencode(".png", image)[1].tobytes(), np.uint8)), None, bytes(33)
+
+
+def joint_state(row: dict[str, str]) -> bytes:
+    """A finger joint whose position is half of the opening."""
+    nothing = np.zeros(0)
+    message = _ros("JointState", row, name=["elbow", "finger"], velocity=nothing, effort=nothing)
+    return message(position=np.array([1.0, 0.5 * float(row["jaw_opening_m"])]))
+
+
+def _ros(type_name: str, row: dict[str, str], **fields: Any) -> Callable[..., bytes]:
+    """The message in CDR, once it has the rest of its fields."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_JAZZY)
+    sec, nanosec = divmod(int(row["stamp_ns"]), 10**9)
+    time_type, header_type = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    header = header_type(stamp=time_type(sec=sec, nanosec=nanosec), frame_id="camera")
+    message_type = store.types[f"sensor_msgs/msg/{type_name}"]
+    return lambda **rest: bytes(
+        store.serialize_cdr(message_type(header=header, **fields, **rest), message_type.__msgtype__)
+    )
+
+
+FORMATS: dict[str, Callable[[np.ndarray, dict[str, str]], Sent]] = {
+    each.__name__: each for each in (raw, raw_padded, png, jpeg, ros2_image, ros2_compressed)
+}
+
+
+def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str, *part: str) -> None:
+    rows = list(csv.DictReader((Path(folder) / "timestamps.csv").open()))
+    if part:
+        rows = rows[int(part[0]) : int(part[1])]
+    transforms: queue.SimpleQueue[int] = queue.SimpleQueue()
+
+    def heard(sample: zenoh.Sample) -> None:
+        transforms.put(json.loads(sample.payload.to_bytes())["stamp_ns"])
+
+    with plain_session(connect=endpoint) as session:
+        subscriber = session.declare_subscriber(f"{prefix}/transform", heard)
+        publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
+        wait_until(lambda: publisher.matching_status.matching, "a monitor that listens")
+        alive = session.liveliness()
+        wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=5.0)), "the monitor to be alive")
+        for row in rows:
+            if part:
+                row["stamp_ns"] = str(time.time_ns())
+            image = cv2.imread(str(Path(folder) / row["file"]), cv2.IMREAD_UNCHANGED)
+            payload, encoding, attachment = FORMATS[frame_format](image, row)
+            if frame_format.startswith("ros2_"):  # its images bring no opening: it comes before them
+                blocking = zenoh.CongestionControl.BLOCK
+                session.put(JOINTS_KEY, joint_state(row), attachment=bytes(33), congestion_control=blocking)
+            publisher.put(payload, encoding=encoding, attachment=attachment)
+            # Under load a transform may be dropped on its way here: whoever called compares what the monitor wrote.
+            with contextlib.suppress(queue.Empty):
+                while transforms.get(timeout=WAIT_S) != int(row["stamp_ns"]):
+                    pass
+        subscriber.undeclare()
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,56 @@
+"""Laser set-ups with known truth, as the benchmark has them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from gripmon.model.geometry import invert
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
+
+from benchmarks.laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
+
+__all__ = [
+    "PAPER_LENS",
+    "LaserData",
+    "assert_same",
+    "numeric",
+    "paper_setup",
+    "sampled",
+    "scene",
+    "sides",
+    "translation_error",
+]
+
+STEP = 1e-6
+
+
+def scene(seed=1, **options):
+    rng = np.random.default_rng(seed)
+    return sampled(paper_setup(rng), rng, **options)
+
+
+def numeric(function, count, step=STEP):
+    """Central differences of a function of a small change (count,), stacked behind."""
+    columns = [(function(step * e) - function(-step * e)) / (2.0 * step) for e in np.eye(count)]
+    return np.stack(columns, axis=-1)
+
+
+def sides(setup):
+    """A laser line's moment and direction, which don't depend on which of its points is given."""
+    return np.concatenate([setup.direction_ee, np.cross(setup.point_ee_m, setup.direction_ee)])
+
+
+def assert_same(found, truth, tolerance=1e-9):
+    assert np.abs(found.cam_T_base - truth.cam_T_base).max() < tolerance
+    assert np.abs(found.normal_cam - truth.normal_cam).max() < tolerance
+    assert abs(found.distance_m - truth.distance_m) < tolerance
+    assert np.abs(sides(found) - sides(truth)).max() < tolerance
+
+
+def translation_error(setup, truth):
+    found, right = invert(setup.cam_T_base)[:3, 3], invert(truth.cam_T_base)[:3, 3]
+    return np.linalg.norm(found - right) / np.linalg.norm(right)

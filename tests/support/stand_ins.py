@@ -1,0 +1,198 @@
+"""Stand-ins for the daemon's neighbours: monitor and sources that follow a script, outputs that write it all down."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+
+from gripmon.io.sources import Waiting
+from gripmon.model.records import (
+    AlertRecord,
+    Command,
+    CommandReply,
+    CornerFault,
+    CornerRecord,
+    Frame,
+    FrameRecord,
+    Limits,
+    MeasurementTrace,
+    MonitorNotes,
+    MonitorState,
+    Origin,
+    RecordedCommand,
+    ReferenceRecord,
+    StateRecord,
+    Verdict,
+)
+from gripmon.record.write import Notes, Trace
+from support.loopback import frame_record, reference_record
+
+REFUSED = {
+    "verdict": Verdict.UNKNOWN,
+    "source": Origin.HELD,
+    "corners": (CornerRecord("L_in_near", None, None, used=False, reason=CornerFault.FRAME_REFUSED),),
+    "alerts": (),
+    "reason": "black",
+}
+
+NOTES = MonitorNotes(0.5, Limits(1e-4, 3e-3, 2.5e-3, 0.02, (1e-5,) * 6, None, None, None, (1.0,) * 6, (0.0,) * 6))
+
+
+class ScriptedMonitor:
+    """Answers frame i with ``answers(i)``; an exception there is raised."""
+
+    def __init__(self, answers: Callable[[int], dict[str, object] | Exception] = lambda seq: {}) -> None:
+        self.answers = answers
+        self.frames: list[Frame] = []
+        self.reference = reference_record(3)
+        self.state_revision = 0
+        self.obeyed: list[tuple[Command, int]] = []
+
+    def process(self, frame: Frame) -> FrameRecord:
+        self.frames.append(frame)
+        answer = self.answers(frame.seq)
+        if isinstance(answer, Exception):
+            raise answer
+        values = {
+            "stamp_ns": frame.stamp_ns,
+            "alerts": (),
+            "jaw_opening_m": frame.jaw_opening_m,
+            "revision": self.reference.revision,
+            **answer,
+        }
+        record = frame_record(frame.seq, **values)
+        if record.revision != self.reference.revision:
+            self.reference = reference_record(record.revision)
+            self.state_revision += 1
+        return record
+
+    def command(self, command: Command, stamp_ns: int) -> CommandReply:
+        """Every command makes a new reference, but one with an argument is refused, and with "fail" it raises."""
+        if command.argument == "fail":
+            raise RuntimeError("out of order")
+        self.obeyed.append((command, stamp_ns))
+        done = not command.argument
+        if done:
+            self.reference = reference_record(self.reference.revision + 1)
+            self.state_revision += 1
+        text = "as you like" if done else "not so"
+        return CommandReply(command.name, done, text, self.reference.reference_id, self.reference.revision)
+
+    def state(self) -> MonitorState:
+        return MonitorState((self.reference,))
+
+    def ponder(self) -> None: ...
+
+    def trace(self) -> MeasurementTrace | None:
+        return None
+
+    def notes(self) -> MonitorNotes:
+        return NOTES
+
+
+class ScriptedSource:
+    """Gives the items in order, then None; numbers stand for frames, exceptions are raised, functions called."""
+
+    def __init__(self, items: Iterable[object], *, live: bool = False) -> None:
+        self._items = iter(items)
+        self.live = live
+        self.connected = True
+        self.dropped = 0
+        self.closed = 0
+
+    def read(self) -> Frame | Waiting | None:
+        for item in self._items:
+            if isinstance(item, Exception):
+                raise item
+            if callable(item):
+                item(self)
+                continue
+            self.connected = not isinstance(item, Waiting)
+            return Frame(item, 1_000 + item, None) if isinstance(item, int) else item  # type: ignore[return-value]
+        return None
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+class Listener:
+    """Publisher and recorder at once: writes everything down, except what ``fails`` names ("everything": all)."""
+
+    def __init__(self, *, fails: str = "", closing_fails: bool = False) -> None:
+        self.transforms: list[FrameRecord] = []
+        self.states: list[StateRecord] = []
+        self.alerts: list[AlertRecord] = []
+        self.references: list[ReferenceRecord] = []
+        self.offered: list[tuple[Frame, FrameRecord]] = []
+        self.commands: list[RecordedCommand] = []
+        self.closed = 0
+        self.dropped = self.images_dropped = 0
+        self.has_room = True
+        self.failure: str | None = None
+        self.order: list[tuple[str, int]] = []  # what came, and the revision that it names
+        self.fails, self._closing_fails = fails, closing_fails
+
+    def transform(self, record: FrameRecord) -> None:
+        self._take("transform", record.revision)
+        self.transforms.append(record)
+
+    def state(self, record: StateRecord) -> None:
+        self._take("state", record.revision)
+        self.states.append(record)
+
+    def alert(self, record: AlertRecord) -> None:
+        self._take("alert", record.revision)
+        self.alerts.append(record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self._take("reference", record.revision)
+        self.references.append(record)
+
+    def command(self, record: RecordedCommand) -> None:
+        self._take("command", record.seq)
+        self.commands.append(record)
+
+    def offer(self, frame: Frame, record: FrameRecord, trace: Trace, notes: Notes | None = None) -> None:
+        self._take("offer", record.revision)
+        self.offered.append((frame, record))
+
+    def _take(self, what: str, revision: int) -> None:
+        if self.fails in (what, "everything"):
+            raise OSError("the line is cut")
+        self.order.append((what, revision))
+
+    def close(self, timeout_s: float = 0.0) -> None:
+        self.closed += 1
+        if self._closing_fails:
+            raise RuntimeError("can't close")
+
+
+class TickingSource:
+    """A camera of so many frames a second; where the machine was late it catches up, so that no number is missing."""
+
+    live = True
+    connected = True
+    dropped = 0
+
+    def __init__(self, frames_per_s: float) -> None:
+        self._period_s = 1.0 / frames_per_s
+        self._start_s = time.monotonic()
+        self._seq = -1
+
+    def read(self) -> Frame:
+        self._seq += 1
+        time.sleep(max(0.0, self._start_s + self._seq * self._period_s - time.monotonic()))
+        return Frame(self._seq, time.time_ns(), None)
+
+    def close(self) -> None:
+        pass
+
+
+class SilentSource(TickingSource):
+    """A camera that is not there."""
+
+    connected = False
+
+    def read(self) -> Waiting:  # type: ignore[override]
+        time.sleep(0.5)
+        return Waiting("camera 0 can't be opened")
