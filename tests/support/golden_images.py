@@ -1,7 +1,7 @@
 """Golden images: small simulated pictures under ``golden/``, each with its whole truth as text beside it.
 
-``python -m support.golden_images`` in tests/ writes them again: only after a change that is meant to change pictures, with a
-look at what changed.
+``python -m support.golden_images`` in tests/ writes them again: only after a change that is meant to change pictures,
+with a look at what changed.
 """
 
 from __future__ import annotations
