@@ -17,12 +17,12 @@ from support.plates import Look, fingers, pose, render
 
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.intrinsics import lens_vector
-from gripmon.calibrate.targets import parse_target
 from gripmon.cli import main
 from gripmon.cli.calibration_files import target_of
 from gripmon.cli.common import CommandFailedError
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.camera import BrownConradyLens, PaperLens
+from gripmon.model.targets import parse_target
 
 LENS = BrownConradyLens(
     width_px=480, height_px=360, fx_px=470.0, fy_px=471.0, cx_px=243.0, cy_px=177.0,

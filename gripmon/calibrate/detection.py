@@ -15,8 +15,8 @@ from gripmon.calibrate.counting import ends_all_round
 from gripmon.calibrate.lattice import Index
 from gripmon.calibrate.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 
 _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here

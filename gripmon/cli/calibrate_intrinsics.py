@@ -17,7 +17,7 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     from gripmon.calibrate.intrinsics import Fixed, IntrinsicsResult
     from gripmon.calibrate.sighting import Sighting
-    from gripmon.calibrate.targets import Target
+    from gripmon.model.targets import Target
 
 MODELS = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
 _FOLDS = 5
@@ -204,7 +204,7 @@ def _calibrated(sightings: list[Sighting], asked: str | None, fixed: Fixed) -> I
 
 def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
     """Whether it may have been described as larger than it is: on a lattice without marks nothing else tells."""
-    from gripmon.calibrate.targets import Charuco
+    from gripmon.model.targets import Charuco
 
     if isinstance(target, Charuco):
         return []
@@ -227,8 +227,8 @@ def _document(
     arguments: argparse.Namespace,
 ) -> Any:
     from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-    from gripmon.calibrate.targets import name_of
     from gripmon.model.provenance import provenance_of
+    from gripmon.model.targets import name_of
 
     options = {"--target": arguments.target, "--model": arguments.model, "--fix": arguments.fix}
     options |= {"--out": arguments.out, "--picture": arguments.picture, "--force": arguments.force}

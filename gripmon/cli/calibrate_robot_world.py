@@ -158,9 +158,9 @@ class _Seer:
         from gripmon.calibrate.detection import detect
         from gripmon.calibrate.intrinsics import plate_pose
         from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
-        from gripmon.calibrate.targets import Chequerboard
         from gripmon.calibrate.upright import upright
         from gripmon.io.sources.folder import read_image
+        from gripmon.model.targets import Chequerboard
 
         if not row.get("image"):
             raise ValueError(f"{place}: has neither cam_tx_m … nor image; the target's pose, or an image of it")
@@ -190,9 +190,9 @@ class _Seer:
         return pose, covariance
 
     def _prepare(self) -> None:
-        from gripmon.calibrate.targets import tells_its_turn
         from gripmon.daemon.config.calibrated import read_camera
         from gripmon.daemon.config.errors import ConfigError
+        from gripmon.model.targets import tells_its_turn
 
         if self._camera is not None:
             return

@@ -13,8 +13,8 @@ from gripmon.cli import common
 if TYPE_CHECKING:
     import msgspec
 
-    from gripmon.calibrate.targets import Target
     from gripmon.model.records import Image
+    from gripmon.model.targets import Target
 
 
 def image_paths(texts: Sequence[str]) -> list[Path]:
@@ -74,7 +74,7 @@ def read_images(paths: Sequence[Path]) -> list[Image]:
 
 def target_of(text: str, option: str = "--target") -> Target:
     """The target of a command line, or in the file that it names; a fault ends the command with exit code 2."""
-    from gripmon.calibrate.targets import parse_target
+    from gripmon.model.targets import parse_target
 
     if is_target_file(text):
         return _target_in(Path(text), option)
@@ -91,9 +91,9 @@ def is_target_file(text: str) -> bool:
 
 def _target_in(path: Path, option: str) -> Target:
     """Of a calibration that was made with it, or described by itself."""
-    from gripmon.calibrate.targets import checked
     from gripmon.daemon.config import ConfigError
     from gripmon.daemon.config.yaml_file import read_yaml
+    from gripmon.model.targets import checked
 
     right = "a file of gripmon calibrate intrinsics or plane, or one with the line target: circles:8x8:0.008:0.004"
     try:

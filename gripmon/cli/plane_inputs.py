@@ -12,7 +12,6 @@ import numpy as np
 
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.calibrate.targets import Target
 from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 from gripmon.daemon.config import Config, ConfigError, read_gripper
@@ -21,6 +20,7 @@ from gripmon.daemon.config.typed import SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
+from gripmon.model.targets import Target
 from gripmon.teach.onboarding import KnownGripper, RoughCorners, UnknownGripper, outlines_of
 
 Rough = Mapping[str, tuple[float, float]]

@@ -15,12 +15,12 @@ from gripmon.calibrate.documents import CalibratedGripper, HandEyeCalibration, H
 from gripmon.calibrate.plane import Coincidence
 from gripmon.calibrate.plane_average import PlaneCalibration
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.calibrate.targets import name_of
 from gripmon.cli import calibration_files as files
 from gripmon.cli.plane_inputs import Inputs
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, GripperError, GripperModel
 from gripmon.model.provenance import Provenance, provenance_of
+from gripmon.model.targets import name_of
 from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
 from gripmon.track.edges.taught import gripper_digest
 

@@ -19,14 +19,27 @@ _DESCRIPTION = """\
 Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
 reports it), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
 them; m, px), and config.yaml with gripper.yaml, so that gripmon replay works at once.  The same seed
-gives the same images."""
+gives the same images.
+
+For the way from a new gripper to a running monitor without any hardware, all of one camera and gripper:
+plate        a calibration plate, tilted to all sides, for gripmon calibrate intrinsics
+standing     the gripper stands on the plate; rough.yaml has its corners as a person would put them
+work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
+robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
+spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)
+truth.json (of work: truth.jsonl) says what is true; no file tells the steps anything else."""
 
 _EXAMPLES = """\
   gripmon simulate --list
   gripmon simulate bump --out bump/ --seed 3
   gripmon simulate creep --out creep/ --seconds 60 --fps 10
   gripmon simulate my_scenario.yaml --config my_robot.yaml --out mine/
-  gripmon replay bump/ --config bump/config.yaml --out bump.jsonl"""
+  gripmon replay bump/ --config bump/config.yaml --out bump.jsonl
+
+inputs for every step from a new gripper to a running monitor
+  gripmon simulate plate --out plate
+  gripmon simulate standing --out standing
+  gripmon simulate work --out work"""
 
 
 def add_parser(commands: Any) -> None:
@@ -53,34 +66,81 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon simulate``."""
-    from gripmon.simulate import SCENARIO_NAMES, Simulator, write_sequence
+    from gripmon.simulate import CALIBRATION_KINDS, SCENARIO_NAMES, Simulator, write_sequence
 
     if arguments.list:
-        print("\n".join(SCENARIO_NAMES))
+        print("\n".join((*SCENARIO_NAMES, *CALIBRATION_KINDS)))
         return common.EXIT_DONE
     if arguments.scenario is None or arguments.out is None:
         raise common.CommandFailedError(
             "simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/", common.EXIT_USAGE
         )
     config = common.load_demo_or(arguments.config)
+    if arguments.scenario in CALIBRATION_KINDS:
+        return _calibration_images(arguments, config)
     scenario = _scenario(arguments, config)
     out = _empty_directory(Path(arguments.out))
     try:
         simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, arguments.seed)
     except ValueError as error:
         raise common.CommandFailedError(f"{arguments.scenario}: {error}", common.EXIT_USAGE) from None
-    shutil.copyfile(config.gripper_path, out / "gripper.yaml")
-    (out / "config.yaml").write_text(_config_text(config, scenario, arguments), encoding="utf-8")
+    makes_its_own = scenario.name == "work"  # the walk's earlier steps make gripper, calibration and configuration
+    if not makes_its_own:
+        shutil.copyfile(config.gripper_path, out / "gripper.yaml")
+        (out / "config.yaml").write_text(_config_text(config, scenario, arguments), encoding="utf-8")
     with common.progress_bar(simulator.frame_count, "frame") as step:
         count = write_sequence(simulator, out, lambda _done, _total: step())
-    replay = shlex.join(["gripmon", "replay", str(out), "--config", str(out / "config.yaml"), "--out", f"{out}.jsonl"])
-    print(f"{count} frames in {out}; next: {replay}")
+    follows = ["gripmon", "replay", str(out), "--config", str(out / "config.yaml"), "--out", f"{out}.jsonl"]
+    if makes_its_own:
+        follows = ["gripmon", "teach", str(out / "000000.png"), *_TEACH]
+    print(f"{count} frames in {out}; next: {shlex.join(follows)}")
     return common.EXIT_DONE
+
+
+_TEACH = shlex.split(
+    "--corners standing/rough.yaml --camera camera.yaml --gripper gripper.yaml --reference hand_eye.yaml --robot arm1 "
+    "--out mine"
+)
+
+
+def _calibration_images(arguments: argparse.Namespace, config: Config) -> int:
+    """What the calibrations start from, and the command that takes it."""
+    from gripmon.simulate import Rig, image_count, write_calibration_images
+
+    kind = arguments.scenario
+    if arguments.seconds is not None or arguments.fps is not None:
+        raise common.CommandFailedError(
+            f"simulate: {kind} is single images; neither --seconds nor --fps", common.EXIT_USAGE
+        )
+    out = _empty_directory(Path(arguments.out))
+    rig = Rig(config.camera, config.gripper, config.cam_T_grip)
+    with common.progress_bar(image_count(kind), "image") as step:
+        try:
+            write_calibration_images(kind, rig, out, arguments.seed, step)
+        except ValueError as error:
+            raise common.CommandFailedError(f"simulate {kind}: {error}", common.EXIT_USAGE) from None
+    print(f"{image_count(kind)} images in {out}; next: {_next_step(kind, shlex.quote(str(out)))}")
+    return common.EXIT_DONE
+
+
+def _next_step(kind: str, folder: str) -> str:
+    from gripmon.model.targets import name_of
+    from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
+
+    return {
+        "plate": f"gripmon calibrate intrinsics {folder} --target {name_of(PLATE)} --model paper --out camera.yaml",
+        "standing": f"gripmon calibrate plane {folder} --target camera.yaml --camera camera.yaml --corners "
+        f"{folder}/rough.yaml --infer --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml",
+        "robot_world": f"gripmon calibrate robot-world {folder}/views.csv --camera camera.yaml --target "
+        f"{name_of(BOARD)} --eye-in-hand --out robot_world.yaml",
+        "spots": f"gripmon calibrate intrinsics {folder}/plate --target {name_of(SECOND_PLATE)} --out second.yaml, "
+        f"then gripmon calibrate laser {folder}/spots.csv --camera second.yaml --out laser.yaml",
+    }[kind]
 
 
 def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
     from gripmon.daemon.config import ConfigError, load_scenario
-    from gripmon.simulate import make_scenario
+    from gripmon.simulate import CALIBRATION_KINDS, SCENARIO_NAMES, Rig, make_scenario
 
     name: str = arguments.scenario
     if Path(name).suffix in (".yaml", ".yml"):
@@ -93,8 +153,17 @@ def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
             return load_scenario(Path(name))
         except ConfigError as error:
             raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    if name not in SCENARIO_NAMES:
+        known = ", ".join((*SCENARIO_NAMES, *CALIBRATION_KINDS))
+        raise common.CommandFailedError(f"simulate: there is no '{name}'; one of {known}", common.EXIT_USAGE)
     try:
-        return make_scenario(name, duration_s=arguments.seconds, fps=arguments.fps, finger=config.gripper.finger_ids[0])
+        return make_scenario(
+            name,
+            duration_s=arguments.seconds,
+            fps=arguments.fps,
+            finger=config.gripper.finger_ids[0],
+            jaw_opening_m=Rig(config.camera, config.gripper, config.cam_T_grip).jaw_opening_m,
+        )
     except ValueError as error:
         raise common.CommandFailedError(f"simulate: {error}", common.EXIT_USAGE) from None
 
