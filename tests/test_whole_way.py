@@ -152,7 +152,7 @@ def test_taught_without_a_page_the_running_monitor_notices_a_knock(
         capture_output=True, text=True, timeout=4 * DEADLINE_S, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
-    assert "drift raised" in ran.stderr and "the camera moved against the gripper" in ran.stderr
+    assert "step raised" in ran.stderr and "the camera moved against the gripper" in ran.stderr
     # The daemon decides what the replay decides, frame by frame.
     live = _lines(tmp_path / "run" / "estimates.jsonl")
     assert [_decided(r) for r in live] == [_decided(r) for r in records]
@@ -208,7 +208,7 @@ def _decided(record: dict[str, Any]) -> dict[str, Any]:
 def _held_against_the_truth(user: new_user.NewUser, records: list[dict[str, Any]]) -> None:
     """No alert before the knock, one after it with the right size; the TCP within what is stated, before and after."""
     assert len(records) == len(user.cam_T_grip)
-    raised = [k for k, record in enumerate(records) if any(a["kind"] == "drift" for a in record["alerts"])]
+    raised = [k for k, record in enumerate(records) if any(a["kind"] == "step" for a in record["alerts"])]
     assert raised and STEP <= raised[0] <= STEP + 25, raised
     assert records[STEP - 1]["state"] == "tracking" and records[-1]["state"] == "drifting"
     errors, sizes = [], []
