@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from gripmon.judge.drift.history import BLOCK_S, History, goes_on
+from gripmon.judge.drift.kinds import BLOCK_S, History, goes_on
 from gripmon.judge.policy.limits import time_left_s
 
 FPS = 20.0
