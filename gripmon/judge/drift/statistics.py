@@ -1,4 +1,4 @@
-"""What the drift test knows of the stream: means over windows, their scatter, their extremes.
+"""Statistics of the stream for the drift test: means over windows, their scatter, their extremes.
 
 Means over the last n frames for many n at once, at a cost that doesn't depend on n.
 
