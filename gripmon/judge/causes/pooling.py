@@ -1,11 +1,8 @@
-"""Evidence of several frames made one.
+"""Evidence of several frames combined: the median place of each piece of an edge, robust against single mistakes.
 
-Evidence of several frames made one: the middle place of each piece of an edge, which single mistakes don't shift.
-
-How the edges show while all is well: the calibration's error, and what the gripper model doesn't say.
-
-Like is compared with like: a bevel, a shade or a reference that is off by a tenth of a millimetre shifts the edges
-before and after alike.
+The baseline is how the edges show while all is well: it holds the calibration's error and what the gripper model
+leaves out.  Like is compared with like: a bevel, a shade or a reference that is off by a tenth of a millimetre shifts
+the edges before and after alike.
 """
 
 from __future__ import annotations

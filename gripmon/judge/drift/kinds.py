@@ -1,8 +1,5 @@
-"""What kind of motion it is: a step or a creep, or a vibration.
-
-What the drift has done over the last minutes: was it a step or a creep, and how fast?
-
-Does the camera vibrate?  Differences between frames grow in one direction, while their mean stays.
+"""What kind of motion it is: a step or a creep from the drift's history over minutes, and a vibration, where the
+differences between frames grow in one direction while their mean stays.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""One stream of poses, judged.
+"""One stream of poses: is the camera where the reference has it, since when not, and how does it move?
 
-The part of the shift that an inexact reference explains.
-
-One stream: is the camera where the reference has it, since when not, and how does it move?
+The part of a shift that an inexact reference explains doesn't count.
 """
 
 from __future__ import annotations

@@ -1,17 +1,13 @@
-"""Has the camera moved?
-
-How large a shift is in terms of what it is known to, and how far it lies beyond those that are tolerated.
-
-The sequential test: a generalised likelihood ratio over windows of 1 to 4096 frames.
+"""Has the camera moved?  A generalised likelihood ratio test over windows of 1 to 4096 frames.
 
 For every window length two hypotheses are tested against an unmoved camera: its mean lies off the reference (which
 finds creeps, and any shift in the end), and it differs from the mean of the window before (which finds steps soon, for
 errors that last cancel in the difference).  Unknown shifts are estimated, so that each statistic is Hotelling's T² with
-the covariances that the stream itself has shown.  Lai 1995 gives the scheme for independent frames; that frames err
-together enters through the covariances alone.
+the covariances that the stream itself has shown, of the part of the shift that lies beyond what is tolerated.  Lai 1995
+gives the scheme for independent frames; that frames err together enters through the covariances alone.
 
-How far out a statistic may lie by chance is assumed at first, from what errors before clutter are like, and for long
-windows for good.  As soon as the stream has shown enough extremes of its own, these tell it for short windows.
+At first the threshold comes from assumed errors before clutter, and for long windows it stays there.  Once the stream
+has shown enough extremes of its own, the thresholds of short windows are learnt from these.
 """
 
 from __future__ import annotations

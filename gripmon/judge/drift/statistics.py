@@ -1,26 +1,20 @@
-"""Statistics of the stream for the drift test: means over windows, their scatter, their extremes.
+"""Statistics of the stream for the drift test: means over windows, their covariance, their extremes.
 
-Means over the last n frames for many n at once, at a cost that doesn't depend on n.
+*Windows*: means over the last n frames for many n at once, at a cost that doesn't depend on n.
 
-By how much the means of windows scatter while nothing moves, learnt from the stream.
+*Scatter*: the covariance of the means of windows while nothing moves, learnt from the stream.  Frames err together: the
+background stands still for a while, lamps flicker, a mount hums.  No formula therefore gives the error of the mean of n
+frames.  It is measured, for every length n separately: the difference of two neighbouring windows of n frames has a
+covariance A(n) (twice the Allan variance), which a slow drift hardly touches.  By Haar's decomposition the mean of n
+frames is that of 2 n frames plus or minus half the difference of its two halves; the two are uncorrelated for stationary
+noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames claim, but that
+the stream has not shown, counts as a bias of this background: it changes with the background, at any moment.
 
-Frames err together: the background stands still for a while, lamps flicker, a mount hums.  What the mean of n frames
-is worth therefore follows from no formula.  It is measured, at every length n by itself: the difference of two
-neighbouring windows of n frames has a covariance A(n) (twice Allan's variance), which a slow drift hardly touches.  By
-Haar's decomposition the mean of n frames is that of 2 n frames plus or minus half the difference of its two halves; the
-two are uncorrelated for a stationary noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over
-four.
-
-Error that frames claim to have, but that the stream has not been seen to make, is taken for a bias of this background:
-it changes with the background, at any moment.
-
-What an unmoved stream's own statistics exceed so rarely that a contract is kept, learnt from their extremes.
-
-The largest value of every block of frames is kept.  Of the upper quarter of blocks the excess over the least of them is
-taken to be distributed exponentially, in the statistic's square root, a number of standard deviations: between normal
-errors, whose tails are lighter, and Student's, whose are heavier.  The level that a block exceeds with a given chance
-follows by extrapolation.  It is the predictive one, which holds for the next block given that the tail's scale is
-itself known from a few blocks only: the fewer there are, the farther out it lies.
+*Extremes*: the threshold of a stream, learnt by extreme value theory from the largest statistic of every block of
+frames.  Of the upper quarter of blocks the excess over the least of them is modelled as exponential in the statistic's
+square root, a number of standard deviations: between normal errors, whose tails are lighter, and Student's, whose are
+heavier.  The level that a block exceeds with a given chance follows by extrapolation, and is the predictive one, which
+holds for the next block although the tail's scale is known from few blocks: the fewer, the farther out it lies.
 """
 
 from __future__ import annotations
