@@ -2,13 +2,13 @@
 
 *Windows*: means over the last n frames for many n at once, at a cost that doesn't depend on n.
 
-*Scatter*: the covariance of the means of windows while nothing moves, learnt from the stream.  Frames err together: the
-background stands still for a while, lamps flicker, a mount hums.  No formula therefore gives the error of the mean of n
-frames.  It is measured, for every length n separately: the difference of two neighbouring windows of n frames has a
-covariance A(n) (twice the Allan variance), which a slow drift hardly touches.  By Haar's decomposition the mean of n
-frames is that of 2 n frames plus or minus half the difference of its two halves; the two are uncorrelated for stationary
-noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames claim, but that
-the stream has not shown, counts as a bias of this background: it changes with the background, at any moment.
+*Scatter*: the covariance of the means of windows while nothing moves, learnt from the stream.  Frames err together:
+the background stands still for a while, lamps flicker, a mount hums.  No formula therefore gives the error of the mean
+of n frames.  It is measured, for every length n separately: the difference of two neighbouring windows of n frames has
+a covariance A(n) (twice the Allan variance), which a slow drift hardly touches.  By Haar's decomposition the mean of n
+frames is that of 2 n frames plus or minus half the difference of its two halves; the two are uncorrelated for
+stationary noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames
+claim, but that the stream has not shown, counts as a bias of this background: it changes with it, at any moment.
 
 *Extremes*: the threshold of a stream, learnt by extreme value theory from the largest statistic of every block of
 frames.  Of the upper quarter of blocks the excess over the least of them is modelled as exponential in the statistic's
