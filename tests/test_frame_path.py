@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 from types import CodeType, FrameType
 
+from support.loopback import free_endpoint
+
 import gripmon
 from gripmon.daemon import run
 from gripmon.daemon.config import builtin_config, load_config
@@ -19,7 +21,6 @@ from gripmon.model.records import Frame, FrameRecord, Verdict
 from gripmon.monitor import Monitor
 from gripmon.record.write import NullRecorder
 from gripmon.simulate import Scenario, Simulator
-from support.loopback import free_endpoint
 
 COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames
 MOST_FILES, MOST_FUNCTIONS, MOST_CALLS = 44, 245, 600
