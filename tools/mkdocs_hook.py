@@ -41,6 +41,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return fill(markdown) if fill else markdown
 
 
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Docstrings mark names as Sphinx does; Markdown shows the name alone."""
+    return re.sub(r":(?:class|meth|func|data|attr|mod):(?=<code>)", "", html) if "api.md" in page.file.src_uri else html
+
+
 def on_post_build(config: Any) -> None:
     """Raises where a built page or style sheet would load something from elsewhere: the site has to work offline."""
     site = Path(config["site_dir"])

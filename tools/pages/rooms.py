@@ -10,9 +10,10 @@ PACKAGE = Path(__file__).resolve().parents[2] / "gripmon"
 
 _BOX = (150, 50)
 _GAP = (30, 62)
+_STAGGER = 45
 _STYLE = (
     "text{font:14px sans-serif;fill:currentColor}.small{font-size:11px;opacity:.75}"
-    "rect{fill:none;stroke:currentColor;stroke-width:1.5}path{fill:none;stroke:currentColor;stroke-width:1;opacity:.45}"
+    "rect{fill:var(--md-default-bg-color,#fff);stroke:currentColor;stroke-width:1.5}path{fill:none;stroke:currentColor;stroke-width:1;opacity:.45}"
 )
 
 
@@ -74,11 +75,14 @@ def svg() -> str:
     heights = floors(graph)
     top = max(heights.values())
     widest = max(sum(height == floor for height in heights.values()) for floor in range(top + 1))
-    width = widest * (_BOX[0] + _GAP[0]) + _GAP[0]
+    width = widest * (_BOX[0] + _GAP[0]) + _GAP[0] + 2 * _STAGGER
     places: dict[str, tuple[float, float]] = {}
-    for floor in range(top + 1):
-        here = sorted(room for room in graph if heights[room] == floor)
-        left = (width - len(here) * (_BOX[0] + _GAP[0]) + _GAP[0]) / 2
+    for floor in range(top, -1, -1):
+        # Below what imports it, so that lines are short; staggered, so that a line past a floor shows beside its boxes.
+        above = {room: [places[user][0] for user in places if room in graph[user]] for room in graph}
+        here = [room for room in graph if heights[room] == floor]
+        here.sort(key=lambda room: (sum(above[room]) / max(1, len(above[room])), room))
+        left = (width - len(here) * (_BOX[0] + _GAP[0]) + _GAP[0]) / 2 + _STAGGER * (-1) ** floor
         for index, room in enumerate(here):
             places[room] = (left + index * (_BOX[0] + _GAP[0]), (top - floor) * (_BOX[1] + _GAP[1]) + 10)
     parts = [_line(places[room], places[below]) for room, lower in direct(graph).items() for below in sorted(lower)]
