@@ -12,7 +12,8 @@ What `import gripmon` gives; the command line calls the same functions. Names ar
 _CLIENT = """\
 ## The client
 
-`gripmon.client` is for programs that use the corrected transform; [Write a controller](../howto/client.md) shows it at work.
+`gripmon.client` is for programs that use the corrected transform;
+[Write a controller](../howto/client.md) shows it at work.
 """
 
 

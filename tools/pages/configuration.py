@@ -1,4 +1,4 @@
-"""The reference of the configuration: every key with type, unit, default, bounds and meaning, from the settings' types."""
+"""The reference of the configuration, from the settings' types: key, type, unit, default, bounds, meaning."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from gripmon.daemon.config.second import SecondSettings
 from gripmon.daemon.config.settings import Settings
 
 UNITS = {
-    "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s", "_per_day": "1/day",
-    "_per_month": "1/month", "_m": "m", "_rad": "rad", "_s": "s", "_ns": "ns", "_hz": "Hz", "_bytes": "bytes",
+    "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s",
+    "_per_day": "1/day", "_per_month": "1/month", "_m": "m", "_rad": "rad", "_s": "s", "_ns": "ns", "_hz": "Hz", "_bytes": "bytes",
     "_sigmas": "standard deviations", "_frames": "frames",
 }  # fmt: skip
 """Endings of keys and what they are in; the first that fits counts."""
@@ -30,7 +30,8 @@ default has to be given; a key that is not listed here is refused. Paths are rel
 _SECOND = """\
 ## A second camera
 
-A configuration with the section `laser` watches a second camera by laser pointer ([how to](../howto/laser.md#watching)).
+A configuration with the section `laser` watches a second camera by laser pointer
+([how to](../howto/laser.md#watching)).
 It has `robot`, `camera_name`, `source`, `publish`, `recording`, `view`, `metrics` and `daemon` as above, and:
 """
 

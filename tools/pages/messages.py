@@ -8,9 +8,8 @@ from typing import Any
 from gripmon.model.records import MESSAGES, json_schema
 
 
-
 def put_into(page: str) -> str:
-    """The page with a table at every mark ``<!-- table: NAME -->``.  KeyError for a name that is no type on the wire."""
+    """The page with a table at every mark ``<!-- table: NAME -->``; KeyError for an unknown name."""
     return re.sub(r"<!-- table: (\w+) -->", lambda mark: f"{mark[0]}\n{_table(mark[1])}\n<!-- end -->", page)
 
 
@@ -77,4 +76,3 @@ def _meaning(node: dict[str, Any]) -> str:
     if not texts and "$ref" in node:
         texts = [json_schema()["$defs"][node["$ref"].rpartition("/")[2]]["description"].split("\n")[0]]
     return ". ".join(dict.fromkeys(text.rstrip(".") for text in texts)).replace("|", "\\|").replace("<", "&lt;")
-
