@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -24,10 +23,8 @@ from gripmon.model.records import Array, Transform
 ROOT = Path(__file__).resolve().parent.parent
 SECTION = "## From a new gripper to a running monitor"
 CHI2_999 = {5: 20.5, 6: 22.5, 12: 32.9}
-PATIENCE_S = 300.0
-"""For any command on a busy machine."""
-DAEMON_S = 60.0
-"""The monitor of a folder ends by itself; one that doesn't is stopped as a person stops it."""
+PATIENCE_S = 600.0
+"""For any command on a busy machine; the monitor of a folder ends with its images."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +56,11 @@ def page(name: str) -> list[Block]:
 def run(command: str, folder: Path) -> tuple[int, str]:
     """Exit code and everything printed, of a shell that finds this environment's ``gripmon``."""
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    shell = subprocess.Popen(
-        ["bash", "-c", f"exec {command}"], cwd=folder, env=os.environ | {"PATH": path}, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    done = subprocess.run(
+        ["bash", "-c", command], cwd=folder, env=os.environ | {"PATH": path}, text=True, timeout=PATIENCE_S,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False,
     )  # fmt: skip
-    try:
-        out, _ = shell.communicate(timeout=DAEMON_S if command.startswith("gripmon run") else PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        shell.send_signal(signal.SIGINT)
-        out, _ = shell.communicate(timeout=PATIENCE_S)
-    return shell.returncode, out
+    return done.returncode, done.stdout
 
 
 def without_numbers(text: str) -> str:
