@@ -59,20 +59,6 @@ def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     assert "first seed 1" in text and "MISSED: something" in text and "nan" not in text
 
 
-def test_what_is_missed_is_told():
-    from benchmarks import offline
-    from benchmarks.offline_plane import Errors
-
-    good = np.full(6, 1e-6)
-    nees = [1.0] * 95 + [100.0] * 5
-    assert offline.missed([Errors("perfect", "known", [good] * 100, nees)]) == []
-    far = [good] * 99 + [np.array([0.0, 0.0, 6e-5, 0.0, 0.0, 0.0])]
-    assert "largest error in z 0.0600 mm" in offline.missed([Errors("perfect", "known", far, nees)])[0]
-    assert offline.missed([Errors("printed, 0.05 mm", "known", far, nees)]) == []
-    assert "100 %" in offline.missed([Errors("perfect", "inferred", [good] * 100, [1.0] * 100)])[0]
-    assert "no result" in offline.missed([Errors("perfect", "known", refused=["why"])])[0]
-
-
 def test_everybody_calibrates_the_same_camera():
     """Errors of the mapping by their definition, and two other libraries near us on points of a known noise."""
     import msgspec
