@@ -168,7 +168,7 @@ def test_while_messages_pour_in_every_thread_gets_the_newest_at_once(endpoint: s
             for thread in threads:
                 thread.start()
             for thread in threads:
-                thread.join(20.0)
+                thread.join(60.0)
             assert [len(mine) for mine in got] == [500] * 4
             assert all(reading.usable for mine in got for reading in mine)
             assert next(iter(client)).usable

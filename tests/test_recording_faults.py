@@ -48,7 +48,7 @@ def no_child_left() -> Iterator[None]:
     before = set(psutil.Process().children())
     yield
     # One that has all it needs may write on for a while.
-    _, alive = psutil.wait_procs(set(psutil.Process().children()) - before, timeout=30.0)
+    _, alive = psutil.wait_procs(set(psutil.Process().children()) - before, timeout=120.0)
     assert not alive
 
 
