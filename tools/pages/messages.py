@@ -1,23 +1,16 @@
-"""The tables of ``docs/wire.md``, made from the JSON Schema; ``python -m support.wire_page`` in tests/ writes them."""
+"""The tables of ``docs/reference/wire.md``, made from the JSON Schema of the messages."""
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 from gripmon.model.records import MESSAGES, json_schema
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "wire.md"
-
 
 def put_into(page: str) -> str:
-    """The page with every table between its marks, ``<!-- NAME -->`` and ``<!-- end -->``, made anew."""
-
-    def table(match: re.Match[str]) -> str:
-        return f"<!-- {match[1]} -->\n{_table(match[1])}\n<!-- end -->"
-
-    return re.sub(r"<!-- (\w+) -->\n.*?\n?<!-- end -->", table, page, flags=re.DOTALL)
+    """The page with a table at every mark ``<!-- table: NAME -->``; KeyError for an unknown name."""
+    return re.sub(r"<!-- table: (\w+) -->", lambda mark: f"{mark[0]}\n{_table(mark[1])}\n<!-- end -->", page)
 
 
 def definitions() -> dict[str, Any]:
@@ -30,7 +23,7 @@ def fields_in(page: str) -> dict[str, list[str]]:
     """What a reader finds: the fields in the rows of each table."""
     return {
         name: re.findall(r"^\| `(\w+)` \|", rows, re.MULTILINE)
-        for name, rows in re.findall(r"<!-- (\w+) -->\n(.*?)<!-- end -->", page, re.DOTALL)
+        for name, rows in re.findall(r"<!-- table: (\w+) -->\n(.*?)<!-- end -->", page, re.DOTALL)
     }
 
 
@@ -38,7 +31,7 @@ def words_in(page: str) -> dict[str, list[str]]:
     """The words of each enumeration."""
     return {
         name: re.findall(r"`(\w+)`", rows)
-        for name, rows in re.findall(r"<!-- (\w+) -->\n(`.*?)<!-- end -->", page, re.DOTALL)
+        for name, rows in re.findall(r"<!-- table: (\w+) -->\n(`.*?)<!-- end -->", page, re.DOTALL)
     }
 
 
@@ -82,8 +75,4 @@ def _meaning(node: dict[str, Any]) -> str:
     texts += [part["description"] for part in node.get("anyOf", ()) if "description" in part]
     if not texts and "$ref" in node:
         texts = [json_schema()["$defs"][node["$ref"].rpartition("/")[2]]["description"].split("\n")[0]]
-    return ". ".join(dict.fromkeys(text.rstrip(".") for text in texts)).replace("|", "\\|")
-
-
-if __name__ == "__main__":
-    PAGE.write_text(put_into(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
+    return ". ".join(dict.fromkeys(text.rstrip(".") for text in texts)).replace("|", "\\|").replace("<", "&lt;")
