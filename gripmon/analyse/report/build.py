@@ -11,19 +11,23 @@ from numpy.typing import NDArray
 
 from gripmon import __version__
 from gripmon.analyse.report.affected import motion_ranges, verdict_ranges
-from gripmon.analyse.report.clock import straightened
-from gripmon.analyse.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
-from gripmon.analyse.report.envelope import curves_of
+from gripmon.analyse.report.content import (
+    CommandEntry,
+    Displacement,
+    Event,
+    RecordingReport,
+    ReferenceEntry,
+    Report,
+    Source,
+    main_text,
+)
 from gripmon.analyse.report.formats import count
-from gripmon.analyse.report.happenings import happenings_of, pauses_of, with_reference_changes
+from gripmon.analyse.report.happenings import MOTIONS, happenings_of, lives_of, pauses_of, with_reference_changes
 from gripmon.analyse.report.hindsight import look_back
-from gripmon.analyse.report.integrity import integrity_of
-from gripmon.analyse.report.limits import limits_of
-from gripmon.analyse.report.lives import MOTIONS, lives_of
+from gripmon.analyse.report.limits import integrity_of, limits_of
 from gripmon.analyse.report.motions import motions_of
 from gripmon.analyse.report.running import dropped_of, running_of
-from gripmon.analyse.report.source import Source, main_text
-from gripmon.analyse.report.track import Track, displacement, make_track
+from gripmon.analyse.report.track import Track, curves_of, displacement, make_track, straightened
 from gripmon.analyse.report.words import headline, paragraph
 from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
 

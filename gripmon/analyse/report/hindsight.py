@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.analyse.report.clock import SECOND_NS
-from gripmon.analyse.report.content import Displacement, Event, Limits, Moment, Onset
+from gripmon.analyse.report.content import Displacement, Event, Limits, Moment, Onset, Source
+from gripmon.analyse.report.happenings import MOTIONS
 from gripmon.analyse.report.limits import excess
-from gripmon.analyse.report.lives import MOTIONS
-from gripmon.analyse.report.source import Source
-from gripmon.analyse.report.track import Track, displacement
+from gripmon.analyse.report.track import SECOND_NS, Track, displacement
 from gripmon.analyse.smoother import LEAST_FRAMES, ChangePoint, correct
 from gripmon.model.records import AlertKind, Severity
 

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.analyse.report.affected import runs_of_equal
-from gripmon.analyse.report.clock import SECOND_NS, Clock
-from gripmon.analyse.report.content import Noise, Running, Share, Slice, Stretch
-from gripmon.analyse.report.onsets import robust_sigma
-from gripmon.analyse.report.source import Source
-from gripmon.analyse.report.track import Track
+from gripmon.analyse.report.content import Noise, Running, Share, Slice, Source, Stretch
+from gripmon.analyse.report.motions import robust_sigma
+from gripmon.analyse.report.track import SECOND_NS, Clock, Track
 from gripmon.model.records import Array, StateRecord
 
 if TYPE_CHECKING:

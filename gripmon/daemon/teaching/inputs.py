@@ -30,7 +30,7 @@ from gripmon.monitor import MonitorSettings
 from gripmon.teach.edges.bench import Bench, rough_fault
 from gripmon.teach.edges.corner_pose import CameraError
 from gripmon.teach.edges.files import Picture, read_any, read_picture
-from gripmon.teach.onboarding.rough import RoughCorners
+from gripmon.teach.onboarding.outlines import RoughCorners
 from gripmon.teach.page import RoughDesk
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"

@@ -15,8 +15,7 @@ from gripmon.record.read.opening import (
     recording_files,
     recordings_below,
 )
-from gripmon.record.read.recordings import Picture, Recording, Shot, decode_image
-from gripmon.record.read.run import RecordedRun
+from gripmon.record.read.recordings import Picture, RecordedRun, Recording, Shot, decode_image
 from gripmon.record.read.table import FrameTable
 
 __all__ = [
