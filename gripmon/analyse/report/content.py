@@ -6,22 +6,13 @@ SI units, radians, Unix nanoseconds.  Within a major version of the schema field
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Protocol
+from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
-from gripmon.model.records import CauseWeight, RecordedConfiguration
-from gripmon.record.read import RecordedRun
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from gripmon.record.read import Picture
+from gripmon.model.records import CauseWeight
+from gripmon.record.read import Recording
 
 
 Vector = tuple[float, float, float]
@@ -288,26 +279,7 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
     faults: Annotated[tuple[str, ...], Meta(description="files that could not be used at all, a line each")]
 
 
-class Source(RecordedRun, Protocol):
-    """One run of one monitor, as :class:`gripmon.record.read.Recording` is."""
-
-    @property
-    def files(self) -> Sequence[Path]: ...
-    @property
-    def configuration(self) -> RecordedConfiguration | None: ...
-    @property
-    def faults(self) -> Sequence[str]: ...
-    @property
-    def gaps(self) -> Sequence[str]:
-        """Those of the faults that tell of frames whose numbers are missing."""
-
-    @property
-    def image_seqs(self) -> NDArray[np.int64]: ...
-    def picture(self, seq: int) -> Picture | None:
-        """The image of a frame with its overlay; None if it isn't recorded."""
-
-
-def main_text(source: Source) -> str | None:
+def main_text(source: Recording) -> str | None:
     """The text of the recorded configuration's main file; None if there is none."""
     configuration = source.configuration
     file = None if configuration is None else configuration.files.get(configuration.main)

@@ -23,7 +23,7 @@ from gripmon.model.errors import NoResultError
 from gripmon.model.records import ReferenceRecord
 from gripmon.record.export.schemas import SCHEMAS
 from gripmon.record.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
-from gripmon.record.read import RecordedRun, open_recordings, recording_files
+from gripmon.record.read import Recording, open_recordings, recording_files
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
@@ -96,7 +96,7 @@ class Exporter:
         self._from: dict[tuple[str, str, str], Path] = {}
         self._references: set[Path] = set()
 
-    def add(self, part: RecordedRun, path: Path) -> None:
+    def add(self, part: Recording, path: Path) -> None:
         """Export what the file ``path`` of a recording holds.  Raises OSError if it can't be written."""
         recording_id, number = part.recording_id, _number(part, path)
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
@@ -160,7 +160,7 @@ def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
             writer.write_table(group, row_group_size=max(1, len(group)))
 
 
-def _number(part: RecordedRun, path: Path) -> int:
+def _number(part: Recording, path: Path) -> int:
     """Of a file in its run; older ones say it in their names alone."""
     if part.meta is not None:
         return part.meta.file_number

@@ -15,14 +15,13 @@ from gripmon.record.read.opening import (
     recording_files,
     recordings_below,
 )
-from gripmon.record.read.recordings import Picture, RecordedRun, Recording, Shot, decode_image
+from gripmon.record.read.recordings import Picture, Recording, Shot, decode_image
 from gripmon.record.read.table import FrameTable
 
 __all__ = [
     "Collection",
     "FrameTable",
     "Picture",
-    "RecordedRun",
     "Recording",
     "Shot",
     "decode_image",

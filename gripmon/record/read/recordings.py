@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -269,26 +269,3 @@ def _media_type(row: _Row) -> str:
 def _stamp_ns(row: _Row) -> int:
     value = row.value("capture_time")
     return 0 if value is None or not value.is_valid else int(value.value)
-
-
-class RecordedRun(Protocol):
-    """What recordings hold of one run of one monitor, or of a part, as :class:`gripmon.record.read.Recording` does."""
-
-    @property
-    def recording_id(self) -> str: ...
-    @property
-    def meta(self) -> Meta | None: ...
-    @property
-    def robot(self) -> str: ...
-    @property
-    def camera(self) -> str: ...
-    @property
-    def frames(self) -> FrameTable: ...
-    @property
-    def alerts(self) -> Sequence[AlertRecord]: ...
-    @property
-    def states(self) -> Sequence[StateRecord]: ...
-    @property
-    def commands(self) -> Sequence[RecordedCommand]: ...
-    @property
-    def references(self) -> Sequence[ReferenceRecord]: ...

@@ -1,5 +1,5 @@
-"""One gripper before one camera, while a person teaches it: images, corners put by hand, and what follows from them, down
-to the accuracy to expect.
+"""One gripper before one camera, while a person teaches it: images, corners put by hand, and what follows from them,
+down to the accuracy to expect.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Sub-pixel corners of a rough outline: a straight line for each of its edges, where adjacent ones meet, and how far off
-they may be by what their points show.
+"""Sub-pixel corners of a rough outline: a straight line for each of its edges, where adjacent ones meet, and how far
+off they may be by what their points show.
 
 Unlike :mod:`gripmon.teach.edges.snapping`, which poses a gripper that is known, this knows no gripper.  Lines are
 straight in ideal coordinates; profiles lie along the edge as the lens bends it.  Each edge is looked for on its own, as
