@@ -14,7 +14,6 @@ from msgspec import Meta
 from gripmon.model.records import CauseWeight
 from gripmon.record.read import Recording
 
-
 Vector = tuple[float, float, float]
 
 
