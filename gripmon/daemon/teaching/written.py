@@ -1,18 +1,28 @@
-"""The configuration that teaching writes: complete, with a comment at every key."""
+"""The configuration that teaching writes: complete, with a comment at every key, from the settings' own descriptions.
+
+Written line by line: a YAML library that keeps comments (ruamel.yaml) would be one more dependency, and the lines that
+stand behind a #, as what holds anyway, it can't write.
+"""
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
+
+import msgspec
 
 from gripmon import __version__
-from gripmon.cli.commented import lines_of, yaml_value
-
-if TYPE_CHECKING:
-    from gripmon.cli.teach_inputs import Inputs
-    from gripmon.model.records import ReferenceRecord
-    from gripmon.teach.edges.corner_pose import CornerPose
+from gripmon.daemon.config import Config, Settings, load_config
+from gripmon.daemon.teaching.inputs import Inputs
+from gripmon.io.sources import FolderSettings, SourceError
+from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
+from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges.corner_pose import CornerPose
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
@@ -34,8 +44,6 @@ def config_text(
     folder: Callable[[Path], str],
 ) -> str:
     """A whole file; ``folder`` names a path as the file does."""
-    from gripmon.io.sources import FolderSettings
-
     source = inputs.source
     assert source is not None
     parts = [
@@ -85,6 +93,20 @@ def with_taught(path: Path, taught: str) -> str:
     )
 
 
+def name_taught(config: Config, taught: Path) -> Config:
+    """Write the line that names a taught model into a configuration, unless one is there; the configuration with it.
+
+    Raises :class:`~gripmon.model.errors.InputError` where it can't be written.
+    """
+    if config.taught_path is None:
+        name = Path(os.path.relpath(taught.resolve(), config.directory.resolve())).as_posix()
+        try:
+            write_atomically(config.path, with_taught(config.path, name).encode())
+        except OSError as error:
+            raise InputError(f"{config.path}: can't be written ({error.strerror or error}); a file") from None
+    return load_config(config.path, check_source=False)
+
+
 def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
     transform, covariance = reference.cam_T_grip, list(reference.covariance)
     said = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
@@ -115,7 +137,7 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
     if inputs.jaw_source in _FROM_ELSEWHERE:
         return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
     openings = [picture.jaw_opening_m for picture in inputs.pictures]
-    table = [(Path(p.path).parent / "timestamps.csv").exists() for p in inputs.pictures if p.path is not None]
+    table = [(Path(p.path).parent / TIMESTAMPS_NAME).exists() for p in inputs.pictures if p.path is not None]
     told = inputs.jaw_source is None and table and all(table)
     if told and None not in openings and len(set(table)) == 1 and _in_table(inputs):
         return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
@@ -131,14 +153,11 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
 
 def _in_table(inputs: Inputs) -> bool:
     """Whether the images' own table has their openings: one given for all of them is fixed."""
-    from gripmon.io.sources import SourceError
-    from gripmon.io.sources.folder import read_table
-
     try:
         for picture in inputs.pictures:
             assert picture.path is not None
             path = Path(picture.path)
-            row = read_table(path.parent / "timestamps.csv").get(path.name)
+            row = read_table(path.parent / TIMESTAMPS_NAME).get(path.name)
             if row is None or row.jaw_opening_m is None or row.jaw_opening_m != picture.jaw_opening_m:
                 return False
     except SourceError:
@@ -148,10 +167,6 @@ def _in_table(inputs: Inputs) -> bool:
 
 def _defaults() -> str:
     """What holds anyway, behind # signs."""
-    import msgspec
-
-    from gripmon.daemon.config import Settings
-
     lines = [
         "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
     ]
@@ -159,3 +174,52 @@ def _defaults() -> str:
         if field.name in _AS_THEY_ARE:
             lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
     return "\n".join(lines)
+
+
+def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
+    """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
+
+    Keys without value are left out.
+    """
+    lines = []
+    tag = type(settings).__struct_config__
+    if tag.tag_field is not None and not off:
+        lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
+    section = msgspec.inspect.type_info(type(settings))
+    assert isinstance(section, msgspec.inspect.StructType)
+    for field in section.fields:
+        value = getattr(settings, field.name)
+        if value is None:
+            continue
+        if isinstance(value, msgspec.Struct):
+            lines.append(_line(indent, field.encode_name, "", "", off))
+            lines.append(lines_of(value, indent + 2, off=off))
+            continue
+        description = _described(field.type)
+        lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
+    return "\n".join(lines)
+
+
+def yaml_value(value: Any) -> str:
+    """A value on one line, as both YAML and JSON read it back."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(yaml_value(item) for item in value)}]"
+
+
+def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:
+    text = f"{'# ' * off}{' ' * indent}{key}:{f' {value}' if value else ''}"
+    return f"{text}  # {description}" if description else text
+
+
+def _described(node: Any) -> str:
+    if isinstance(node, msgspec.inspect.Metadata):
+        own = (node.extra_json_schema or {}).get("description", "")
+        return own or _described(node.type)
+    if isinstance(node, msgspec.inspect.UnionType):
+        return next((text for each in node.types if (text := _described(each))), "")
+    return ""

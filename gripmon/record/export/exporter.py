@@ -6,7 +6,9 @@ import hashlib
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
@@ -17,10 +19,11 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from gripmon.model.atomic import opened_atomically, remove_leftovers
+from gripmon.model.errors import NoResultError
 from gripmon.model.records import ReferenceRecord
 from gripmon.record.export.schemas import SCHEMAS
 from gripmon.record.export.tables import alert_rows, command_rows, days_of, frame_rows, reference_row, state_rows
-from gripmon.record.read import RecordedRun
+from gripmon.record.read import Recording, open_recordings, recording_files
 
 ROWS_A_GROUP = 1 << 16
 """Of frames: 18 minutes at 60 frames/s.  Readers skip whole groups by the times in their statistics."""
@@ -29,6 +32,53 @@ _NULL = "__HIVE_DEFAULT_PARTITION__"
 _LONGEST_NAME = 120
 _NUMBERED = re.compile(r"-(\d{4,9})$")
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
+_FAULTS_IN_A_LINE = 5
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written: rows by table, from how many files; ``faults`` is what could not be used, one line each."""
+
+    rows: dict[str, int]
+    files: int
+    faults: tuple[str, ...]
+
+
+def export(
+    recordings: Sequence[str | PathLike[str]],
+    out: str | PathLike[str],
+    *,
+    progress: Callable[[int, int], None] = lambda _done, _all: None,
+) -> Exported:
+    """Write recordings (.rrd, ``estimates.jsonl``, folders of recordings) as Parquet below the folder ``out``.
+
+    Memory holds one file at a time; files that were exported before are replaced.  ``progress`` is called with bytes
+    read and bytes in all.  Raises :class:`~gripmon.model.errors.InputError` for recordings that are not there,
+    :class:`~gripmon.model.errors.NoResultError` where nothing in them can be used or ``out`` can't be written.
+    """
+    files = recording_files([Path(path) for path in recordings])
+    exporter = Exporter(Path(out))
+    faults: list[str] = []
+    sizes = [file.stat().st_size for file in files]
+    for number, file in enumerate(files):
+
+        def reached(done: int, _: int, behind: int = sum(sizes[:number])) -> None:
+            progress(behind + done, sum(sizes))
+
+        found = open_recordings([file], reached)
+        faults += found.faults
+        for recording in found.recordings:
+            faults += recording.file_faults
+            try:
+                exporter.add(recording, file)
+            except OSError as error:
+                wrong = f"can't be written ({error.strerror or error})"
+                raise NoResultError(f"{out}: {wrong}, at {file}; what stands there is whole") from None
+    faults += exporter.faults
+    if not exporter.parts:
+        more = f"; and {len(faults) - _FAULTS_IN_A_LINE} more" if len(faults) > _FAULTS_IN_A_LINE else ""
+        raise NoResultError(f"export: {'; '.join(faults[:_FAULTS_IN_A_LINE]) or 'nothing was recorded'}{more}")
+    return Exported({table: exporter.rows[table] for table in SCHEMAS}, exporter.parts, tuple(faults))
 
 
 class Exporter:
@@ -46,7 +96,7 @@ class Exporter:
         self._from: dict[tuple[str, str, str], Path] = {}
         self._references: set[Path] = set()
 
-    def add(self, part: RecordedRun, path: Path) -> None:
+    def add(self, part: Recording, path: Path) -> None:
         """Export what the file ``path`` of a recording holds.  Raises OSError if it can't be written."""
         recording_id, number = part.recording_id, _number(part, path)
         name = f"{_file_name(recording_id)}-{number:04d}.parquet"
@@ -55,9 +105,6 @@ class Exporter:
             self.faults.append(f"{path}: the same part of the same run as {known}; left out")
             return
         frames = part.frames.take(np.argsort(part.frames.stamp_ns, kind="stable"))
-
-        def some_frames(rows: slice) -> pa.Table:
-            return frame_rows(frames.take(rows), recording_id, number)
 
         target = _Target(f"robot={_escaped(part.robot)}/camera={_escaped(part.camera)}", name)
         self._by_day(
@@ -113,7 +160,7 @@ def _write(path: Path, schema: pa.Schema, groups: Iterable[pa.Table]) -> None:
             writer.write_table(group, row_group_size=max(1, len(group)))
 
 
-def _number(part: RecordedRun, path: Path) -> int:
+def _number(part: Recording, path: Path) -> int:
     """Of a file in its run; older ones say it in their names alone."""
     if part.meta is not None:
         return part.meta.file_number

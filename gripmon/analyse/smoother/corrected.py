@@ -1,24 +1,62 @@
-"""What ``gripmon correct`` writes: JSON lines and Parquet, with where it comes from."""
+"""A corrected run, and how it is written: JSON lines, Parquet or a track for the viewer, with where it comes from."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
-from gripmon.analyse.smoother import SOURCES, ChangePoint, changes, correction, sample, smoother
-from gripmon.model.records import Transform
-
-if TYPE_CHECKING:
-    from gripmon.cli.correct import CorrectedRun
+from gripmon.analyse.smoother import changes, correction, smoother
+from gripmon.analyse.smoother.correction import SOURCES, ChangePoint, Correction, correct
+from gripmon.analyse.smoother.sampling import sample
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Origin, Transform
+from gripmon.record.read import FrameTable, Recording
 
 BETWEEN = "between"
 """Source of an instant that is no frame's."""
+
+
+@dataclass(frozen=True)
+class CorrectedRun:
+    """One run of a monitor and its correction; ``wanted_ns`` (n,): the instants to write instead of its frames."""
+
+    recording: Recording
+    correction: Correction
+    wanted_ns: NDArray[np.int64] | None = None
+
+    @property
+    def name(self) -> str:
+        """See :func:`name_of`."""
+        return name_of(self.recording)
+
+
+def name_of(recording: Recording) -> str:
+    """The first files of a run."""
+    return ", ".join(path.name for path in recording.files[:3]) + (", …" if len(recording.files) > 3 else "")
+
+
+def correct_table(frames: FrameTable, step: Callable[[], None]) -> Correction:
+    """Correct the frames of a table; ``step`` is called after each stage.  ValueError where too little was measured."""
+    held = frames.ORIGINS.index(Origin.HELD.value)
+    length = np.linalg.norm(frames.cam_T_grip[:, 3:], axis=1)
+    measured = np.isfinite(frames.cam_T_grip).all(axis=1) & (frames.source != held) & ~frames.refused & (length > 0.0)
+    poses = np.full((len(frames), 4, 4), np.nan)
+    good = frames.cam_T_grip[measured]
+    poses[measured] = np.eye(4)
+    if len(good):
+        poses[measured, :3, :3] = Rotation.from_quat(good[:, 3:]).as_matrix()
+    poses[measured, :3, 3] = good[:, :3]
+    return correct(frames.stamp_ns, poses, frames.covariance, measured, step)
 
 
 class WrittenChangePoint(msgspec.Struct, frozen=True):
@@ -69,7 +107,7 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
     sigma_tcp_m: float
 
 
-def provenance(runs: list[CorrectedRun], inputs: list[tuple[str, str]]) -> Provenance:
+def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
     """What a file says about where it comes from."""
     settings = {
         "false_alarms_per_hour": changes.FALSE_ALARMS_PER_HOUR,
@@ -143,44 +181,63 @@ def _frames(number: int, rows: _Rows) -> Iterator[CorrectedFrame]:
         )
 
 
-def write_jsonl(path: Path, runs: list[CorrectedRun], inputs: list[tuple[str, str]]) -> None:
+def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]], number: int = 0) -> None:
+    """A file, whole or not at all, of the kind that its suffix names; a track (.rrd) is of run ``number`` alone.
+
+    ``inputs`` are SHA-256 by file name.  Raises :class:`gripmon.model.errors.NoResultError`.
+    """
+    part = path.with_name(f".{path.name}.part")
+    about = provenance(runs, inputs)
+    try:
+        if path.suffix.lower() == ".jsonl":
+            _write_jsonl(part, runs, about)
+        elif path.suffix.lower() == ".parquet":
+            _write_parquet(part, runs, about)
+        else:
+            from gripmon.record.write.track import write_track
+
+            recording = runs[number].recording
+            write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
+        part.replace(path)
+    except OSError as error:
+        raise NoResultError(f"{path}: writing failed ({error.strerror or error})") from None
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def _write_jsonl(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
     """A :class:`Provenance`, then a :class:`CorrectedFrame` a line."""
     encode = msgspec.json.Encoder().encode
     with path.open("wb") as file:
-        file.write(encode(provenance(runs, inputs)) + b"\n")
+        file.write(encode(about) + b"\n")
         for number, each in enumerate(runs):
             for frame in _frames(number, _Rows(each)):
                 file.write(encode(frame) + b"\n")
 
 
-def write_parquet(path: Path, runs: list[CorrectedRun], inputs: list[tuple[str, str]]) -> None:
+def _write_parquet(path: Path, runs: Sequence[CorrectedRun], about: Provenance) -> None:
     """The same as a table, the covariance as a list of 36 (m², m rad, rad²), :class:`Provenance` as metadata."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    about = msgspec.json.encode(provenance(runs, inputs))
-    tables = [_table(number, each, pa) for number, each in enumerate(runs)]
-    whole = pa.concat_tables(tables).replace_schema_metadata({b"gripmon": about})
-    pq.write_table(whole, path, compression="zstd")
+    whole = pa.concat_tables([_table(number, each) for number, each in enumerate(runs)])
+    pq.write_table(whole.replace_schema_metadata({b"gripmon": msgspec.json.encode(about)}), path, compression="zstd")
 
 
-def _table(number: int, each: CorrectedRun, pa: Any) -> Any:
+def _table(number: int, each: CorrectedRun) -> pa.Table:
     rows, recording = _Rows(each), each.recording
     count = len(rows.stamp_ns)
-    columns: dict[str, Any] = {
-        "run": pa.array(np.full(count, number, np.int32)),
-        "robot": pa.array([recording.robot] * count),
-        "camera": pa.array([recording.camera] * count),
-        "seq": pa.array(rows.seq),
-        "stamp_ns": pa.array(rows.stamp_ns),
-        "segment": pa.array(rows.segment),
-        "source": pa.array(rows.source, pa.string()),
-        "sigma_tcp_m": pa.array(rows.sigma_tcp_m),
-    }
-    for k, axis in enumerate("xyz"):
-        columns[f"translation_{axis}_m"] = pa.array(np.ascontiguousarray(rows.poses[:, k, 3]))
-    for k, axis in enumerate("xyzw"):
-        columns[f"rotation_{axis}"] = pa.array(np.ascontiguousarray(rows.rotation_xyzw[:, k]))
     flat = pa.array(np.ascontiguousarray(rows.covariance).ravel())
-    columns["covariance"] = pa.FixedSizeListArray.from_arrays(flat, 36)
-    return pa.table(columns)
+    return pa.table(
+        {
+            "run": pa.array(np.full(count, number, np.int32)),
+            "robot": pa.array([recording.robot] * count),
+            "camera": pa.array([recording.camera] * count),
+            "seq": rows.seq,
+            "stamp_ns": rows.stamp_ns,
+            "segment": rows.segment,
+            "source": pa.array(rows.source, pa.string()),
+            "sigma_tcp_m": rows.sigma_tcp_m,
+            **{f"translation_{axis}_m": np.ascontiguousarray(rows.poses[:, k, 3]) for k, axis in enumerate("xyz")},
+            **{f"rotation_{axis}": np.ascontiguousarray(rows.rotation_xyzw[:, k]) for k, axis in enumerate("xyzw")},
+            "covariance": pa.FixedSizeListArray.from_arrays(flat, 36),
+        }
+    )

@@ -1,11 +1,14 @@
-"""Sub-pixel corners of a rough outline: a straight line for each of its edges, and where adjacent ones meet.
+"""Sub-pixel corners of a rough outline: a straight line for each of its edges, where adjacent ones meet, and how far
+off they may be by what their points show.
 
-Lines are straight in ideal coordinates; profiles lie along the edge as the lens bends it.  Each edge is looked for on
-its own, as the rough ends may be off by several pixels each in any direction.
+Unlike :mod:`gripmon.teach.edges.snapping`, which poses a gripper that is known, this knows no gripper.  Lines are
+straight in ideal coordinates; profiles lie along the edge as the lens bends it.  Each edge is looked for on its own, as
+the rough ends may be off by several pixels each in any direction.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,12 +16,12 @@ import numpy as np
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
-from gripmon.teach.edges.lines import EdgePoints, settle_line
+from gripmon.teach.edges.lines import EdgePoints, Line, settle_line
 from gripmon.teach.onboarding.before_print import look_at, moves, rough_line, sharpness
-from gripmon.teach.onboarding.edge_errors import SeenEdge, line_covariances
 from gripmon.teach.onboarding.outlines import INNERMOST, Outline
 from gripmon.teach.onboarding.plate_print import PlatePrint
-from gripmon.track.edges.prediction import ROWS
+from gripmon.track.edges.consensus import ConsensusSettings
+from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
     EdgeSettings,
     estimate_noise,
@@ -48,7 +51,7 @@ _MOVES = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Snapped:
+class FoundOutline:
     """``points`` (p, 2) of the outline on its measured edges, px; ``covariance_px2`` (2c, 2c) of its c corners, u and v
     of the first, then of the next; ``seen`` (e,) part of each edge that shows it, ``rms_px`` (e,) of its points.
     """
@@ -70,7 +73,7 @@ class _Base:
     way: Array
 
 
-def snap(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> Snapped:
+def find_outline(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> FoundOutline:
     """The outline on the edges that the image shows; before a known print, which has edges of its own, by
     :mod:`~gripmon.teach.onboarding.before_print`.  Raises :class:`CalibrationError`, which names the corner or edge:
     outside of the image, not seen, or no corner.
@@ -98,7 +101,7 @@ def snap(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | N
             break
     covariance = _covariance(camera, outline, points, bases, seen)
     lines = [edge.line for edge in seen]
-    return Snapped(points, covariance, np.array([n.seen for n in lines]), np.array([n.rms_px for n in lines]))
+    return FoundOutline(points, covariance, np.array([n.seen for n in lines]), np.array([n.rms_px for n in lines]))
 
 
 def _check_inside(camera: Camera, outline: Outline) -> None:
@@ -275,3 +278,67 @@ def _covariance(camera: Camera, outline: Outline, points: Array, bases: list[_Ba
             slope = (shifted[0] - shifted[1])[corners].ravel()
             out += np.outer(slope, slope)
     return out
+
+
+_FEWEST_FREE = 3.0
+_LEAST_PX = 0.01
+"""Standard deviation of a point: no image gives it better than that."""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenEdge:
+    """A line with the ``points`` (k,) it was chosen from, their edges' ``width_px`` (k,), and what they know of the
+    line (k,), on average 1; None: all the same.
+    """
+
+    line: Line
+    points: EdgePoints
+    width_px: Array
+    worth: Array | None = None
+
+    def design(self) -> tuple[Array, Array]:
+        """Rows (m, 2) and values (m,) of the weighted least squares whose solution is the line."""
+        inlier = self.line.inlier
+        way = self.points.way[inlier]
+        root = np.ones(len(way)) if self.worth is None else np.sqrt(self.worth[inlier])
+        return np.column_stack([1.0 - way, way]) * root[:, None], self.points.offset_px[inlier] * root
+
+
+def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
+    """(2, 2) of each line's offsets at both ends, px.
+
+    Neighbouring points err together where there is texture, independently where there is only noise.  Which it is, the
+    residuals' sums over stretches of an edge tell: divided by the root of their counts they have the variance v of a
+    point if all are independent, and up to :data:`STRETCH` times that if those of a stretch are one.  Either way the
+    line's covariance is ``v (A' A)^-1``, A being its design (Huber, "Robust statistics", 1981, section 6.3, for groups
+    that err together).  v comes from all edges together, as one alone has few stretches, or from the edge itself where
+    that shows more.
+
+    On top comes what all points of an edge share, which no residual shows.
+    """
+    squares, freedom = np.array([_stretches(edge) for edge in seen]).T
+    free = float(freedom.sum())
+    # Known from few stretches itself: Student's distribution has this variance.
+    student = free / (free - 2.0) if free >= _FEWEST_FREE else _FEWEST_FREE
+    usual_px2 = student * float(squares.sum()) / max(free, 1.0)
+    floor_px = ConsensusSettings().edge_floor_px
+    out = []
+    for edge, own, count in zip(seen, squares, freedom, strict=True):
+        design = edge.design()[0]
+        variance_px2 = max(usual_px2, own / max(count, 1.0), _LEAST_PX**2)
+        shared_px = floor_px * max(float(np.median(edge.width_px[edge.line.inlier])), 1.0)
+        out.append(variance_px2 * np.linalg.inv(design.T @ design) + shared_px**2)
+    return out
+
+
+def _stretches(edge: SeenEdge) -> tuple[float, float]:
+    """Sum of squares of the stretches' residuals, and what it would be for independent points of unit variance."""
+    inlier = edge.line.inlier
+    design, values = edge.design()
+    residual = values - design @ edge.line.ends_px
+    member = edge.points.profile[inlier] // STRETCH
+    stretch = (member[:, None] == np.unique(member)).astype(np.float64)
+    stretch /= np.sqrt(stretch.sum(axis=0))
+    # The line's two unknowns take their part: tr(S' (I - P) S).
+    basis = np.linalg.qr(design)[0]
+    return float(np.square(stretch.T @ residual).sum()), float(stretch.shape[1] - np.square(basis.T @ stretch).sum())

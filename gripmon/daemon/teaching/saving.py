@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
+import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import cv2
+import yaml
 
 from gripmon import __version__
-
-if TYPE_CHECKING:
-    from gripmon.cli.teach_inputs import Inputs
-    from gripmon.model.records import ReferenceRecord
-    from gripmon.teach.edges import Taught
-    from gripmon.teach.edges.bench import Found
-    from gripmon.teach.page import Picture, Saved, SaveOrder
-    from gripmon.teach.page.desk import Labels
-    from gripmon.track.edges import TaughtModel
+from gripmon.calibrate.detection import BLURRED_PX
+from gripmon.calibrate.pictures import sharpest_blur_px, to_grey
+from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.teaching.inputs import Inputs
+from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
+from gripmon.model.atomic import write_atomically
+from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges import TeachingImage, TeachingRefused
+from gripmon.teach.edges.bench import Found
+from gripmon.teach.edges.files import taught_model, to_yaml
+from gripmon.teach.page import Picture, Saved, SaveOrder, SavingRefused
+from gripmon.teach.page.desk import Labels
+from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
 
@@ -42,8 +50,6 @@ class FileSaving:
 
     def labels(self) -> Labels:
         """What the page shows."""
-        from gripmon.teach.page.desk import Labels
-
         inputs, known = self._inputs, self._inputs.bench.reference
         return Labels(
             robot=inputs.robot,
@@ -57,8 +63,6 @@ class FileSaving:
 
     def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
         """As :class:`gripmon.teach.page.Saving`."""
-        from gripmon.teach.page import Saved, SavingRefused
-
         paths = self._paths
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
@@ -73,15 +77,13 @@ class FileSaving:
         texts: dict[str, str] = {}
         if "corners" in wanted:
             texts["corners"] = self._corners(order, found, pictures[number].name)
-        files = self._pictures(pictures)
+        pictures, files = self._pictures(pictures)
         reference = found.reference
         if reference is None and {"taught", "config"} & set(wanted):
             raise SavingRefused(f"{found.no_reference}; or save the corners only")
         model = None
         if order.taught and reference is not None:
             model, notes = self._taught(order, found, reference, pictures, files)
-            from gripmon.teach.edges.document import to_yaml
-
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
             texts["config"] = self._config(order, found, reference, model is not None)
@@ -96,25 +98,20 @@ class FileSaving:
         config = self._inputs.config
         return config is not None and (config.taught_path is not None or not order.taught)
 
-    def _pictures(self, pictures: Sequence[Picture]) -> dict[str, bytes]:
+    def _pictures(self, pictures: Sequence[Picture]) -> tuple[list[Picture], dict[str, bytes]]:
         """Live images become files, so that their taught model can be made again."""
-        import cv2
-
-        out = {}
+        out, files = [], {}
         for picture in pictures:
             if picture.path is None:
                 ending = ".tif" if picture.image.dtype.kind == "f" else ".png"
-                _, data = cv2.imencode(ending, picture.image)
-                path = self._inputs.folder / IMAGES / Path(picture.name).with_suffix(ending)
-                out[str(path)] = data.tobytes()
-        return out
+                path = str(self._inputs.folder / IMAGES / Path(picture.name).with_suffix(ending))
+                picture = replace(picture, path=path)
+                files[path] = cv2.imencode(ending, picture.image)[1].tobytes()
+            out.append(picture)
+        return out, files
 
     @staticmethod
     def _check_sharp(pictures: Sequence[Picture]) -> None:
-        from gripmon.calibrate.detection import BLURRED_PX
-        from gripmon.calibrate.pictures import sharpest_blur_px, to_grey
-        from gripmon.teach.page import SavingRefused
-
         for picture in pictures:
             blur_px = sharpest_blur_px(to_grey(picture.image))
             if blur_px > BLURRED_PX:
@@ -131,70 +128,26 @@ class FileSaving:
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
     ) -> tuple[TaughtModel, list[str]]:
-        from gripmon.teach.edges import TeachingImage, TeachingRefused
-        from gripmon.teach.page import SavingRefused
 
         bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
-        openings = [
-            opening_m if order.put.jaw_opening_m is not None or p.jaw_opening_m is None else p.jaw_opening_m
-            for p in pictures
-        ]
+        given = order.put.jaw_opening_m is not None
+        pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
         nominal_m = bench.gripper.jaw_nominal_m
         images = [
-            TeachingImage(p.image, nominal_m if m is None else m, p.name)
-            for p, m in zip(pictures, openings, strict=True)
+            TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, p.name) for p in pictures
         ]
         try:
             taught, _ = bench.taught(reference, images)
         except TeachingRefused as refused:
             raise SavingRefused(f"no taught model: {refused}; or save without it") from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
-        model = self._model(taught, reference, pictures, openings, files)
+        model = taught_model(
+            taught, bench.camera, bench.gripper, bench.settings, reference, pictures, self._inputs.command, files
+        )
         return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
-
-    def _model(
-        self,
-        taught: Taught,
-        reference: ReferenceRecord,
-        pictures: Sequence[Picture],
-        openings: Sequence[float | None],
-        files: Mapping[str, bytes],
-    ) -> TaughtModel:
-        from datetime import UTC, datetime
-
-        from gripmon.model.geometry import from_record
-        from gripmon.track.edges import TaughtModel
-        from gripmon.track.edges.taught import Provenance, TaughtImage, identity
-
-        bench, names = self._inputs.bench, iter(files)
-        images = []
-        for picture, opening_m in zip(pictures, openings, strict=True):
-            path = next(names) if picture.path is None else picture.path
-            data = files[path] if picture.path is None else Path(path).read_bytes()
-            images.append(TaughtImage(file=path, sha256=hashlib.sha256(data).hexdigest(), jaw_opening_m=opening_m))
-        camera, gripper, stands = identity(
-            bench.camera, bench.gripper, reference.reference_id, from_record(reference.cam_T_grip)
-        )
-        return TaughtModel(
-            provenance=Provenance(
-                gripmon=__version__,
-                time=datetime.now(UTC).isoformat(timespec="seconds"),
-                command=self._inputs.command,
-                images=tuple(taught.used(images)),
-                closure_px=taught.closure_px,
-            ),
-            camera=camera,
-            gripper=gripper,
-            reference=stands,
-            edge_settings=bench.settings.corners.edges,
-            edges=taught.edges,
-            corners=taught.corners,
-        )
 
     def _corners(self, order: SaveOrder, found: Found, image: str) -> str:
         """Corners as ``--corners`` reads them."""
-        from gripmon.cli.commented import yaml_value
-
         lines = [
             f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
             "# For gripmon calibrate plane --corners, gripmon teach --corners; name: [column, row] in the image (px)",
@@ -212,7 +165,6 @@ class FileSaving:
         return "\n".join(lines) + "\n"
 
     def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
-        from gripmon.cli.teach_config import config_text, with_taught
 
         given = self._inputs.config
         if given is not None:
@@ -238,13 +190,6 @@ class FileSaving:
         """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
         if "config" not in texts:
             return
-        import shutil
-
-        import yaml
-
-        from gripmon.daemon.config import ConfigError, load_config
-        from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
-        from gripmon.teach.page import SavingRefused
 
         base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
         with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
@@ -268,9 +213,6 @@ class FileSaving:
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Each whole or not at all; the configuration last, since it names the others."""
-        from gripmon.model.atomic import write_atomically
-        from gripmon.teach.page import SavingRefused
-
         words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}
         written: dict[str, str] = {}
         todo = [(Path(path), data, "an image") for path, data in files.items()]
