@@ -155,7 +155,7 @@ def write_plan(planned: Plan, path: Path) -> None:
     import csv
     import io
 
-    from gripmon.laser.pointer.samples import POSITION, QUATERNION
+    from gripmon.calibrate.tables import POSITION, QUATERNION
     from gripmon.model.atomic import write_atomically
     from gripmon.model.geometry import quaternion_xyzw
 

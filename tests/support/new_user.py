@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gripmon.calibrate.targets import CircleGrid
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Array
+from gripmon.model.targets import CircleGrid
 from gripmon.simulate import Scenario, Simulator, write_sequence
 from gripmon.simulate.scenario import Background, Bump, JawScript, Sensor
 from support.plates import Look, pose, render

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
-from gripmon.calibrate.targets import Chequerboard, CircleGrid
+from gripmon.model.targets import Chequerboard, CircleGrid
 from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, load_gripper
