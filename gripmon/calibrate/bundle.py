@@ -161,7 +161,7 @@ class BundleProblem:
         )
         if found.converged:
             return found.state
-        normals = np.stack([T[:3, 2] for T in poses])
+        normals = np.stack([T[:3, 2] for T in found.state[1]])
         if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL:
             raise CalibrationError(DEGENERATE)
         raise CalibrationError(
