@@ -62,6 +62,14 @@ class _Plate:
 
 def make(folder: Path) -> NewUser:
     """Render everything."""
+    make_plates(folder)
+    work = _work()
+    write_sequence(work, folder / "work")
+    return NewUser(folder, np.array([work.truth(k).cam_T_grip for k in range(work.frame_count)]))
+
+
+def make_plates(folder: Path) -> None:
+    """Render the plate, and the gripper standing on it."""
     for name in ("plate", "standing"):
         (folder / name).mkdir(parents=True)
     rng = np.random.default_rng(5)
@@ -78,9 +86,6 @@ def make(folder: Path) -> NewUser:
         grip_T_plate = make_transform(rotation, middle - rotation @ (0.5 * size))
         simulator = _simulator(_Plate(nominal_cam_T_grip() @ grip_T_plate), 20 + number)
         cv2.imwrite(str(folder / "standing" / f"{number}.png"), simulator.render(0))
-    work = _work()
-    write_sequence(work, folder / "work")
-    return NewUser(folder, np.array([work.truth(k).cam_T_grip for k in range(work.frame_count)]))
 
 
 def corners_px(rng: np.random.Generator, off_px: float) -> dict[str, Array]:
