@@ -15,8 +15,8 @@ from gripmon.calibrate.counting import ends_all_round
 from gripmon.calibrate.lattice import Index
 from gripmon.calibrate.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target, TargetError
 
 _CHARUCO = cv2.aruco.CharucoParameters()
 _CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
@@ -34,8 +34,8 @@ BLURRED_PX = 3.0
 def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
     """Points of the target in an image (any that a camera delivers), or why there are none.
 
-    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  ValueError if the target
-    itself can't be (a dictionary that isn't there).
+    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  :class:`TargetError` if
+    the target itself can't be (a dictionary that isn't there).
     """
     grey = to_grey(image)
     if isinstance(target, Charuco):
@@ -68,7 +68,7 @@ def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
     before version 4.6 of OpenCV boards with an even number of rows began with the other colour.
     """
     if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
-        raise ValueError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
+        raise TargetError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
     found: list[_Marked] = []
     for legacy in (False, True) if target.rows % 2 == 0 else (False,):

@@ -12,9 +12,8 @@ import numpy as np
 
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb, skew
+from gripmon.model.least_squares import fit
 from gripmon.model.records import Array
-
-_ITERATIONS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,17 +35,7 @@ class FreePose:
         uv_px = self.camera.project(self.points_m @ out[:3, :3].T + out[:3, 3])
         xy = camera.undistort(uv_px)
         seen = np.isfinite(xy).all(axis=1)
-        points_m, xy = self.points_m[seen], xy[seen]
-        for _ in range(_ITERATIONS):
-            turned = points_m @ out[:3, :3].T
-            x, y, z = (turned + out[:3, 3]).T
-            by_point = np.zeros((len(z), 2, 3))
-            by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
-            by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
-            rows = np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
-            left = xy - np.stack([x / z, y / z], axis=1)
-            out = perturb(out, np.linalg.lstsq(rows.reshape(-1, 6), left.ravel(), rcond=None)[0])
-        return out
+        return pose_of_points(out, self.points_m[seen], xy[seen])
 
     def own_slopes(self, cam_T_plate: Array, contact_m: float) -> Array:
         """(3, 6): what the pose's own independent errors, in their standard deviations, do to :func:`off_plate`."""
@@ -59,6 +48,24 @@ class FreePose:
         )
         out: Array = (up - down).T
         return out
+
+
+def pose_of_points(start: Array, points_m: Array, xy: Array, whiten: Array | None = None) -> Array:
+    """The pose (4, 4) near ``start`` that shows points (n, 3) at ideal coordinates ``xy`` (n, 2) with the least
+    residuals, which ``whiten`` (n, 2, 2) makes comparable.
+    """
+
+    def linearised(pose: Array) -> tuple[Array, Array]:
+        turned = points_m @ pose[:3, :3].T
+        x, y, z = (turned + pose[:3, 3]).T
+        by_point = np.zeros((len(z), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+        by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
+        rows = np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
+        values = xy - np.stack([x / z, y / z], axis=1)
+        return (rows, values) if whiten is None else (whiten @ rows, np.einsum("nij,nj->ni", whiten, values))
+
+    return fit(start, linearised, perturb).state
 
 
 def off_plate(cam_T_grip: Array, cam_T_plate: Array, contact_m: float) -> Array:

@@ -8,8 +8,8 @@ import numpy as np
 
 from gripmon.calibrate.pictures import to_grey
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import Chequerboard
 from gripmon.model.records import Image
+from gripmon.model.targets import Chequerboard
 
 LEAST_CONTRAST = 0.2
 """Between dark and light squares, over the range of the squares' grey levels: what is less may be light and shadow."""

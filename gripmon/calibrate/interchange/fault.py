@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
+from gripmon.model.errors import InputError
 
 
-class InterchangeError(ValueError):
+class InterchangeError(InputError):
     """``str()`` is one line ``file: key: what is wrong; what would be right``."""
 
     def __init__(self, file: str, key: str, wrong: str, right: str = ""):

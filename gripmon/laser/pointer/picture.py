@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.laser.pointer.calibrating import LaserResult
-from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array, Image
@@ -18,9 +17,9 @@ _GOOD, _WRONG, _PLANE, _BEAM = (170, 110, 20), (40, 40, 220), (120, 180, 90), (9
 _SUBPIXEL_BITS = 4
 
 
-def draw(result: LaserResult, base_T_ee: Array, written: LaserCalibration) -> Image:
+def draw(result: LaserResult, base_T_ee: Array) -> Image:
     """Residuals on the left (arrows many times as long), the scene on the right; BGR."""
-    return np.concatenate([_residuals(result, written), _scene(result, base_T_ee)], axis=1)
+    return np.concatenate([_residuals(result), _scene(result, base_T_ee)], axis=1)
 
 
 def _canvas(title: str) -> NDArray[np.uint8]:
@@ -33,17 +32,14 @@ def _write(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> 
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
 
 
-def _residuals(result: LaserResult, written: LaserCalibration) -> Image:
+def _residuals(result: LaserResult) -> Image:
     refined = result.refined
     used = refined.used
     largest = max(float(np.linalg.norm(refined.residuals_px[used], axis=1).max()), 1e-9)
     camera = refined.camera
     most = 0.06 * camera.width_px / largest
     stretch = max(step * 10.0 ** np.floor(np.log10(most / step)) for step in (1.0, 2.0, 5.0))
-    residuals = written.residuals
-    image = _canvas(
-        f"residuals x {stretch:g}: RMS {residuals.rms_px:.3f} px, {residuals.used} of {residuals.spots} spots used"
-    )
+    image = _canvas(f"residuals x {stretch:g}: RMS {refined.rms_px:.3f} px, {used.sum()} of {len(used)} spots used")
     scale = min((_WIDTH - 2 * _MARGIN) / camera.width_px, (_HEIGHT - 2 * _MARGIN - 20) / camera.height_px)
 
     def place(uv: Array) -> Array:

@@ -1,20 +1,20 @@
-"""When a calibration isn't one, and what of it the views can't support: in words, for a person."""
+"""A calibrated camera, and what of it the views can't support: in words, for a person."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gripmon.calibrate.bundle import DEGENERATE, Bundle
-from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.lens_models import LensModel, ModelName, parameter_names
+from gripmon.calibrate.plate_pose import lens_vector
 from gripmon.calibrate.sighting import CalibrationError, Sighting
+from gripmon.model.camera import LensSettings
 from gripmon.model.records import Array
-
-if TYPE_CHECKING:
-    from gripmon.calibrate.intrinsics import IntrinsicsResult
 
 DOUBTFUL_FOCAL = 0.01
 """Relative standard deviation of the focal length from which the views are said not to support it; and the one from
@@ -26,6 +26,42 @@ LARGE_RMS_SHARE = 0.0007
 """Root mean square residual over the image's width from which it is said to be large; and the one from which no camera
 of the model fits at all."""
 LARGEST_RMS_SHARE = 0.003
+
+
+@dataclass(frozen=True, slots=True)
+class IntrinsicsResult:
+    """A calibrated camera.
+
+    ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; the rest was held fixed.  One a view:
+    ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
+    and ``used`` (n,).  ``criterion``: Bayes' information criterion of each model that was tried, the smallest is best.
+    """
+
+    model: ModelName
+    camera: LensSettings
+    parameters: tuple[str, ...]
+    covariance: Array
+    cam_T_plate: tuple[Array, ...]
+    pose_covariance: tuple[Array, ...]
+    residuals_px: tuple[Array, ...]
+    used: tuple[NDArray[np.bool_], ...]
+    rms_px: float
+    warnings: tuple[str, ...] = ()
+    criterion: dict[str, float] | None = None
+    cross_validated_rms_px: float | None = None
+
+    @property
+    def view_rms_px(self) -> tuple[float, ...]:
+        """Root mean square of each view's residuals that were used, u and v each."""
+        return tuple(
+            float(np.sqrt(np.mean(np.square(r[u])))) if u.any() else math.inf
+            for r, u in zip(self.residuals_px, self.used, strict=True)
+        )
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All parameters by name, those that were held, too."""
+        return dict(zip(parameter_names(self.model), lens_vector(self.camera).tolist(), strict=True))
 
 
 def check_fit(lens_model: LensModel, bundle: Bundle, free: Array) -> None:
