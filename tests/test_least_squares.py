@@ -127,7 +127,7 @@ def test_a_pose_on_its_manifold_from_far_away():
         return rows, seen - turned - pose[:3, 3]
 
     # The rows are the derivatives by the perturbation that the retraction applies.
-    rows, values = rows_of(np.eye(4))
+    rows, _ = rows_of(np.eye(4))
     for k in range(6):
         step = 1e-6 * np.eye(6)[k]
         there, back = rows_of(perturb(np.eye(4), step))[1], rows_of(perturb(np.eye(4), -step))[1]

@@ -50,9 +50,10 @@ class Samples:
     @property
     def files(self) -> list[Path]:
         """All images that are to be looked at."""
-        unseen = np.isnan(self.uv_px).any(axis=1).tolist()
-        rows = [pair for pair, look in zip(zip(self.images, self.laser_off, strict=True), unseen, strict=True) if look]
-        return list(dict.fromkeys(path for pair in rows for path in pair if path is not None))
+        unseen = [bool(np.isnan(uv_px).any()) for uv_px in self.uv_px]
+        rows = zip(self.images, self.laser_off, unseen, strict=True)
+        wanted = [path for *pair, look in rows if look for path in pair if path is not None]
+        return list(dict.fromkeys(wanted))
 
     def picked(self, kept: Sequence[int]) -> Samples:
         """Those samples only."""
