@@ -47,9 +47,8 @@ def main(folder: Path) -> bool:
     print(f"TCP in the camera's frame ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {np.round(sigma_mm, 4).tolist()}")
 
     verdict = verify(calibrated("first", first), calibrated("second", second))
-    print(
-        f"the other image says {'the same' if verdict.same else 'something else'}: p = {verdict.difference.p_value:.2g}"
-    )
+    said = "the same" if verdict.same else "something else"
+    print(f"the other image says {said}: p = {verdict.difference.p_value:.2g}")
     return verdict.same
 
 

@@ -112,7 +112,7 @@ class FileSaving:
     @staticmethod
     def _check_sharp(pictures: Sequence[Picture]) -> None:
         from gripmon.calibrate.detection import BLURRED_PX
-        from gripmon.calibrate.pictures import sharpest_blur_px, to_grey
+        from gripmon.calibrate.detection.pictures import sharpest_blur_px, to_grey
         from gripmon.teach.page import SavingRefused
 
         for picture in pictures:

@@ -50,9 +50,9 @@ class Samples:
     @property
     def files(self) -> list[Path]:
         """All images that are to be looked at."""
-        unseen = np.isnan(self.uv_px).any(axis=1).tolist()
-        rows = [pair for pair, look in zip(zip(self.images, self.laser_off, strict=True), unseen, strict=True) if look]
-        return list(dict.fromkeys(path for pair in rows for path in pair if path is not None))
+        unseen = np.flatnonzero(np.isnan(self.uv_px).any(axis=1))
+        files = [path for k in unseen for path in (self.images[k], self.laser_off[k])]
+        return list(dict.fromkeys(path for path in files if path is not None))
 
     def picked(self, kept: Sequence[int]) -> Samples:
         """Those samples only."""
