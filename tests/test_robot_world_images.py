@@ -13,10 +13,10 @@ from support.plates import pose, render
 from test_robot_world import columns, transform
 
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.upright import upright
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.camera import BrownConradyLens

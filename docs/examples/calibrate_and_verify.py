@@ -15,20 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.calibrate.api import calibrate_intrinsics, verify
-from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.calibrations import read_rough_corners
-from gripmon.model.geometry import to_record
 from gripmon.model.images import image_paths
 from gripmon.model.provenance import provenance_of
-from gripmon.teach.hand_eye import HandEyeOnPlate, calibrate_plane
+from gripmon.teach.hand_eye import calibrate_plane
 
 TARGET = "circles:12x10:0.008:0.004"  # columns x rows, spacing and diameter of the discs in metres
-
-
-def calibrated(name: str, hand_eye: HandEyeOnPlate) -> Calibrated:
-    """What ``verify`` compares."""
-    covariance = tuple(hand_eye.covariance.ravel().tolist())
-    return Calibrated(name, "images", cam_T_grip=to_record(hand_eye.cam_T_grip), covariance=covariance)
 
 
 def main(folder: Path) -> bool:
@@ -46,10 +38,9 @@ def main(folder: Path) -> bool:
     sigma_mm = 1e3 * np.sqrt(first.covariance.diagonal()[:3])
     print(f"TCP in the camera's frame ({x:.3f}, {y:.3f}, {z:.3f}) mm ± {np.round(sigma_mm, 4).tolist()}")
 
-    verdict = verify(calibrated("first", first), calibrated("second", second))
-    print(
-        f"the other image says {'the same' if verdict.same else 'something else'}: p = {verdict.difference.p_value:.2g}"
-    )
+    verdict = verify(first.calibrated("first"), second.calibrated("second"))
+    said = "the same" if verdict.same else "something else"
+    print(f"the other image says {said}: p = {verdict.difference.p_value:.2g}")
     return verdict.same
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import upright
 from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.robot_world import check_target_scale
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.calibrate.tables import Row, check_scale, pose_of, rows_of
-from gripmon.calibrate.upright import upright
 from gripmon.model.camera import LensSettings
 from gripmon.model.errors import InputError
 from gripmon.model.images import check_size, image_in

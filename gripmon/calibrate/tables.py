@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gripmon.calibrate.interchange.yaml_text import read_mapping
+from gripmon.calibrate.interchange.fault import read_mapping
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array

@@ -20,7 +20,7 @@ from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, Ha
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.plane_average import PlaneCalibration, average
 from gripmon.calibrate.sighting import CalibrationError, NotFound
-from gripmon.calibrate.verify import agreeing, mean_of_one_scene
+from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import from_record, to_record
@@ -104,6 +104,12 @@ class HandEyeOnPlate:
             warnings=self.fit.warnings,
             provenance=provenance,
         )
+
+    def calibrated(self, name: str = "images") -> Calibrated:
+        """What :func:`gripmon.calibrate.api.verify` compares."""
+        flat = tuple(self.covariance.ravel().tolist())
+        transform = to_record(self.cam_T_grip)
+        return Calibrated(name, "images", self.method.camera.lens, cam_T_grip=transform, covariance=flat)
 
     def picture(self) -> Image:
         """The first image with its residuals, enlarged; BGR."""

@@ -8,7 +8,7 @@ residuals; at the end those beyond what noise explains are left out, and the res
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from scipy.stats import f as fisher_f
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
-from gripmon.laser.pointer.spot_problem import SpotProblem, State
+from gripmon.laser.pointer.spot_problem import LensPrior, SpotProblem, State
 from gripmon.model.camera import LensSettings
 from gripmon.model.least_squares import (
     TUKEY,
@@ -216,3 +216,22 @@ def _scale(problem: SpotProblem, state: State) -> float:
         raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
     left = max(1.0 - len(PARAMETERS) / (2.0 * len(problem)), 0.25)
     return max(scale / float(np.sqrt(left)), _LEAST)
+
+
+def with_held_lens(refined: Refined, problem: SpotProblem, lens: LensPrior) -> Refined:
+    """``refined``, which held the lens that is its ``problem``'s prior: its ``covariance`` grows by what an error of
+    the lens does to the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up stays as it is.
+    """
+    by_lens = _by_lens(refined, problem)
+    return replace(refined, covariance=refined.covariance + by_lens @ lens.covariance @ by_lens.T)
+
+
+def _by_lens(refined: Refined, problem: SpotProblem) -> Array:
+    """(13, p): least squares' answer to a change of the lens's free parameters."""
+    state = problem.start(refined.setup)
+    rows, _ = problem.with_pose_noise(state).linearised(state)
+    rows = rows[refined.used].reshape(-1, problem.unknowns)
+    own, lens = rows[:, : len(PARAMETERS)], rows[:, len(PARAMETERS) :]
+    size = np.linalg.norm(own, axis=0)
+    out: Array = -np.linalg.lstsq(own / size, lens, rcond=None)[0] / size[:, None]
+    return out

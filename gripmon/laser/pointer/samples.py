@@ -50,10 +50,9 @@ class Samples:
     @property
     def files(self) -> list[Path]:
         """All images that are to be looked at."""
-        unseen = [bool(np.isnan(uv_px).any()) for uv_px in self.uv_px]
-        rows = zip(self.images, self.laser_off, unseen, strict=True)
-        wanted = [path for *pair, look in rows if look for path in pair if path is not None]
-        return list(dict.fromkeys(wanted))
+        unseen = np.flatnonzero(np.isnan(self.uv_px).any(axis=1))
+        files = [path for k in unseen for path in (self.images[k], self.laser_off[k])]
+        return list(dict.fromkeys(path for path in files if path is not None))
 
     def picked(self, kept: Sequence[int]) -> Samples:
         """Those samples only."""

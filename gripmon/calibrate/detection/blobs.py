@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.lattice import Index, find_lattice, trimmed
-from gripmon.calibrate.pictures import Grey, to_bytes
+from gripmon.calibrate.detection.lattice import Index, find_lattice, trimmed
+from gripmon.calibrate.detection.pictures import Grey, to_bytes
 from gripmon.model.records import Array
 
 SMALLEST_PX = 4.0

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate import blobs, chequers, symmetry
-from gripmon.calibrate.bending import bends
-from gripmon.calibrate.counting import ends_all_round
-from gripmon.calibrate.lattice import Index
-from gripmon.calibrate.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
+from gripmon.calibrate.detection import blobs, chequers, symmetry
+from gripmon.calibrate.detection.bending import bends
+from gripmon.calibrate.detection.boards import ends_all_round
+from gripmon.calibrate.detection.lattice import Index
+from gripmon.calibrate.detection.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.records import Array, Image
 from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target, TargetError

@@ -1,4 +1,7 @@
-"""A picture of a camera calibration: residuals over the image, where the target was seen, and how each view fits."""
+"""A picture of a camera calibration: residuals over the image, where the target was seen, and how each view fits.
+
+Drawn with OpenCV, as the laser's: a PNG from plotly needs a browser.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,8 @@ _CELLS = 12
 _LONGEST_PX = 28.0
 """Of an arrow as long as three standard deviations."""
 _INK, _PALE, _GOOD, _BAD, _EMPTY = (40, 40, 40), (245, 245, 245), (150, 90, 20), (40, 40, 210), (205, 205, 225)
-_FONT = cv2.FONT_HERSHEY_SIMPLEX
+_SUBPIXEL_BITS = 4
+_Colour = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -52,10 +56,9 @@ def draw_maps(result: IntrinsicsResult, sightings: Sequence[Sighting]) -> Image:
         # What is far off would cross the whole picture.
         arrow = np.nan_to_num(residual) * enlarged * np.minimum(1.0, 2.0 * _LONGEST_PX / np.maximum(length, 1e-9))
         for a, b, good in zip(start, start + np.nan_to_num(arrow), used.tolist(), strict=True):
-            ends = [tuple(np.rint(16.0 * p).astype(int).tolist()) for p in (a, b)]
             colour = _GOOD if good else _BAD
-            cv2.line(picture, ends[0], ends[1], colour, 1, cv2.LINE_AA, shift=4)
-            cv2.circle(picture, ends[0], 24, colour, -1, cv2.LINE_AA, shift=4)
+            line(picture, a, b, colour)
+            disc(picture, a, 1.5, colour)
     centre = frame.at(np.array([[result.camera.cx_px, result.camera.cy_px]]))[0]
     at = (round(float(centre[0])), round(float(centre[1])))
     cv2.drawMarker(picture, at, _INK, cv2.MARKER_CROSS, 18, 1, cv2.LINE_AA)
@@ -88,7 +91,7 @@ def _bars(picture: Image, frame: _Frame, result: IntrinsicsResult, sightings: Se
         cv2.rectangle(picture, (left, top), (left + round(width * value / longest), top + high), colour, -1)
         if step >= 13.0:
             text = f"{value:.3f}  {Path(sighting.name).name}"[:44]
-            cv2.putText(picture, text, (left + 4, top + high - 5), _FONT, 0.4, _INK, 1, cv2.LINE_AA)
+            write(picture, text, (left + 4, top + high - 5), 0.4)
 
 
 def _titles(
@@ -101,5 +104,22 @@ def _titles(
         f"residuals {enlarged:.0f} times enlarged; cross: principal point; tinted: no point seen there",
     )
     for k, text in enumerate(lines):
-        cv2.putText(picture, text, (8, 24 + 24 * k), _FONT, 0.55, _INK, 1, cv2.LINE_AA)
-    cv2.putText(picture, "rms of each view (px)", (frame.width + 16, 48), _FONT, 0.55, _INK, 1, cv2.LINE_AA)
+        write(picture, text, (8, 24 + 24 * k), 0.55)
+    write(picture, "rms of each view (px)", (frame.width + 16, 48), 0.55)
+
+
+def write(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> None:
+    """A text that begins at a place (px)."""
+    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
+
+
+def line(image: Image, start: Array, end: Array, colour: _Colour, width: int = 1) -> None:
+    """A line between two places (2,), px."""
+    first, last = (np.rint(point * 2**_SUBPIXEL_BITS).astype(int).tolist() for point in (start, end))
+    cv2.line(image, first, last, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def disc(image: Image, at: Array, radius: float, colour: _Colour) -> None:
+    """A filled disc at a place (2,), px."""
+    x, y = (round(v * 2**_SUBPIXEL_BITS) for v in at.tolist())
+    cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.lattice import Index, find_lattice, trimmed
-from gripmon.calibrate.pictures import Grey
+from gripmon.calibrate.detection.lattice import Index, find_lattice, trimmed
+from gripmon.calibrate.detection.pictures import Grey
 from gripmon.model.records import Array
 
 SCALES = (1.0, 2.0, 3.5)
