@@ -12,9 +12,9 @@ from scipy.stats import norm
 from support.shown_edges import FRAMES, OPENING_M, Shown, bend, beside, ill_seen, knocked, told, two_fingers
 from support.simulated import PAPER_LENS, STRONG_LENS, sharp_gripper
 
+from gripmon.judge.causes.models import FREEDOM, Errors, Model, weigh
 from gripmon.judge.causes.pooling import pool
 from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State
-from gripmon.judge.causes.weighing import FREEDOM, Errors, Model, weigh
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import perturb
 from gripmon.model.records import Cause

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gripmon.judge.drift.extremes import BLOCK_FRAMES, FEWEST_BLOCKS, KEPT_BLOCKS, Extremes
+from gripmon.judge.drift.statistics import BLOCK_FRAMES, FEWEST_BLOCKS, KEPT_BLOCKS, Extremes
 
 ALIKE_ONE = np.ones((1, 1))
 CHANCE = 1e-4

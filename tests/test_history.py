@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from gripmon.judge.drift.history import BLOCK_S, History, goes_on
-from gripmon.judge.policy.limits import time_left_s
+from gripmon.judge.drift.kinds import BLOCK_S, History, goes_on
+from gripmon.judge.policy.settings import time_left_s
 
 FPS = 20.0
 SIGMA = np.array([5e-6, 4e-6, 2e-5, 3e-4, 3e-4, 1e-4])

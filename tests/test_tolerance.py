@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from gripmon.judge.drift.tolerance import square_beyond
+from gripmon.judge.drift.sequential import square_beyond
 
 TOLERATED = np.array([5e-6] * 3 + [1e-4] * 3)
 SIGMA = np.array([5e-6, 4e-6, 2e-5, 3e-4, 3e-4, 1e-4])

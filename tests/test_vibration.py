@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.drift_noise import COVARIANCE, SIGMA
 
-from gripmon.judge.drift.vibration import VibrationWatch
+from gripmon.judge.drift.kinds import VibrationWatch
 from gripmon.model.records import Vibration
 
 FPS = 60.0

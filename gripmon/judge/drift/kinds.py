@@ -1,4 +1,6 @@
-"""What the drift has done over the last minutes: was it a step or a creep, and how fast?"""
+"""What kind of motion it is: a step or a creep from the drift's history over minutes, and a vibration, where the
+differences between frames grow in one direction while their mean stays.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,7 @@ from collections import deque
 
 import numpy as np
 
-from gripmon.model.records import Array, Creep
+from gripmon.model.records import Array, Creep, Vibration
 
 BLOCK_S = 0.5
 """Frames are averaged over so many seconds."""
@@ -125,3 +127,104 @@ def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array
     residual = along - along.mean() - slope * t
     sigma = math.sqrt(float(residual @ residual) / (len(t) - 2) / spread)
     return (t @ means) / spread if abs(slope) > SIGNIFICANT * sigma else None
+
+
+KEPT_FRAMES = 128
+"""Frames that are looked at: two seconds at 60 frames/s."""
+
+LOOK_FRAMES = 32
+"""Looked at once in so many frames."""
+
+PARTS = 4
+
+TIMES = 6.0
+"""Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
+
+
+STILL_THERE = 0.5
+"""Part of what it takes to find a vibration from which one that was found goes on."""
+
+
+class VibrationWatch:
+    """Looks at the last :data:`KEPT_FRAMES` shifts of the TCP."""
+
+    def __init__(self, smallest_m: float):
+        """``smallest_m``: root mean square from which a vibration is worth telling."""
+        self._smallest_m = smallest_m
+        self._shifts: deque[Array] = deque(maxlen=KEPT_FRAMES)
+        self._times_s: deque[float] = deque(maxlen=KEPT_FRAMES)
+        self._since_look = 0
+        self._found: Vibration | None = None
+        self._before: Array = np.eye(3)
+        self._learnt = True
+
+    @property
+    def is_news(self) -> bool:
+        """Whether it vibrates by more than the stream's noise, as learnt by now, explains."""
+        return self._found is not None and not self._learnt
+
+    def forget(self) -> None:
+        """The camera has moved: the step is no vibration."""
+        self._shifts.clear()
+        self._times_s.clear()
+        self._found = None
+
+    def add(self, shift: Array, now_s: float, usual: Array) -> Vibration | None:
+        """One frame's shift (6,); ``usual`` (6, 6): covariance of an unmoved camera's shifts about their mean.
+
+        What is going on; None for no vibration.  One that goes on is learnt as noise sooner or later, and goes on.
+        """
+        self._shifts.append(shift)
+        self._times_s.append(now_s)
+        self._since_look += 1
+        if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
+            self._since_look = 0
+            if self._found is None:
+                self._before = usual[:3, :3].copy()
+            self._found = self._look(self._before, usual[:3, :3], 1.0 if self._found is None else STILL_THERE)
+        return self._found
+
+    def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
+        shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
+        # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
+        parts = [_about_its_line(part) for part in np.split(shifts, PARTS)]
+        direction = _loudest(np.mean([part.T @ part / len(part) for part in parts], axis=0), usual)
+        loud = sorted(float(np.square(part @ direction).mean()) for part in parts)
+        expected = float(direction @ usual @ direction)
+        if loud[1] < ease * TIMES * expected:
+            return None
+        self._learnt = loud[1] < TIMES * float(direction @ learnt @ direction)
+        # A part may hold less than a period: the size is that about a line through all of them.
+        along = _about_its_line(shifts) @ direction
+        excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected
+        if excess < ease * self._smallest_m**2:
+            return None
+        return Vibration(math.sqrt(excess), _frequency_hz(along, times_s))
+
+
+def _about_its_line(values: Array) -> Array:
+    """(n, 3) what is left of values (n, 3) that grow evenly: a creep is no vibration."""
+    index = np.arange(len(values)) - 0.5 * (len(values) - 1)
+    line = np.column_stack([np.ones(len(values)), index])
+    return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
+
+
+def _loudest(covariance: Array, usual: Array) -> Array:
+    """The direction (3,) of length one in which a covariance exceeds the usual one the most."""
+    root = np.linalg.cholesky(usual)
+    inverse = np.linalg.inv(root)
+    _, directions = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    direction = inverse.T @ directions[:, -1]
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def _frequency_hz(values: Array, times_s: Array) -> float:
+    """Of the largest line in the spectrum, between lines by a parabola through its neighbours."""
+    interval_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+    if interval_s <= 0.0:
+        return 0.0
+    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values))))
+    top = int(power[1:-1].argmax()) + 1
+    below, at, above = power[top - 1 : top + 2]
+    bend = below - 2.0 * at + above
+    return float((top + (0.5 * (below - above) / bend if bend else 0.0)) / (len(values) * interval_s))
