@@ -44,7 +44,7 @@ def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_a
     assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]
 
 
-def test_jaws_that_are_seen_elsewhere_against_the_report_than_usually_are_worth_asking_about():
+def test_jaws_seen_elsewhere_than_usually_are_worth_asking_about():
     rng = np.random.default_rng(6)
     watch = JawWatch()
 

@@ -133,7 +133,7 @@ def test_mean_corners_are_the_corners_of_one_gripper_at_the_mean_opening(opening
 
 @pytest.mark.parametrize("off_px", [0.4, 30.0])
 def test_a_corner_that_is_wrong_in_some_frames_does_not_pull_its_mean(off_px: float):
-    """By tens of pixels, and by just more than the five standard deviations (0.05 px each) from which it is left out."""
+    """By tens of pixels, and by just more than the five standard deviations of 0.05 px from which it is left out."""
     frames = Scene().frames(20)
     clean = mean_corners(frames, TRUE_T)
     for k in (2, 9, 10, 15):

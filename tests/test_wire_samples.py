@@ -30,7 +30,9 @@ PAGE = wire_page.PAGE.read_text(encoding="utf-8")
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_writes_these_bytes(name: str):
-    assert payload(name) == kept(name), "the wire has changed; is it meant? then, in tests/: python -m support.sample_messages"
+    assert payload(name) == kept(name), (
+        "the wire has changed; is it meant? then, in tests/: python -m support.sample_messages"
+    )
 
 
 def test_the_folder_holds_these_samples_and_nothing_else():
