@@ -11,6 +11,7 @@ SIZE = (384, 288)
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_the_whole_run_in_small(capsys: pytest.CaptureFixture[str]):
     from benchmarks import latency, report, stages
 

@@ -118,6 +118,7 @@ def test_a_valid_transform_that_is_wrong_counts_also_where_errors_do_not():
     ] == pytest.approx(0.0)
 
 
+@pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
     from benchmarks.conditions import CONDITIONS, FPS
     from benchmarks.scenes import make_scene
@@ -137,6 +138,7 @@ def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
             assert (scene.taught is not None) == condition.taught
 
 
+@pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_a_whole_run_in_small_leaves_a_report(tmp_path: Path):
     from benchmarks import accuracy, accuracy_report, accuracy_table
 

@@ -21,6 +21,7 @@ def scene(name: str, number: int, frames: int = 6) -> Any:
     return make_scene(next(c for c in CONDITIONS if c.name == name), 1, number, frames)
 
 
+@pytest.mark.slow("10 s: peers of a benchmark, no part of what is installed")
 @pytest.mark.parametrize(("name", "bound_m"), [("cornerSubPix", 2e-4), ("rapid", 1.5e-3), ("aruco", 1e-3)])
 def test_peers_follow_a_gripper_that_shows_well(name: str, bound_m: float):
     from benchmarks.peers import PEERS
@@ -35,6 +36,7 @@ def test_peers_follow_a_gripper_that_shows_well(name: str, bound_m: float):
             assert np.linalg.norm(pose[:3, 3] - shot.cam_T_grip[:3, 3]) < bound_m
 
 
+@pytest.mark.slow("10 s: peers of a benchmark, no part of what is installed")
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_printed_tags_are_where_the_model_says(number: int):
     """Their black corners as an independent detector finds them, on three grippers; and nothing else changes."""
@@ -58,6 +60,7 @@ def test_printed_tags_are_where_the_model_says(number: int):
     assert np.linalg.norm(pose[:3, 3] - shot.cam_T_grip[:3, 3]) < 2e-4
 
 
+@pytest.mark.slow("10 s: peers of a benchmark, no part of what is installed")
 def test_slopes_of_the_bound_tell_what_small_motions_do():
     """Against pictures of the gripper placed elsewhere outright; even light, so that its shades don't depend on it."""
     from dataclasses import replace

@@ -99,6 +99,7 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
     assert normal_level_m(covariance, 1e-5) == pytest.approx(4.417 * 2e-5, rel=1e-3)
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
     from benchmarks.integrity_misleading import CONDITIONS
     from benchmarks.integrity_scenes import make_integrity_scene
@@ -119,6 +120,7 @@ def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
             assert np.array_equal(again.simulator.truth(40).cam_T_grip, simulator.truth(40).cam_T_grip)
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_conditions_hide_what_they_say():
     from benchmarks.integrity_misleading import CONDITIONS
     from benchmarks.integrity_runs import View, _view
@@ -136,6 +138,7 @@ def test_conditions_hide_what_they_say():
     assert share("grasp", View.BOTH_TIPS) > 0.6
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(tmp_path: Path):
     from benchmarks import integrity, integrity_report, integrity_table
 

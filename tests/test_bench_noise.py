@@ -24,6 +24,7 @@ def own_statistics(model, scenes: int = 200):
     return statistics(np.swapaxes(z, 0, 1))
 
 
+@pytest.mark.slow("5 s: the noise of a benchmark, no part of what is installed")
 @pytest.mark.parametrize("regime", REGIMES)
 def test_streams_are_nowhere_milder_than_what_was_measured(regime: str):
     """All axes together: few scenes were measured, so that a single axis scatters."""
@@ -77,6 +78,7 @@ def test_frames_without_an_error_are_left_out():
     assert np.isfinite(found.step_variance).all() and np.isfinite(found.tails).all()
 
 
+@pytest.mark.slow("5 s: the noise of a benchmark, no part of what is installed")
 def test_the_fit_gives_back_the_model_that_made_the_series():
     """Two parts and a level with known variances, as measured series of it."""
     from benchmarks import noise_fit

@@ -35,6 +35,7 @@ def test_discs_lie_where_they_are_projected_to():
         assert window.sum() / 160.0 == pytest.approx(abs(area), rel=1e-3)
 
 
+@pytest.mark.slow("5 s: a benchmark in small; plane and intrinsics have tests of their own")
 def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     """Against bounds that are ten times the tool centre point's stated deviation, not the benchmark's own."""
     from benchmarks import offline, offline_plane
@@ -59,6 +60,7 @@ def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     assert "first seed 1" in text and "MISSED: something" in text and "nan" not in text
 
 
+@pytest.mark.slow("5 s: a benchmark in small; plane and intrinsics have tests of their own")
 def test_everybody_calibrates_the_same_camera():
     """Errors of the mapping by their definition, and two other libraries near us on points of a known noise."""
     import msgspec

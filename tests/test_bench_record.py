@@ -31,6 +31,7 @@ def ring(tools_importable: None, rendered: Path) -> Path:
     return rendered
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_the_loop_is_measured_in_turns_and_nothing_that_was_stopped_stays_stopped(ring: Path):
     from benchmarks import record_loop
 
@@ -45,6 +46,7 @@ def test_the_loop_is_measured_in_turns_and_nothing_that_was_stopped_stays_stoppe
     assert measured["dropped"] == {"off": 0, "on": 0, "stalled": 0}
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(tools_importable: None, tmp_path: Path):
     from benchmarks import stalled_disk
 
@@ -63,6 +65,7 @@ def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(tools_importa
     assert not os.path.ismount(directory)
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_bytes_by_policy(ring: Path):
     from benchmarks import record_bytes
 
@@ -76,6 +79,7 @@ def test_bytes_by_policy(ring: Path):
     assert every["bytes_per_frame"] > none["bytes_per_frame"] + 2_000 > 2_500
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     from benchmarks import record_hour
 
@@ -91,6 +95,7 @@ def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     assert not recording.faults
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_kills_are_counted_and_what_they_cost(ring: Path):
     from benchmarks import record_killed
 
@@ -100,6 +105,7 @@ def test_kills_are_counted_and_what_they_cost(ring: Path):
     assert tried["loss_s"] == pytest.approx((tried["delivered"] - tried["in_file"]) / 60.0)
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_memory_over_frames(ring: Path):
     from benchmarks import record_memory
 

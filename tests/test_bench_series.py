@@ -25,6 +25,7 @@ def plain_pairs(tcp_shift_m: tuple[float, float], count: int = 2):
     return SimulatedSeries("series2", "plain", simulator(scenario))
 
 
+@pytest.mark.slow("5 s: a benchmark in small; the variants are tested with the differential update")
 @pytest.mark.parametrize("tcp_shift_m", [(1.5e-3, 0.0), (0.0, 4.5e-3)], ids=["aside", "down"])
 def test_every_variant_finds_the_true_tcp_in_plain_pictures(tcp_shift_m: tuple[float, float]):
     from benchmarks import pairs
@@ -37,6 +38,7 @@ def test_every_variant_finds_the_true_tcp_in_plain_pictures(tcp_shift_m: tuple[f
         assert np.abs(errors_mm[variant]).max() < (0.02 if variant == "3P-U" else 0.01), variant
 
 
+@pytest.mark.slow("5 s: a benchmark in small; the variants are tested with the differential update")
 def test_what_shifts_a_corner_in_both_images_cancels():
     """Half a pixel at every corner, another way at each."""
     from benchmarks import pairs

@@ -8,6 +8,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
+@pytest.mark.slow("10 s: smoothing of known errors is in test_smoothing")
 @pytest.mark.parametrize("regime", ["quiet", "working", "rough"])
 def test_smoothing_keeps_its_word_in_every_regime(regime: str, monkeypatch: pytest.MonkeyPatch):
     """Better than the frames in quiet time, as honest as they are, and no worse from the second frame after a step."""

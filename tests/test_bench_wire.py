@@ -7,6 +7,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
+@pytest.mark.slow("40 s: a benchmark in small; publishing has tests of its own")
 def test_the_whole_run_in_small():
     from benchmarks import wire, wire_runs
 

@@ -62,7 +62,7 @@ def test_whoever_waits_for_the_next_reading_is_told_that_the_monitor_is_gone(end
         assert len(first) <= 1 and all(reading.usable for reading in told[len(first) : -1])
 
 
-def test_a_monitor_that_is_stopped_makes_its_transform_stale_and_a_continued_one_usable(endpoint: str):
+def test_a_stopped_monitors_transform_is_stale_and_usable_again(endpoint: str):
     """Its session stays, so that only the age tells."""
     with (
         remote_monitor(listen=[endpoint]) as monitor,

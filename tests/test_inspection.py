@@ -75,9 +75,7 @@ def test_frames_that_can_be_measured_pass(image: np.ndarray):
         (grey(0.5), Refusal.FLAT, "0.0 %", "full scale"),
     ],
 )  # fmt: skip
-def test_frames_that_cannot_be_measured_are_refused_with_what_came_and_what_would_be_right(
-    image: object, reason: Refusal, came: str, right: str
-):
+def test_frames_that_cannot_be_measured_are_refused_in_words(image: object, reason: Refusal, came: str, right: str):
     found = inspect(frame(image), CAMERA, GRIPPER)
     assert found is not None
     assert found[0] is reason

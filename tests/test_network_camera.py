@@ -82,7 +82,17 @@ def fed(sequence: Path, tmp_path: Path, frame_format: str) -> tuple[Lines, Netwo
     return lines_of(tmp_path / "estimates.jsonl"), daemon
 
 
-@pytest.mark.parametrize("frame_format", ["raw", "raw_padded", "png", "ros2_image", "ros2_compressed"])
+@pytest.mark.parametrize(
+    "frame_format",
+    [
+        "raw",
+        "ros2_image",
+        *(
+            pytest.param(each, marks=pytest.mark.slow("8 s: how it is decoded is in test_network_payload"))
+            for each in ("raw_padded", "png", "ros2_compressed")
+        ),
+    ],
+)
 def test_lossless_frames_give_the_transforms_of_the_files(
     sequence: Path, replayed: Lines, tmp_path: Path, frame_format: str
 ):

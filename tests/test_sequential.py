@@ -72,7 +72,7 @@ def test_with_learnt_limits_there_is_none_in_hours_and_steps_are_noticed():
     assert noticed_within(test, noise(30), 60.0).max() <= 10
 
 
-def test_what_may_be_tolerated_is_no_drift_and_errors_that_belong_together_make_none_of_it():
+def test_what_is_tolerated_is_no_drift_though_errors_are_correlated():
     """An offset up to the tolerance, in any direction, on top of noise."""
     settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, tolerated_m=2e-5, tolerated_rad=1e-3)
     rng = np.random.default_rng(3)
@@ -142,6 +142,7 @@ def test_learnt_limits_keep_the_contract_where_alarms_can_be_counted():
         assert 0 < of_noise.sum() <= 16 * 5000 / 864
 
 
+@pytest.mark.slow("8 s: how much is gained; that the contract is kept is in the default run")
 def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_one():
     """The same step in the same streams: excess after it, before and after enough of the noise has been seen."""
     rng, test, excess = np.random.default_rng(32), SequentialTest(PLAIN, 16), {}
@@ -159,6 +160,7 @@ def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_o
     assert excess["calm", LEARNT_FRAMES] > 1.5 * excess["bursting", LEARNT_FRAMES]
 
 
+@pytest.mark.slow("4 s: a finer point of learning; that the contract is kept is in the default run")
 def test_a_motion_is_no_noise_to_learn_limits_from():
     """Two streams with the same noise, of which one has made a step of a thousand standard deviations.
 
