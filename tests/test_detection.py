@@ -11,11 +11,6 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-<<<<<<< HEAD
-=======
-from gripmon.calibrate.chequers import _Turns
-from gripmon.calibrate.counting import ends_all_round
->>>>>>> e0d0a05f93aeae58b3692d0f5c9f52ca8daf0510
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.detection.chequers import _Turns
 from gripmon.calibrate.sighting import NotFound, Sighting

@@ -39,13 +39,7 @@ def tables(tools_importable: None) -> ModuleType:
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_writes_these_bytes(name: str):
-<<<<<<< HEAD
     assert payload(name) == kept(name), "the wire has changed; if meant: python -m support.sample_messages, in tests/"
-=======
-    assert payload(name) == kept(name), (
-        "the wire has changed; is it meant? then, in tests/: python -m support.sample_messages"
-    )
->>>>>>> e0d0a05f93aeae58b3692d0f5c9f52ca8daf0510
 
 
 def test_the_folder_holds_these_samples_and_nothing_else():
