@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import ends_all_round
 from gripmon.calibrate.detection.chequers import _Turns
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
