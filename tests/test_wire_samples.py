@@ -39,7 +39,7 @@ def tables(tools_importable: None) -> ModuleType:
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_writes_these_bytes(name: str):
-    assert payload(name) == kept(name), "the wire has changed; is it meant? then run tests/sample_messages.py"
+    assert payload(name) == kept(name), "the wire has changed; if meant: python -m support.sample_messages, in tests/"
 
 
 def test_the_folder_holds_these_samples_and_nothing_else():

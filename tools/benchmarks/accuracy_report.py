@@ -45,8 +45,7 @@ def as_markdown(results: dict[str, Any], pictures: list[Path]) -> str:
     rows = results["rows"]
     parts = [
         "# Accuracy",
-        "Written by `tools/bench accuracy --out docs/results`, which puts the figures behind it into `accuracy.json` "
-        "beside it.",
+        "Written by `tools/bench accuracy --out docs/results`; the figures behind it: `accuracy.json` beside it.",
         "\n".join(f"- {line}" for line in about(results)),
         _METHOD,
         "## Results",

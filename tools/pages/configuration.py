@@ -15,8 +15,8 @@ from gripmon.daemon.config.settings import Settings
 
 UNITS = {
     "_px2": "px²", "_px": "px", "_m_per_sqrt_s": "m/√s", "_rad_per_sqrt_s": "rad/√s", "_per_s": "1/s",
-    "_per_day": "1/day", "_per_month": "1/month", "_m": "m", "_rad": "rad", "_s": "s", "_ns": "ns", "_hz": "Hz", "_bytes": "bytes",
-    "_sigmas": "standard deviations", "_frames": "frames",
+    "_per_day": "1/day", "_per_month": "1/month", "_m": "m", "_rad": "rad", "_s": "s", "_ns": "ns", "_hz": "Hz",
+    "_bytes": "bytes", "_sigmas": "standard deviations", "_frames": "frames",
 }  # fmt: skip
 """Endings of keys and what they are in; the first that fits counts."""
 
