@@ -27,7 +27,7 @@ standing     the gripper stands on the plate; rough.yaml has its corners as a pe
 work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
 robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
 spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)
-truth.json (of work: truth.jsonl) says what is true; no file tells the steps anything else."""
+truth.json (of work: truth.jsonl) holds the truth beside the images; no step reads it."""
 
 _EXAMPLES = """\
   gripmon simulate --list
@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, arguments.seed)
     except ValueError as error:
         raise common.CommandFailedError(f"{arguments.scenario}: {error}", common.EXIT_USAGE) from None
-    makes_its_own = scenario.name == "work"  # the walk's earlier steps make gripper, calibration and configuration
+    makes_its_own = arguments.scenario == "work"  # the walk's earlier steps make gripper, calibration and configuration
     if not makes_its_own:
         shutil.copyfile(config.gripper_path, out / "gripper.yaml")
         (out / "config.yaml").write_text(_config_text(config, scenario, arguments), encoding="utf-8")
@@ -119,18 +119,20 @@ def _calibration_images(arguments: argparse.Namespace, config: Config) -> int:
             write_calibration_images(kind, rig, out, arguments.seed, step)
         except ValueError as error:
             raise common.CommandFailedError(f"simulate {kind}: {error}", common.EXIT_USAGE) from None
-    print(f"{image_count(kind)} images in {out}; next: {_next_step(kind, shlex.quote(str(out)))}")
+    print(f"{image_count(kind)} images in {out}; next: {_next_step(kind, shlex.quote(str(out)), config)}")
     return common.EXIT_DONE
 
 
-def _next_step(kind: str, folder: str) -> str:
+def _next_step(kind: str, folder: str, config: Config) -> str:
     from gripmon.model.targets import name_of
     from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
 
+    gripper = config.gripper
+    jaw = f"--jaw-range {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g} " if gripper.has_jaw else ""
     return {
         "plate": f"gripmon calibrate intrinsics {folder} --target {name_of(PLATE)} --model paper --out camera.yaml",
         "standing": f"gripmon calibrate plane {folder} --target camera.yaml --camera camera.yaml --corners "
-        f"{folder}/rough.yaml --infer --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml",
+        f"{folder}/rough.yaml --infer {jaw}--gripper-out gripper.yaml --out hand_eye.yaml",
         "robot_world": f"gripmon calibrate robot-world {folder}/views.csv --camera camera.yaml --target "
         f"{name_of(BOARD)} --eye-in-hand --out robot_world.yaml",
         "spots": f"gripmon calibrate intrinsics {folder}/plate --target {name_of(SECOND_PLATE)} --out second.yaml, "
