@@ -58,14 +58,14 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
-    from gripmon.daemon import sigterm_exits
+    from gripmon.model.stopping import signals_exit
     from gripmon.record.write.viewer import NativeViewer, ViewerError, has_display
 
     files = recording_files([Path(name) for name in arguments.recordings])
     for path in files:
         _check(path)
     try:
-        with sigterm_exits(), ExitStack() as opened:
+        with signals_exit(), ExitStack() as opened:
             if arguments.native or (has_display() and not arguments.web):
                 viewer = NativeViewer([str(path) for path in files], tied=True)
                 opened.callback(viewer.close)
