@@ -46,7 +46,9 @@ def test_the_state_and_the_log_say_what_to_type(caplog: pytest.LogCaptureFixture
 
 def test_its_alert_says_what_to_type_until_it_is_cleared():
     """The monitor writes the text, and doesn't know the robot's name."""
-    about = Alert(AlertKind.PROPOSED, Cause.CAMERA_MOUNT, Severity.WARNING, "it waits to be accepted", AlertEvent.RAISED)
+    about = Alert(
+        AlertKind.PROPOSED, Cause.CAMERA_MOUNT, Severity.WARNING, "it waits to be accepted", AlertEvent.RAISED
+    )
     over = msgspec.structs.replace(about, event=AlertEvent.CLEARED, text="the proposal was rejected")
     other = msgspec.structs.replace(about, kind=AlertKind.DRIFT, text="a drift")
     alerts = {2: (about, other), 4: (over,)}

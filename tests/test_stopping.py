@@ -40,9 +40,7 @@ def test_one_that_python_drops_during_the_start_up_ends_the_loop_at_once(number:
 
 
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)])
-def test_during_the_start_up_it_raises_what_closes_everything(
-    number: signal.Signals, error: type[BaseException]
-):
+def test_during_the_start_up_it_raises_what_closes_everything(number: signal.Signals, error: type[BaseException]):
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with pytest.raises(error) as caught, signals_exit():
         signal.raise_signal(number)
