@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
 from support.daemon_bench import Bench
 
+from gripmon.io.sources.realtime import SimulatedCamera
+from gripmon.model.records import Frame
 from gripmon.model.stopping import StopRequest, signals_exit
 
 HERE = Path(__file__).resolve().parent
@@ -58,6 +61,31 @@ def test_a_background_job_that_ignores_ctrl_c_is_interrupted_as_well_while_it_st
     job = ["sh", "-c", "trap '' INT; exec \"$@\"", "sh", sys.executable, "-c", code]
     done = subprocess.run(job, capture_output=True, text=True, env=os.environ | {"PYTHONPATH": str(HERE.parent)})
     assert "KeyboardInterrupt" in done.stderr, done.stderr
+
+
+class NeverReady:
+    """Frames that nobody lives to see."""
+
+    def frame(self, index: int) -> Frame:
+        time.sleep(600.0)
+        raise AssertionError
+
+
+def test_one_that_another_thread_takes_ends_the_wait_for_a_camera():
+    """It wakes no system call of the main thread's; so does one that comes right before such a call."""
+
+    def interrupt() -> None:
+        time.sleep(1.0)
+        signal.pthread_kill(threading.get_ident(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    begun_s = time.monotonic()
+    with signals_exit():
+        thread.start()
+        with pytest.raises(KeyboardInterrupt):
+            SimulatedCamera(NeverReady(), size_px=(8, 8), fps=10.0, name="slow")
+    thread.join()
+    assert time.monotonic() - begun_s < 30.0, "half of what a camera that starts is given"
 
 
 def test_in_another_thread_signals_are_left_alone():

@@ -236,7 +236,7 @@ class StateFile:
         return descriptor
 
     def _note(self, descriptor: int) -> None:
-        """Write into the lock's file whose it is, and the newest revision: a state that gets damaged takes its own along."""
+        """Write into the lock's file whose it is, and the newest revision, which a damaged state no longer tells."""
         revision = b"" if self._newest_revision is None else b" %d" % self._newest_revision
         note = b"%d%s\n" % (os.getpid(), revision)
         with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only nobody can say whose
