@@ -35,7 +35,7 @@ LARGEST_BYTES = 64 << 20
 
 AUTO = "auto"
 
-_MOST_DIGITS = 18
+_MOST_DIGITS = 18  # of a number in the lock's file: what is longer fits no revision
 
 
 class StateSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -339,8 +339,9 @@ class StateFile:
 def _noted(descriptor: int) -> tuple[int | None, int | None]:
     """Process and newest revision that a lock's file names."""
     words = os.pread(descriptor, 64, 0).split()
-    numbers = [int(word) if word.isdigit() and len(word) <= _MOST_DIGITS else None for word in words[:2]]
-    return (*numbers, None, None)[:2]
+    numbers = [int(word) if word.isdigit() and len(word) <= _MOST_DIGITS else None for word in words]
+    holder, revision, *_ = (*numbers, None, None)
+    return holder, revision
 
 
 def _linked(path: Path, other: Path) -> bool:
