@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from support.loopback import wait_for_default_port
 
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import Array, Transform
@@ -77,6 +78,8 @@ def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     for block in blocks:
         printed = ""
         for command in block.commands:
+            if command.startswith("gripmon run"):
+                wait_for_default_port()
             code, out = run(command, folder)
             promised = re.search(r"# exit code (\d+)", command)
             assert code == (int(promised[1]) if promised else 0), f"{command}\n{out}"
