@@ -245,9 +245,7 @@ def test_a_target_comes_from_a_calibration_too(tmp_path: Path, capsys: pytest.Ca
     assert "none.yaml" in capsys.readouterr().err
 
 
-def test_a_target_that_is_described_too_small_is_refused_though_some_images_show_no_more(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_target_described_too_small_is_refused(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     for k in (0, 1, 2, 4, 5, 6):
         image = cv2.imread(str(folder / f"{k}.png"), cv2.IMREAD_UNCHANGED)
         if k > 2:
