@@ -25,8 +25,9 @@ from gripmon.model.records import Array
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """``names`` of n samples, and the ``places`` where they stand; ``uv_px`` (n, 2), NaN where an image is to be looked at; ``images`` and ``laser_off``,
-    files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of orientations, or None: the poses tell them.
+    """``names`` of n samples, and the ``places`` where they stand; ``uv_px`` (n, 2), NaN where an image is to be looked
+    at; ``images`` and ``laser_off``, files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of orientations, or
+    None: the poses tell them.
     """
 
     names: tuple[str, ...]
