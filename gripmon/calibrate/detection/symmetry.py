@@ -60,6 +60,7 @@ def centres_of_symmetry(
     # What the light's slope adds; its columns don't move with the point.
     odd = np.broadcast_to(2.0 * offsets, (len(start), *offsets.shape))
     at, moving = start.astype(np.float64).copy(), np.full(len(start), True)
+    # All points at once: a minimiser of single problems would be called hundreds of times an image.
     for _ in range(_STEPS):
         difference, gradient, _ = _opposites(levels, slopes, at[:, None] + bent, offsets)
         rows = np.concatenate([gradient, odd], axis=2)
