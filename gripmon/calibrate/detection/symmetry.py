@@ -7,7 +7,7 @@ about the point gives its place, its covariance from the image's noise, and tell
 That is exact where the target's map to the image is linear.  Perspective and lens bend it: a step and its opposite on
 the target lead to ``p + d + q(d)`` and ``p - d + q(d)``, with q quadratic.  Left out, it moves corners by some
 hundredths of a pixel, all of them towards where the target looks smaller; so opposite pixels are taken by ``bend``,
-q's coefficients (:mod:`gripmon.calibrate.bending`).
+q's coefficients (:mod:`gripmon.calibrate.detection.bending`).
 """
 
 from __future__ import annotations
