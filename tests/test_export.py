@@ -37,7 +37,7 @@ from gripmon.record.export import SCHEMAS, Exporter
 from gripmon.record.export.exporter import ROWS_A_GROUP
 from gripmon.record.read import FrameTable
 
-PAGE = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "howto" / "export.md").read_text(encoding="utf-8")
 DUCKDB, POLARS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 DAY_NS = 86_400_000_000_000
 MIDNIGHT_NS = 20_526 * DAY_NS  # 2026-03-14

@@ -151,6 +151,7 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
     assert 0 < len(last) < len(then), "each file brings what it takes"
 
 
+@pytest.mark.slow("4 s: what is shown of a replay; that it decides the same is in the default run")
 def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = sequence_config(sequence, "{image_rate_hz: 2.0, around_alert_s: 0.0, min_free_bytes: 0}", "thin.yaml")
     recording = tmp_path / "thin.rrd"
@@ -221,6 +222,7 @@ def contents(path: Path, entity: str, component: str) -> dict[int, Any]:
     return values
 
 
+@pytest.mark.slow("4 s: what is shown of a replay; that it decides the same is in the default run")
 def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Drifts, limits, states and the log of both; what is replayed is a recording of its own, to be replayed again."""
     then, both = tmp_path / "then.rrd", tmp_path / "both.rrd"

@@ -94,7 +94,7 @@ def test_an_offset_in_metres_grows_in_the_image_as_the_gripper_comes_nearer():
     assert shifts[1] / shifts[0] == pytest.approx(depth_m / (depth_m - 0.04), rel=0.03)
 
 
-def test_creases_are_used_where_they_were_taught_and_edges_are_shifted_while_they_show_as_taught():
+def test_taught_creases_and_shifts_are_used_while_they_show_as_taught():
     crease, outline = "L_in_near_along", "R_tip_in"
     edges = {crease: taught_edge(crease=True), outline: taught_edge()}
     otherwise = {crease: taught_edge(), outline: taught_edge(crease=True)}

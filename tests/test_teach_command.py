@@ -149,7 +149,7 @@ def test_the_picture_shows_every_taught_edge(rig: Path, taught: Path):
     assert 0.9 < grey.mean() < 0.999, "the image is grey, what is drawn isn't"
 
 
-def test_replay_with_the_taught_model_is_right_where_it_was_a_fifth_of_a_millimetre_off(rig: Path, taught: Path):
+def test_replay_with_the_taught_model_is_right_where_it_was_off(rig: Path, taught: Path):
     truth = np.array(json.loads((rig / "truth.json").read_text()))
     rms = {}
     for name in ("untaught", "config"):

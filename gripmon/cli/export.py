@@ -17,7 +17,7 @@ a whole fleet can be asked by any engine:
   DIR/frames/robot=arm1/camera=wrist/date=2026-03-14/RUN-0000.parquet
 
 and likewise alerts, states and commands; references by robot and camera.  Columns, units and one
-query each for DuckDB and Polars: docs/export.md.  A file that is exported again replaces its rows;
+query each for DuckDB and Polars: docs/howto/export.md.  A file that is exported again replaces its rows;
 it may be done every hour, also while the monitor writes.  Images stay in the recording."""
 
 _EXAMPLES = """\

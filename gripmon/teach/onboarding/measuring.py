@@ -7,9 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import block_diag
 
-from gripmon.calibrate.free_pose import FreePose
 from gripmon.calibrate.plane import FingerCorners
-from gripmon.calibrate.plane_equations import FEWEST_CORNERS, stand
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, FreePose, stand
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
