@@ -140,7 +140,7 @@ def _targets(out: Path, runs: int) -> list[Path]:
     there = next((target for target in targets if target.exists()), None)
     if there is not None:
         raise InputError(
-            f"{out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
+            f"--out {out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
         )
     return targets
 
