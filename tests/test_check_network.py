@@ -59,7 +59,9 @@ def test_a_session_that_cannot_be_opened(
     assert said in refused(written(tmp_path, publish=publish), capsys)
 
 
-@pytest.mark.parametrize("package", ["rosbags", "xxhash"])
+@pytest.mark.parametrize(
+    "package", ["rosbags", pytest.param("xxhash", marks=pytest.mark.slow("the other package is in the default run"))]
+)
 @pytest.mark.parametrize(
     ("sections", "key"),
     [

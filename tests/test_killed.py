@@ -197,4 +197,4 @@ def test_killed_at_any_moment_it_goes_on_from_what_it_said_last(kills: int, tmp_
     assert not list(tmp_path.glob("kept.json.*-*")), "nothing was set aside"
     assert len(list(tmp_path.glob(".kept.json-*.tmp"))) <= 1, "each start clears what the last life left"
     assert sum(answers > 0 for answers in lives) > kills // 3, "many were killed at work"
-    assert witness.transforms > kills and witness.answered > kills
+    assert witness.transforms > kills and witness.answered >= kills

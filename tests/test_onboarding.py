@@ -61,7 +61,9 @@ def true_of(found: Coincidence, lens: LensSettings) -> np.ndarray:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    "known", [pytest.param(True, marks=pytest.mark.slow("2 s each; inferred ones are in the default run")), False]
+)
 def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
     """To reach: 0.02 mm across the line of sight and 0.05 mm along it."""
     camera = GivenCamera(PAPER_LENS)
@@ -82,6 +84,7 @@ def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
         assert average([found], not known).warnings == ()
 
 
+@pytest.mark.slow("5 s: one hard case; chequerboards are in the test of the TCP")
 def test_a_chequerboards_lines_beside_a_finger_arent_taken_for_its_edges():
     """The board's lines run along the fingers' edges, some pixels beside them."""
     frame = standing(CHEQUERBOARD, turn_rad=0.0, shift_m=(0.0, 0.0), look=Look(supersampling=3))
