@@ -11,13 +11,13 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-from gripmon.calibrate.chequers import _Turns
-from gripmon.calibrate.counting import ends_all_round
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import ends_all_round
+from gripmon.calibrate.detection.chequers import _Turns
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import Chequerboard, parse_target
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import Chequerboard, parse_target
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,

@@ -11,8 +11,7 @@ from gripmon.calibrate.lens_models import LensModel
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane, refinement
 from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions
-from gripmon.laser.pointer.held_lens import with_held_lens
-from gripmon.laser.pointer.refinement import FALSE_OUTLIERS, refine
+from gripmon.laser.pointer.refinement import FALSE_OUTLIERS, refine, with_held_lens
 from gripmon.laser.pointer.setup import (
     PARAMETERS,
     LaserSetup,

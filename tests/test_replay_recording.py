@@ -19,12 +19,13 @@ from support import recorded
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.cli import main
-from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds
+from gripmon.cli.recorded_run import RecordedRun
 from gripmon.cli.replay import _recorder
 from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.recorded_run import as_recorded_before_bounds
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
@@ -301,7 +302,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         ([tmp_path / "other.rrd"], 3, "is a recording of the application 'somebody_else'"),
         ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
         ([tmp_path / "nothing.rrd"], 3, "is empty"),
-        ([tmp_path / "none.rrd"], 2, "there is no recording; an .rrd file"),
+        ([tmp_path / "none.rrd"], 2, "there is no such file; recordings of gripmon run"),
         ([tmp_path / "old-0001.rrd", sequence], 2, "is no .rrd file; one input, or several .rrd files of one run"),
         ([tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
         ([tmp_path / "old-0001.rrd", tmp_path / "empty"], 2, "empty: no recordings and no images in it"),

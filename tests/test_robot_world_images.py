@@ -14,16 +14,16 @@ from support.plates import pose, render
 from test_robot_world import columns, transform
 
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import parse_target
-from gripmon.calibrate.upright import upright
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.camera import BrownConradyLens
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
+from gripmon.model.targets import parse_target
 
 LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)
 TARGET = "charuco:8x6:0.03:0.022:DICT_4X4_250"

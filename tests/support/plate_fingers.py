@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibrate.targets import Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
 from support.plates import Look, render
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
