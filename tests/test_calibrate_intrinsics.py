@@ -10,7 +10,6 @@ import pytest
 from scipy.stats import chi2
 from support.sightings import CAMERAS, PLATE_M, poses, seen
 
-from gripmon.calibrate.doubts import doubts_of
 from gripmon.calibrate.intrinsics import (
     calibrate,
     calibrate_best,
@@ -19,6 +18,7 @@ from gripmon.calibrate.intrinsics import (
     lens_vector,
     plate_pose,
 )
+from gripmon.calibrate.intrinsics_result import doubts_of
 from gripmon.calibrate.lens_models import MODELS
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import PaperLens
