@@ -133,6 +133,7 @@ def forks(config: Path) -> Iterator[Forks]:
         made.close()
 
 
+@pytest.mark.slow("15 s; killed at any moment is in the default run")
 def test_killed_while_it_calibrates_anew_it_goes_on_from_the_newest_reference(tmp_path: Path):
     """The same without commands: the camera is knocked to and fro, and past the limit each time."""
     endpoint = free_endpoint()
