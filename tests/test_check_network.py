@@ -88,6 +88,7 @@ def test_packages_that_are_missing(
     typestore.cache_clear()
 
 
+@pytest.mark.slow("6 s: words; what cannot be joined is in the default run")
 def test_how_the_network_would_be_joined_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def said(publish: dict[str, object]) -> str:
         path = written(tmp_path, publish=publish)
