@@ -117,7 +117,10 @@ def errors(known: bool, print_m: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.array(out), np.array(sizes), np.array(p_values)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    "known",
+    [pytest.param(True, marks=pytest.mark.slow("6 s: sampled; inferred corners are in the default run")), False],
+)
 @pytest.mark.parametrize(
     "print_m",
     [pytest.param(0.0, marks=pytest.mark.slow("9 s: sampled; with an uneven print it is in the default run")), 5e-5],

@@ -245,6 +245,7 @@ def test_another_reason_is_told_and_other_figures_are_not() -> None:
     assert standing.text == updated.text
 
 
+@pytest.mark.slow("3 s; a directory that vanishes is in test_recording_faults")
 def test_a_directory_that_was_removed_is_made_again(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "recordings"
     writer = recorder(folder)
