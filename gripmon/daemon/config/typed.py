@@ -13,6 +13,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 import msgspec
 from msgspec import inspect as mi
 
+from gripmon.model.errors import InputError
+
 _T = TypeVar("_T")
 
 
@@ -24,7 +26,7 @@ class Fault(NamedTuple):
     right: str
 
 
-class SettingsError(ValueError):
+class SettingsError(InputError):
     """A value doesn't fit its settings type; ``fault`` says where and why."""
 
     def __init__(self, fault: Fault):

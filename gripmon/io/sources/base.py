@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
+from gripmon.model.errors import InputError
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Frame
 
 
-class SourceError(ValueError):
+class SourceError(InputError):
     """A source that can't start: "key: what is wrong; what would be right", the key as in the source's settings."""
 
 
