@@ -58,7 +58,7 @@ _WHERE = {
     "teach_edges": "teach.api:teach",
     "verify": "calibrate.api",
 }
-"""Each public name, and the module below ``gripmon`` that has it (after a colon: by which name, where it is another)."""
+"""Each public name, and the module below ``gripmon`` that has it; after a colon by which name, if by another."""
 
 __all__ = [
     "Client",

@@ -1,4 +1,7 @@
-"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs."""
+"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs.
+
+``argparse`` stays: it costs no import time, and its error lines and exit codes are what scripts rely on.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from gripmon.cli import (
     view,
     watch,
 )
-from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandFailedError
+from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 from gripmon.model.errors import InputError, NoResultError
 
 _COMMANDS = (
@@ -101,12 +104,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code: int = chosen.handler(chosen)
         sys.stdout.flush()
-    except CommandFailedError as error:
+    except (CommandFailedError, InputError, NoResultError) as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    except (InputError, NoResultError) as error:
-        print(error, file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, InputError) else EXIT_FAILED
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import common
 from gripmon.cli.one_recording import keep
-from gripmon.cli.replay_differences import Differences
-from gripmon.cli.replaying import Past
+from gripmon.daemon.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config

@@ -42,12 +42,13 @@ def route(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon router``."""
     from gripmon.daemon import sigterm_exits
     from gripmon.io.wire import Router, ZenohFileError
+    from gripmon.model.errors import InputError
 
     with sigterm_exits():
         try:
             router = Router(Path(arguments.config))
         except ZenohFileError as error:
-            raise common.CommandFailedError(f"router: {error}", common.EXIT_USAGE) from None
+            raise InputError(f"router: {error}") from None
         with router:
             try:
                 _say(f"listening on {', '.join(router.listens_on)}")

@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
-from gripmon.cli import common
+from gripmon.daemon.forecast_values import (
+    CameraValues,
+    Forecast,
+    GripperValues,
+    InView,
+    JawTravelForecast,
+    JawValues,
+    OpeningCertainty,
+    RecalibrationForecast,
+    ReferenceValues,
+)
+from gripmon.daemon.surroundings import SourceReport, Surroundings
 
 Level = Literal["OK", "WARN", "FAIL"]
 
@@ -22,22 +32,22 @@ class Finding(NamedTuple):
     text: str
 
 
-def of_wrist(report: dict[str, Any]) -> list[Finding]:
-    """The findings about a wrist camera, from the values of ``check --json``."""
+def findings(forecast: Forecast, around: Surroundings) -> list[Finding]:
+    """What to know of a wrist camera's configuration before it runs."""
     found = [
-        _source(report["source"]),
-        _camera(report["camera"]),
-        _mount(report["reference"]),
-        _view(report["in_view"], report["gripper"]),
-        _promise(report),
-        _jaw_travel(report["in_view"]["jaw_travel"], report["jaw"]),
-        _recalibration(report["accuracy"]["recalibration"]),
-        _network(report["keys"]),
+        _source(around.source),
+        _camera(forecast.camera),
+        _mount(forecast.reference),
+        _view(forecast.in_view, forecast.gripper),
+        _promise(forecast),
+        _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
+        _recalibration(forecast.accuracy.recalibration),
+        _network(around.keys),
     ]
     return [each for each in found if each is not None]
 
 
-def of_second(report: dict[str, Any]) -> list[Finding]:
+def second_findings(report: dict[str, Any], around: Surroundings) -> list[Finding]:
     """Those about a second camera."""
     calibration, watch, pulses = report["calibration"], report["watch"], report["pulses"]
     spots = f"{calibration['used']} of {calibration['spots']} spots, RMS {calibration['rms_px']:.2f} px"
@@ -46,94 +56,70 @@ def of_second(report: dict[str, Any]) -> list[Finding]:
     table = pulses["table"]
     heard = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
     return [
-        _source(report["source"]),
+        _source(around.source),
         Finding("OK", "calibration", f"{size}, {spots}"),
         Finding("OK", "watch", limits),
         Finding("OK", "pulses", heard),
-        _network(report["keys"]),
+        _network(around.keys),
     ]
 
 
-def plain(findings: Sequence[Finding]) -> list[dict[str, str]]:
-    """The findings as plain values for JSON."""
-    return [each._asdict() for each in findings]
+def _source(source: SourceReport) -> Finding:
+    if source.reachable is False:
+        return Finding("FAIL", "source", f"{source.kind}: NOT REACHABLE: {source.detail}")
+    text = f"{source.kind}: {source.detail}"
+    return Finding("WARN", "source", f"{text}; {source.odd}") if source.odd else Finding("OK", "source", text)
 
 
-def lines(path: str, findings: Sequence[Finding]) -> list[str]:
-    """A headline, then a line each."""
-    counts = {level: sum(each.level == level for each in findings) for level in ("FAIL", "WARN")}
-    parts = [_counted(counts["FAIL"], "failure")] if counts["FAIL"] else ["sound"]
-    parts += [_counted(counts["WARN"], "warning")] if counts["WARN"] else []
-    width = max(len(each.about) for each in findings)
-    rows = [f"{each.level:<4}  {each.about:<{width}}  {each.text}" for each in findings]
-    return [f"{path}: {', '.join(parts)}", *rows]
+def _camera(camera: CameraValues) -> Finding:
+    across, down = (math.degrees(angle) for angle in camera.field_of_view_rad)
+    size = f"{camera.width_px} x {camera.height_px} px"
+    return Finding("OK", "camera", f"{size}, {camera.model} lens, sees about {across:.0f}° x {down:.0f}°")
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
-    """3 where something fails."""
-    return common.EXIT_FAILED if any(each.level == "FAIL" for each in findings) else common.EXIT_DONE
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}{'s' if count > 1 else ''}"
-
-
-def _source(source: dict[str, Any]) -> Finding:
-    if source["reachable"] is False:
-        return Finding("FAIL", "source", f"{source['kind']}: NOT REACHABLE: {source['detail']}")
-    text = f"{source['kind']}: {source['detail']}"
-    return Finding("WARN", "source", f"{text}; {source['odd']}") if source["odd"] else Finding("OK", "source", text)
-
-
-def _camera(camera: dict[str, Any]) -> Finding:
-    across, down = (math.degrees(angle) for angle in camera["field_of_view_rad"])
-    size = f"{camera['width_px']} x {camera['height_px']} px"
-    return Finding("OK", "camera", f"{size}, {camera['model']} lens, sees about {across:.0f}° x {down:.0f}°")
-
-
-def _mount(reference: dict[str, Any]) -> Finding:
+def _mount(reference: ReferenceValues) -> Finding:
     """The gripper's z axis points out of the gripper: a camera on the wrist is on its negative side."""
-    ahead_m = reference["camera_ahead_m"]
+    ahead_m = reference.camera_ahead_m
     if ahead_m <= 0.0:
-        way = f"which looks along the fingers at {math.degrees(reference['tilt_rad']):.0f}°"
-        text = f"TCP {1e3 * reference['distance_m']:.1f} mm from the camera, {way}"
+        way = f"which looks along the fingers at {math.degrees(reference.tilt_rad):.0f}°"
+        text = f"TCP {1e3 * reference.distance_m:.1f} mm from the camera, {way}"
         return Finding("OK", "mount", text)
     text = f"the camera would be {1e3 * ahead_m:.0f} mm in front of the fingertips, looking back at the gripper"
-    if reference["sound_as_wxyz"]:
+    if reference.sound_as_wxyz:
         right = "rotation_xyzw read as w, x, y, z puts it behind them: write x, y, z, w"
         return Finding("FAIL", "mount", f"{text}; {right} (reference.cam_T_grip)")
     return Finding("WARN", "mount", f"{text}; a camera on the wrist is behind them (reference.cam_T_grip)")
 
 
-def _view(in_view: dict[str, Any], gripper: dict[str, Any]) -> Finding:
-    if not in_view["enough"]:
-        return Finding("FAIL", "view", f"nothing can be measured: {in_view['reason']}")
-    seen = f"{in_view['corners']} of {gripper['corners']} corners and {in_view['edges']} edges can be measured"
-    spans = in_view["camera_may_move"]["shift_m"].values()
-    shifts = [amount for span in spans for amount in span if amount is not None]
+def _view(in_view: InView, gripper: GripperValues) -> Finding:
+    if not in_view.enough:
+        return Finding("FAIL", "view", f"nothing can be measured: {in_view.reason}")
+    seen = f"{in_view.corners} of {gripper.corners} corners and {in_view.edges} edges can be measured"
+    spans = {} if in_view.camera_may_move is None else in_view.camera_may_move.shift_m
+    shifts = [amount for span in spans.values() for amount in span if amount is not None]
     if not shifts:
         return Finding("OK", "view", seen)
-    shortest_m, limit_m = min(shifts), in_view["limit_m"]
+    shortest_m, limit_m = min(shifts), in_view.limit_m
     text = f"{seen}; too few once the camera shifts by {1e3 * shortest_m:.1f} mm"
     if shortest_m < limit_m:
         limit = f"{1e3 * limit_m:g} mm (monitor.policy.limit_m)"
         return Finding("WARN", "view", f"{text}: less than the shift that leads to a recalibration, {limit}")
-    if not gripper["faces"]:
+    if not gripper.faces:
         unknown = "the gripper file has no faces, so what a finger itself hides isn't known"
         return Finding("WARN", "view", f"{text}; {unknown}")
     return Finding("OK", "view", text)
 
 
-def _promise(report: dict[str, Any]) -> Finding | None:
-    found = report["protection"]
+def _promise(report: Forecast) -> Finding | None:
+    found = report.protection
     if found is None:
         return None  # the line about the view says why
-    limit_m, limit_rad = report["alert_limit_m"], report["alert_limit_rad"]
-    share = max(found["position_m"] / limit_m, found["rotation_rad"] / limit_rad)
-    good = f"{_millimetres(found['position_m'])} and {_degrees(found['rotation_rad'])}"
+    limit_m, limit_rad = report.alert_limit_m, report.alert_limit_rad
+    share = max(found.position_m / limit_m, found.rotation_rad / limit_rad)
+    good = f"{_millimetres(found.position_m)} and {_degrees(found.rotation_rad)}"
     limit = f"the alert limit of {_millimetres(limit_m)} and {_degrees(limit_rad)}"
     if share > 1.0:
-        text = f"no transform can be valid: good to {good}, beyond {limit}; valid needs {report['needed']}"
+        text = f"no transform can be valid: good to {good}, beyond {limit}; valid needs {report.needed}"
         return Finding("WARN", "promise", text)
     if _USUAL_SPREAD * share > 1.0:
         often = "one frame in twenty is twice as uncertain: some will be suspect"
@@ -141,32 +127,32 @@ def _promise(report: dict[str, Any]) -> Finding | None:
     return Finding("OK", "promise", f"a transform is good to {good}, within {limit}")
 
 
-def _jaw_travel(travel: dict[str, Any] | None, jaw: dict[str, Any]) -> Finding | None:
+def _jaw_travel(travel: JawTravelForecast | None, jaw: JawValues) -> Finding | None:
     if travel is None:
         return None
-    if jaw["source"] == "fixed":
-        return Finding("OK", "jaw travel", f"none: the opening is fixed at {1e3 * jaw['opening_m']:.1f} mm")
-    gaps = [f"from {1e3 * gap['from_m']:.1f} to {1e3 * gap['to_m']:.1f} mm" for gap in travel["gaps"]]
-    span = f"{1e3 * travel['from_m']:g} to {1e3 * travel['to_m']:g} mm"
+    if jaw.source == "fixed" and jaw.opening_m is not None:
+        return Finding("OK", "jaw travel", f"none: the opening is fixed at {1e3 * jaw.opening_m:.1f} mm")
+    gaps = [f"from {1e3 * gap.from_m:.1f} to {1e3 * gap.to_m:.1f} mm" for gap in travel.gaps]
+    span = f"{1e3 * travel.from_m:g} to {1e3 * travel.to_m:g} mm"
     texts = [f"nothing can be measured {', '.join(gaps)}"] if gaps else []
-    past = past_limit(travel["certainty"])
+    past = past_limit(travel.certainty)
     texts += [f"every transform is suspect {past}"] if past is not None else []
     if texts:
         return Finding("WARN", "jaw travel", f"of {span}: {'; '.join(texts)}")
     return Finding("OK", "jaw travel", f"{span}, within the alert limit all the way")
 
 
-def past_limit(certainty: dict[str, Any]) -> str | None:
+def past_limit(certainty: OpeningCertainty) -> str | None:
     """At which openings the bounds exceed the alert limits, in words; None for nowhere.
 
     Neighbours among the openings that were looked at make a span.
     """
-    limit_m, limit_rad = certainty["alert_limit_m"], certainty["alert_limit_rad"]
-    rows = zip(certainty["opening_m"], certainty["protection_m"], certainty["protection_rad"], strict=True)
+    limit_m, limit_rad = certainty.alert_limit_m, certainty.alert_limit_rad
+    rows = zip(certainty.opening_m, certainty.protection_m, certainty.protection_rad, strict=True)
     spans: list[list[float]] = []
     before = False
     for opening_m, bound_m, bound_rad in rows:
-        past = bound_m is not None and (bound_m > limit_m or bound_rad > limit_rad)
+        past = bound_m is not None and bound_rad is not None and (bound_m > limit_m or bound_rad > limit_rad)
         if past and before:
             spans[-1][1] = opening_m
         elif past:
@@ -179,11 +165,11 @@ def _span(low_mm: float, high_mm: float) -> str:
     return f"at {low_mm:.1f} mm" if low_mm == high_mm else f"from {low_mm:.1f} to {high_mm:.1f} mm"
 
 
-def _recalibration(values: dict[str, Any]) -> Finding:
-    if not values["possible"]:
-        text = f"the reference can't be measured anew from the corners in view: {values['reason']}"
+def _recalibration(values: RecalibrationForecast) -> Finding:
+    if not values.possible:
+        text = f"the reference can't be measured anew from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
-    return Finding("OK", "recalibration", f"possible, from {values['corners']} corners")
+    return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
 
 
 def _network(keys: str | None) -> Finding:
