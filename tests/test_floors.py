@@ -45,6 +45,7 @@ HEAVY = (
     "pyarrow",
     "plotly",
     "jinja2",
+    "shtab",
 )
 
 

@@ -86,10 +86,23 @@ def build_parser() -> argparse.ArgumentParser:
         prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"gripmon {__version__}")
+    parser.add_argument("--print-completion", action=_PrintCompletion, choices=("bash", "zsh"), help=argparse.SUPPRESS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in _COMMANDS:
         command.add_parser(commands)
     return parser
+
+
+class _PrintCompletion(argparse.Action):
+    """Print what a shell needs to complete commands, options and choices: source <(gripmon --print-completion bash)."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, _namespace: object, value: object, _option: str | None = None
+    ) -> None:
+        import shtab
+
+        print(shtab.complete(parser, str(value)))
+        parser.exit()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -87,23 +87,15 @@ def run(arguments: argparse.Namespace) -> int:
     if picture is not None:
         _check_picture(picture)
     from gripmon.daemon.forecast import rig_of
-    from gripmon.teach.forecast import Mount, tried, try_mount
+    from gripmon.daemon.sweeping import as_plain, sweep
     from gripmon.teach.forecast.picture import draw_sweep
 
-    opening_m = config.jaw_opening_m
-    present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m, travel_m)
-    trials = []
     with common.progress_bar(len(grid), "mount") as step:
-        for trial in tried(grid, opening_m, travel_m):
-            trials.append(trial)
-            step()
-    ranked = sorted(trials, key=lambda trial: trial.rank)
-    if arguments.json:
-        print(json.dumps(sweep_table.as_json(config, grid, at_px, present, ranked), indent=2))
-    else:
-        print("\n".join(sweep_table.as_text(config, grid, at_px, present, ranked)))
+        swept = sweep(config, grid, at_px, travel_m, step)
+    print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(sweep_table.as_text(swept)))
     if picture is not None:
-        _write(picture, draw_sweep(rig_of(config), grid, present, trials, opening_m))
+        drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
+        _write(picture, drawn)
         if not arguments.json:
             print(f"picture    {picture}")
     return common.EXIT_DONE
