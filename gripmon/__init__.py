@@ -21,14 +21,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from gripmon.analyse.api import correct, report
+    from gripmon.calibrate.api import calibrate_intrinsics, calibrate_robot_world, verify
     from gripmon.client import Client, Fleet, TransformClient
     from gripmon.daemon.api import Monitor, open_source
     from gripmon.daemon.config import Config, load_config
     from gripmon.daemon.forecast import Forecast, forecast
     from gripmon.daemon.replaying import replay
     from gripmon.daemon.simulating import simulate_images
+    from gripmon.laser.api import calibrate_laser
     from gripmon.model.errors import InputError, NoResultError
     from gripmon.model.records import Frame, FrameRecord
+    from gripmon.record.export import export
+    from gripmon.teach.api import teach as teach_edges
+    from gripmon.teach.hand_eye import calibrate_plane
 
 __version__ = "0.1.0"
 
@@ -45,7 +51,7 @@ _WHERE = {
     "TransformClient": "client",
     "calibrate_intrinsics": "calibrate.api",
     "calibrate_laser": "laser.api",
-    "calibrate_plane": "calibrate.api",
+    "calibrate_plane": "teach.hand_eye",
     "calibrate_robot_world": "calibrate.api",
     "correct": "analyse.api",
     "export": "record.export",

@@ -286,7 +286,7 @@ def test_two_monitors_can_not_use_one_file(path: Path):
 def test_the_lock_goes_with_its_process(path: Path):
     code = (
         "import sys; from pathlib import Path; sys.path[:0] = sys.argv[2:]\n"
-        "from state_files import opened\n"
+        "from support.state_files import opened\n"
         "file = opened(Path(sys.argv[1])); print('locked', flush=True); sys.stdin.read()"
     )
     tests = Path(__file__).resolve().parent

@@ -20,7 +20,7 @@ from the last reference, checks in the picture that it still fits, and says so (
 
 A configuration with a section laser is that of a second camera, beside the robot: its calibration is
 tested with every pulse of a laser pointer on the arm, which the robot's program tells
-(docs/laser.md, Watching)."""
+(docs/howto/laser.md, Watching)."""
 
 _EXAMPLES = """\
   gripmon run configs/live_camera.yaml

@@ -30,23 +30,17 @@ class _Network:
 
 
 def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
-    """The configuration if it is a second camera's, else None; a fault ends the command with exit code 2."""
-    from gripmon.daemon.config import ConfigError, is_second, load_second
+    """The configuration if it is a second camera's, else None."""
+    from gripmon.daemon.config import is_second, load_second
 
-    try:
-        return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
 
 
 def with_pulses(config: SecondConfig) -> SecondConfig:
-    """The same with the pulses of its table, where that was left out before; ends the command if it can't be read."""
-    from gripmon.daemon.config import ConfigError, load_pulses
+    """The same with the pulses of its table, where that was left out before."""
+    from gripmon.daemon.config import load_pulses
 
-    try:
-        return load_pulses(config)
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    return load_pulses(config)
 
 
 def run_second(

@@ -1,8 +1,9 @@
 """Parsed YAML -> typed settings, with errors that a person can act on.
 
 ``msgspec`` does the conversion.  As its errors name neither the entry of a mapping nor what would be right, the first
-fault is searched for here, along the type, with the description and the bounds that stand in the settings.  This stays beside pydantic: that
-names the entry, but not what would be right, and would be a second model of types that ``msgspec`` also encodes.
+fault is searched for here, along the type, with the description and the bounds that stand in the settings.  This stays
+beside pydantic, which names the entry, but not what would be right, and would be a second model of what ``msgspec``
+also encodes.
 """
 
 from __future__ import annotations
