@@ -14,10 +14,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gripmon.cli import common, promising, second_run
+from gripmon.cli import common, second_run
 from gripmon.cli.one_recording import keep
-from gripmon.cli.recorded_run import RecordedRun, is_recording
-from gripmon.cli.replaying import NOTHING_BEFORE, replay
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config, SecondConfig
@@ -96,6 +95,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon replay``."""
     import cv2
 
+    from gripmon.cli.recorded_run import RecordedRun, is_recording
+    from gripmon.daemon.forecast import limits_warning
+    from gripmon.daemon.replaying import NOTHING_BEFORE, replay
+    from gripmon.model.records import to_json
+
     cv2.setNumThreads(1)
     paths = [Path(name) for name in arguments.input]
     _refuse_empty_folder(paths)
@@ -110,15 +114,15 @@ def run(arguments: argparse.Namespace) -> int:
         out = opened.enter_context(_output(arguments.out))
         overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
         recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
-        if (said := promising.warning(config)) is not None:
-            print(f"replay: {said}", file=sys.stderr)
+        if (text := limits_warning(config)) is not None:
+            _say(text)
         counts = _Counts()
         try:
             step = opened.enter_context(
                 common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame")
             )
-            for line, record in replay(config, source, recorder, recorded.past if recorded else NOTHING_BEFORE):
-                out.write(line)
+            for record in replay(source, config, recorder, recorded.past if recorded else NOTHING_BEFORE, _say):
+                out.write(to_json(record) + b"\n")
                 counts.add(record)
                 if recorded:
                     recorded.compare(record)
@@ -133,6 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
     """The pulses of a second camera, on recorded frames."""
     from gripmon.cli import second_replay
+    from gripmon.cli.recorded_run import is_recording
 
     path = Path(arguments.input[0])
     wrong = ""
@@ -143,7 +148,7 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
     elif len(arguments.input) > 1 or is_recording([path]):
         wrong = f"{path}: no input for a second camera's configuration; one folder of images, or one video"
     if wrong:
-        raise common.CommandFailedError(wrong, common.EXIT_USAGE)
+        raise InputError(wrong)
     config = second_run.with_pulses(config)
     with contextlib.ExitStack() as opened:
         source = _open_input(path, arguments.fps)
@@ -164,19 +169,15 @@ def _refuse_empty_folder(paths: list[Path]) -> None:
         try:
             images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir())
         except OSError as error:
-            raise common.CommandFailedError(f"{path}: can't be read ({error.strerror})", common.EXIT_USAGE) from None
+            raise InputError(f"{path}: can't be read ({error.strerror})") from None
         if not images:
-            raise common.CommandFailedError(
-                f"{path}: no recordings and no images in it; .rrd files, or images such as *.png, *.jpg, *.tif, *.pgm",
-                common.EXIT_USAGE,
-            )
+            right = ".rrd files, or images such as *.png, *.jpg, *.tif, *.pgm"
+            raise InputError(f"{path}: no recordings and no images in it; {right}")
 
 
 def _given_config(path: Path, name: str | None) -> Config:
     if name is None:
-        raise common.CommandFailedError(
-            f"{path}: only a recording brings its own configuration; --config CONFIG", common.EXIT_USAGE
-        )
+        raise InputError(f"{path}: only a recording brings its own configuration; --config CONFIG")
     return common.load(name, check_source=False)
 
 
@@ -227,21 +228,18 @@ class _Counts:
 
 
 def _open_input(path: Path, fps: float | None) -> Source:
-    import msgspec
-
     from gripmon.io.sources import SourceError, open_source, settings_for_path
 
     if not path.exists():
-        raise common.CommandFailedError(
-            f"{path}: there is no such file or folder; a folder of images, a video or an .rrd", common.EXIT_USAGE
-        )
+        raise InputError(f"{path}: there is no such file or folder; a folder of images, a video or an .rrd")
     try:
-        settings = settings_for_path(path)
-        if fps is not None:
-            settings = msgspec.structs.replace(settings, fps=fps)
-        return open_source(settings)
+        return open_source(settings_for_path(path, fps))
     except SourceError as error:
-        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"{path}: {error}") from None
+
+
+def _say(text: str) -> None:
+    print(f"replay: {text}", file=sys.stderr)
 
 
 class _Lines:
@@ -266,7 +264,7 @@ class _Lines:
         except BrokenPipeError:
             raise  # a reader that has seen enough is no fault
         except OSError as error:
-            raise common.CommandFailedError(f"--out {self._name}: writing failed ({error.strerror})") from None
+            raise NoResultError(f"--out {self._name}: writing failed ({error.strerror})") from None
 
 
 @contextmanager
@@ -308,7 +306,7 @@ def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
         config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
     )
     if path.is_dir():
-        raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+        raise InputError(f"--recording {path}: is a folder; a file")
     common.make_directory(path.parent, "--recording")
     with contextlib.ExitStack() as opened:
         try:

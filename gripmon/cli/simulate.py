@@ -4,16 +4,11 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gripmon import __version__
 from gripmon.cli import common
-
-if TYPE_CHECKING:
-    from gripmon.daemon.config import Config
-    from gripmon.simulate import Scenario
+from gripmon.model.errors import InputError
 
 _DESCRIPTION = """\
 Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
@@ -53,100 +48,26 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon simulate``."""
-    from gripmon.simulate import SCENARIO_NAMES, Simulator, write_sequence
+    from gripmon.daemon.simulating import simulate_images
+    from gripmon.simulate import SCENARIO_NAMES
 
     if arguments.list:
         print("\n".join(SCENARIO_NAMES))
         return common.EXIT_DONE
     if arguments.scenario is None or arguments.out is None:
-        raise common.CommandFailedError(
-            "simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/", common.EXIT_USAGE
-        )
+        raise InputError("simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/")
+    out = Path(arguments.out)
     config = common.load_demo_or(arguments.config)
-    scenario = _scenario(arguments, config)
-    out = _empty_directory(Path(arguments.out))
-    try:
-        simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, arguments.seed)
-    except ValueError as error:
-        raise common.CommandFailedError(f"{arguments.scenario}: {error}", common.EXIT_USAGE) from None
-    shutil.copyfile(config.gripper_path, out / "gripper.yaml")
-    (out / "config.yaml").write_text(_config_text(config, scenario, arguments), encoding="utf-8")
-    with common.progress_bar(simulator.frame_count, "frame") as step:
-        count = write_sequence(simulator, out, lambda _done, _total: step())
-    replay = shlex.join(["gripmon", "replay", str(out), "--config", str(out / "config.yaml"), "--out", f"{out}.jsonl"])
-    print(f"{count} frames in {out}; next: {replay}")
+    with common.progress_bar(None, "frame") as step:
+        sequence = simulate_images(
+            arguments.scenario,
+            out,
+            config=config,
+            seed=arguments.seed,
+            duration_s=arguments.seconds,
+            fps=arguments.fps,
+            step=lambda _done, total: step(total),
+        )
+    replay = shlex.join(["gripmon", "replay", str(out), "--config", str(sequence.config), "--out", f"{out}.jsonl"])
+    print(f"{sequence.frames} frames in {out}; next: {replay}")
     return common.EXIT_DONE
-
-
-def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
-    from gripmon.daemon.config import ConfigError, load_scenario
-    from gripmon.simulate import make_scenario
-
-    name: str = arguments.scenario
-    if Path(name).suffix in (".yaml", ".yml"):
-        if arguments.seconds is not None or arguments.fps is not None:
-            raise common.CommandFailedError(
-                f"{name}: --seconds and --fps are for built-in scenarios; duration_s and fps in the file",
-                common.EXIT_USAGE,
-            )
-        try:
-            return load_scenario(Path(name))
-        except ConfigError as error:
-            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
-    try:
-        return make_scenario(name, duration_s=arguments.seconds, fps=arguments.fps, finger=config.gripper.finger_ids[0])
-    except ValueError as error:
-        raise common.CommandFailedError(f"simulate: {error}", common.EXIT_USAGE) from None
-
-
-def _empty_directory(path: Path) -> Path:
-    common.make_directory(path)
-    if any(path.iterdir()):
-        raise common.CommandFailedError(f"--out {path}: is not empty; a new or empty folder", common.EXIT_USAGE)
-    return path
-
-
-def _config_text(config: Config, scenario: Scenario, arguments: argparse.Namespace) -> str:
-    """A configuration for the sequence, commented, in the form of the hand-written ones."""
-    import msgspec
-
-    camera = msgspec.to_builtins(config.settings.camera)
-    x, y, z, w = config.reference.cam_T_grip.rotation_xyzw
-    lens = "\n".join(f"  {key}: {_yaml(value)}  # {_LENS_UNITS[key]}" for key, value in camera.items())
-    jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
-    return f"""\
-# Written by: gripmon simulate {scenario.name} --seed {arguments.seed} (gripmon {__version__})
-robot: simulated  # name of the robot in the Zenoh keys
-camera_name: wrist  # name of the camera in the Zenoh keys
-camera:
-{lens}
-gripper: gripper.yaml  # path of the gripper file, relative to this file
-reference:
-  cam_T_grip:  # what a perfect calibration gave at the beginning: maps gripper coordinates to camera coordinates
-    translation_m: {_yaml(list(config.reference.cam_T_grip.translation_m))}  # x, y, z (m)
-    rotation_xyzw: {_yaml([x, y, z, w])}  # unit quaternion x, y, z, w
-jaw:
-  source: {jaw}  # the opening comes with each frame (timestamps.csv), or is the nominal one if fixed
-source:
-  kind: folder  # images in a folder
-  path: .  # the folder, relative to this file
-"""
-
-
-_LENS_UNITS = {
-    "model": "lens model: paper, brown_conrady or fisheye",
-    "width_px": "image width (px)",
-    "height_px": "image height (px)",
-    "fx_px": "focal length over the pixel's width (px)",
-    "fy_px": "focal length over the pixel's height (px)",
-    "cx_px": "column of the principal point (px)",
-    "cy_px": "row of the principal point (px)",
-    "kappa_per_px2": "radial distortion (1/px²)",
-    "coefficients": "distortion in OpenCV's order (no unit)",
-}
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_yaml, value))}]"
-    return repr(value) if isinstance(value, float) else str(value)
