@@ -21,9 +21,9 @@ from support.replayed import EVERY_FRAME, replayed, without_latency
 from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import main
 from gripmon.cli.recorded_run import RecordedRun
-from gripmon.cli.replay import _recorder
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.one_recording import one_recording
 from gripmon.daemon.recorded_run import as_recorded_before_bounds
 from gripmon.daemon.replaying import replay
 from gripmon.io.sources.folder import FolderSettings, FolderSource
@@ -109,7 +109,7 @@ def odd_frames(sequence: Path) -> list[Frame]:
 
 def test_refused_and_odd_frames_are_given_again(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = load_config(sequence_config(sequence), check_source=False)
-    with _recorder(str(tmp_path / "odd.rrd"), config) as recorder:
+    with one_recording(tmp_path / "odd.rrd", config) as recorder:
         lines = [to_json(each) + b"\n" for each in replay(Given(odd_frames(sequence)), config, recorder)]
     reasons = {json.loads(line)["reason"].partition(":")[0] for line in lines if json.loads(line)["reason"]}
     assert reasons >= set(Refusal) - {Refusal.FROZEN}, "every kind of refusal"

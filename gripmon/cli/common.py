@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 EXIT_DONE = 0
 EXIT_USAGE = 2
 EXIT_FAILED = 3
-EXIT_TAKEN = 4  # another monitor has the name
 EXIT_INTERRUPTED = 130
 RECORDING_PATIENCE_S = 30.0  # images that can wait outrun any camera: they wait for the recording, none is dropped
 EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import logging
 import math
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sized
 from contextlib import contextmanager
@@ -15,14 +13,12 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
 from gripmon.cli import common, second_run
-from gripmon.cli.one_recording import keep
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config, SecondConfig
     from gripmon.io.sources import Source
     from gripmon.model.records import FrameRecord
-    from gripmon.record.write import Recorder
 
 _DESCRIPTION = """\
 Run recorded frames through the monitor and write one JSON line for every input frame, in input
@@ -97,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from gripmon.cli.recorded_run import RecordedRun, is_recording
     from gripmon.daemon.forecast import limits_warning
+    from gripmon.daemon.one_recording import one_recording
     from gripmon.daemon.replaying import NOTHING_BEFORE, replay
     from gripmon.model.records import to_json
 
@@ -113,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         opened.callback(source.close)
         out = opened.enter_context(_output(arguments.out))
         overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
-        recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
+        recorder = opened.enter_context(overlaid or one_recording(_recording_path(arguments.recording), config))
         if (text := limits_warning(config)) is not None:
             _say(text)
         counts = _Counts()
@@ -289,68 +286,11 @@ def _output(name: str) -> Iterator[_Lines]:
             file.close()
 
 
-@contextmanager
-def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
-    """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
-    import msgspec
-
-    from gripmon.daemon.config.recorded import to_recorded
-    from gripmon.record.write import NullRecorder, open_recorder
-
+def _recording_path(name: str | None) -> Path | None:
     if name is None:
-        yield NullRecorder()
-        return
+        return None
     path = Path(name)
-    # One file, whatever its length.
-    settings = msgspec.structs.replace(
-        config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
-    )
     if path.is_dir():
         raise InputError(f"--recording {path}: is a folder; a file")
     common.make_directory(path.parent, "--recording")
-    with contextlib.ExitStack() as opened:
-        try:
-            scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
-        except OSError as error:
-            raise common.not_writable(path, error, "--recording") from None
-        recorder = open_recorder(
-            settings,
-            robot=config.settings.robot,
-            camera_name=config.settings.camera_name,
-            camera=config.camera,
-            gripper=config.gripper,
-            reference=config.reference,
-            directory=Path(scratch),
-            name=path.stem,
-            patience_s=common.RECORDING_PATIENCE_S,
-            configuration=to_recorded(config),
-        )
-        opened.enter_context(_told_at_the_end())
-        try:
-            yield recorder
-        finally:
-            recorder.close(timeout_s=60.0)
-            # A disk that failed for a moment has left a whole file of the frames after it.
-            missing = _missing(recorder)
-            keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
-
-
-def _missing(recorder: Recorder) -> str | None:
-    """What is not in a recording that is to hold all; None if nothing is missing."""
-    if recorder.dropped:
-        return f"{recorder.dropped} frames are missing"
-    return f"{recorder.images_dropped} images are missing" if recorder.images_dropped else None
-
-
-@contextmanager
-def _told_at_the_end() -> Iterator[None]:
-    """What a daemon logs of its recording while it goes on, a replay says in one line when it is over."""
-    logger = logging.getLogger("gripmon.record.write")
-    propagates, silent = logger.propagate, logging.NullHandler()
-    logger.addHandler(silent)
-    logger.propagate = False
-    try:
-        yield
-    finally:
-        logger.propagate = propagates
-        logger.removeHandler(silent)
+    return path
