@@ -10,13 +10,13 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.laser_images import spot_image
 from support.laser_scenes import write_csv
 from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.simulate.laser import spot_image
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 

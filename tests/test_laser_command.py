@@ -11,7 +11,6 @@ import pytest
 import yaml
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
-from support.laser_images import spot_image
 from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
@@ -20,6 +19,7 @@ from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.model.geometry import invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
+from gripmon.simulate.laser import spot_image
 
 
 @pytest.fixture
