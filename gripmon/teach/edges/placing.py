@@ -17,7 +17,7 @@ from gripmon.judge.recalibrate import RecalibrationRefused, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
-from gripmon.model.least_squares import covariance_of, minimise
+from gripmon.model.least_squares import minimise
 from gripmon.model.records import Array, ReferenceRecord
 
 ROUGH_SHARE = 0.006
@@ -132,7 +132,8 @@ def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prio
     if not math.isfinite(cost(start)):
         return None
     found = minimise(start, cost, equations, perturb, iterations=_ROUNDS, tolerance=1e-6)
-    return found.state, covariance_of(equations(found.state)[0]), found.cost
+    # However a person's corners lie, the prior keeps every direction determined.
+    return found.state, np.linalg.inv(equations(found.state)[0]), found.cost
 
 
 def _cost(pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array) -> float:
