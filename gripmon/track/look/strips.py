@@ -47,8 +47,8 @@ ONE_PLACE_PX = 3
 EXPLAINED = 0.87
 """Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
 
-FEWEST_FRAMES, MOST_FRAMES = 5, 32
-"""Learnt before it may judge; and remembered."""
+FEWEST_FRAMES, MOST_FRAMES = 3, 32
+"""Frames learnt before it may judge: seen inside the outline, they differ by noise alone; and remembered."""
 
 RELEARN_S = 1.0
 """Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
@@ -97,8 +97,9 @@ class FingerStrips:
         learnt = np.clip(self._mean, -most, most)
         # Gain and brightness are free: light changes.
         energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
-        alike = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
-        alike /= np.sqrt(np.maximum(energy, 0.25 * float(energy[REACH_PX])) * float(np.square(learnt).sum()) + 1e-12)
+        product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
+        least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
+        alike = product / np.sqrt(np.maximum(energy, least) * float(np.square(learnt).sum()) + 1e-12)
         unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED))
         here = float(unexplained[REACH_PX])
         unexplained[REACH_PX - ONE_PLACE_PX : REACH_PX + ONE_PLACE_PX + 1] = 1.0
@@ -117,12 +118,13 @@ class FingerStrips:
         points = (self._points_grip_m + moved[:, None]).reshape(-1, 3)
         uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
         # A point outside the lens is NaN; OpenCV needs a number for it.
-        maps = np.nan_to_num(uv_px, nan=-1.0).astype(np.float32).reshape(*self._points_grip_m.shape[:2], 2)
-        values = cv2.remap(image, maps, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        shape = self._points_grip_m.shape[:2]
+        u, v = (c.reshape(shape) for c in np.nan_to_num(uv_px, nan=-1.0).astype(np.float32).T)
+        values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
         if values.ndim == 3:
             values = values @ GREY_BGR
-        values = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
-        return np.asarray(values - cv2.blur(values, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE))
+        smooth = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
 
     def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
         start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
@@ -147,11 +149,9 @@ class FingerStrips:
         self._mean = np.zeros_like(self._within)
         self._laid_out_at_m = jaw_opening_m
 
-    def _strips(
-        self, cam_T_grip: Array, jaw_opening_m: float | None
-    ) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+    def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
         """Strips behind the end edges on faces that look at the camera: where they start (n, 3) and the way (n, 3)
-        that they go, gripper frame, for how long (n,), m, and on which finger (n,).
+        that they go, gripper frame (z points out of the gripper), for how long (n,), m, and on which finger (n,).
         """
         gripper = self._gripper
         points_m = gripper.points_grip_m(jaw_opening_m)
@@ -161,9 +161,10 @@ class FingerStrips:
             ends = gripper.edge_points[edge].tolist()
             for face in self._faces(points_m, eye_m, ends):
                 ways = [points_m[far] - points_m[end] for end in ends for far in self._behind(end) if far in face]
-                if ways:
-                    sides = ways[0], ways[-1]
-                    rows += [(points_m[ends], np.stack(sides), share, gripper.edge_finger[edge]) for share in _ACROSS]
+                # At the fingers' roots there are edges across them, too.
+                if ways and ways[0][2] < 0.0:
+                    both = np.stack([ways[0], ways[-1]])
+                    rows += [(points_m[ends], both, share, gripper.edge_finger[edge]) for share in _ACROSS]
         if not rows:
             return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp)
         share = np.array([[1.0 - row[2], row[2]] for row in rows])
