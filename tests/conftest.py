@@ -27,7 +27,10 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Workers take file after file in this order."""
+    """Workers take file after file in this order; what is marked slow says why."""
+    for item in items:
+        if any(len(mark.args) != 1 for mark in item.iter_markers("slow")):
+            raise pytest.UsageError(f'{item.nodeid}: @pytest.mark.slow("<seconds> s; what guards the same in less")')
     rank = {name: place for place, name in enumerate(LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 

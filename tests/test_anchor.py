@@ -97,7 +97,7 @@ def test_what_lasts_is_all_that_may_have_been_wrong_from_the_first_frame_on():
     assert LASTING.name[0] == "nothing is wrong"
 
 
-def test_with_hidden_edges_a_hypothesis_is_the_one_that_doubts_the_same_of_what_is_left():
+def test_with_hidden_edges_hypotheses_doubt_the_same_of_what_is_left():
     edges = np.array([0, 1, 3, 4, 5])  # a_tip, b_tip and b_side are hidden
     seen = hypotheses_of(tuple(NAMES[e] for e in edges), FINGER[edges], ("a", "b"), ALONG[edges], True)
     rows = LASTING.rows(seen, edges)
@@ -215,7 +215,7 @@ def test_after_a_long_time_without_proof_the_average_is_the_newest_frame():
     assert (off < SIGMA).all()
 
 
-def test_where_the_average_and_the_frame_differ_beyond_chance_the_average_bounds_nothing():
+def test_an_average_that_differs_beyond_chance_bounds_nothing():
     """Under a hypothesis that tells them apart the frame is left, not the way between them."""
     frames = stream(np.random.default_rng(RNG_SEED), 40, common=0.0)
     anchor = averaged(frames[:-1])

@@ -118,19 +118,7 @@ def test_a_valid_transform_that_is_wrong_counts_also_where_errors_do_not():
     ] == pytest.approx(0.0)
 
 
-def test_against_the_best_peer_and_the_detector():
-    from benchmarks.accuracy_stats import against_peers
-
-    ours = {"mean_um": [1.0, 2.0, 3.0], "median_ms": 0.5}
-    peers = {
-        "cornerSubPix": {"mean_um": [10.0, 4.0, 100.0], "median_ms": 1.0},
-        "rapid": {"mean_um": None, "median_ms": 9.0},
-        "aruco": {"mean_um": [0.1, 0.1, 0.1], "median_ms": 10.0},
-    }
-    assert against_peers(ours, peers) == pytest.approx({"of_best_peer": 0.5, "times_faster": 20.0})
-    assert against_peers(ours, {}) == {"of_best_peer": None, "times_faster": None}
-
-
+@pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
     from benchmarks.conditions import CONDITIONS, FPS
     from benchmarks.scenes import make_scene
@@ -150,32 +138,7 @@ def test_every_condition_has_enough_frames_and_its_scenes_can_be_made():
             assert (scene.taught is not None) == condition.taught
 
 
-def test_scenes_differ_and_come_back_the_same():
-    from benchmarks.conditions import CONDITIONS
-    from benchmarks.scenes import make_scene
-
-    clutter = next(c for c in CONDITIONS if c.name == "clutter printed")
-
-    def picture(seed: int, number: int) -> np.ndarray:
-        return make_scene(clutter, seed, number, 2).simulator.render(1)
-
-    first = picture(1, 0)
-    assert np.array_equal(first, picture(1, 0))
-    assert not np.array_equal(first, picture(2, 0))
-    poses = [make_scene(clutter, 1, number, 2).simulator.truth(0) for number in range(6)]
-    assert len({pose.jaw_opening_m for pose in poses}) == 6
-    assert len({make_scene(clutter, 1, number, 2).gripper.name for number in range(6)}) == 3
-
-
-def test_sequences_that_are_not_there_are_skipped_by_name(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    from benchmarks import accuracy_table, rendered, rows
-
-    monkeypatch.setattr(rendered, "FOLDER", tmp_path)
-    figures, tracks = rows.measure_row("rendered jaw_cycle", scenes=None, frames=None, seed=1, peers=False)
-    assert str(tmp_path) in figures["skipped"] and not tracks
-    assert "rendered jaw_cycle" in accuracy_table._row("rendered jaw_cycle", figures)[0]
-
-
+@pytest.mark.slow("15 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_a_whole_run_in_small_leaves_a_report(tmp_path: Path):
     from benchmarks import accuracy, accuracy_report, accuracy_table
 
@@ -196,16 +159,3 @@ def test_a_whole_run_in_small_leaves_a_report(tmp_path: Path):
         assert f"(accuracy/{picture}.png)" in report
         assert (tmp_path / "accuracy" / f"{picture}.png").stat().st_size > 5000
     assert json.loads((tmp_path / "accuracy.json").read_text())["rows"]["clean"]["ours"]["edges"]["frames"] == 6
-
-
-@pytest.mark.parametrize("only", [["nothing like this"], ["clean", "Clean"]])
-def test_unknown_rows_are_one_line(only: list[str], capsys: pytest.CaptureFixture[str]):
-    import argparse
-
-    from benchmarks import accuracy
-
-    parser = argparse.ArgumentParser()
-    accuracy.add_parser(parser.add_subparsers())
-    assert accuracy.run(parser.parse_args(["accuracy", "--only", *only])) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "there is no such row" in error

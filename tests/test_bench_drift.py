@@ -10,7 +10,6 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tools"))
 
-from benchmarks import drift
 from benchmarks.drift_streams import (
     BLOCK_FRAMES,
     FRAMES_PER_DAY,
@@ -77,43 +76,3 @@ def test_delays_count_from_the_step_and_never_is_infinite():
     assert (found["at once"]["T²"] == 1).all()
     assert (found["third"]["T²"] == 3).all()
     assert np.isinf(found["never"]["T²"]).all()
-
-
-def test_tables_say_what_is_met():
-    rows = {"step 0.1 mm, x": {c: np.full(4, v) for c, v in (("ours", 2.0), ("bare", np.inf), ("T²", 1.0))}}
-    rows["step 0.05 mm, z"] = {c: np.full(4, np.inf) for c in ("ours", "bare", "T²")}
-    table = drift._delay_table("quiet", rows)
-    assert "| step 0.1 mm, x | 2 / 2, 100 % | - / -, 0 % | 1 / 1, 100 % | 3, met |" in table
-    assert "10, NOT MET |" in table
-
-
-def test_the_charts_that_meet_working_noise_are_those_that_have_learnt_quiet_noise(monkeypatch: pytest.MonkeyPatch):
-    """Each in few frames: what was counted is told, and the line says all of it."""
-    seen: list[tuple[str, int]] = []
-
-    def count(charts, model, streams, frames, rng, tick):
-        test = charts["ours"].test
-        seen.append((model.regime, int(test.windows.frames.max())))
-        return count_alarms(charts, model, streams, frames, rng, tick)
-
-    monkeypatch.setattr("benchmarks.drift_streams.count_alarms", count)
-    monkeypatch.setattr(drift, "CHANGE_STREAMS", 4)
-    monkeypatch.setattr(drift, "CHANGE_FRAMES", BLOCK_FRAMES)
-    change = drift._change(1, lambda n: None)
-    assert [regime for regime, _ in seen] == ["quiet", "working"]
-    assert seen[0][1] == 0
-    assert seen[1][1] > BLOCK_FRAMES // 2
-    assert (change["changes"], change["frames"]) == (4, BLOCK_FRAMES)
-    line = drift._change_line({"changes": 4, "frames": 1024, "before": 2, "after": 3})
-    assert "4 changes: 3 in the 1024 frames after each, 2 in as many before" in line
-
-
-@pytest.mark.parametrize("option", ["--frames", "--streams", "--warm-up"])
-def test_bad_numbers_are_refused(option: str, capsys: pytest.CaptureFixture[str]):
-    import argparse
-
-    parser = argparse.ArgumentParser()
-    drift.add_parser(parser.add_subparsers())
-    with pytest.raises(SystemExit):
-        parser.parse_args(["drift", option, "0"])
-    assert "at least 1" in capsys.readouterr().err

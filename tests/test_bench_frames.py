@@ -12,7 +12,8 @@ TOOLS = Path(__file__).resolve().parent.parent / "tools"
 FRAMES = 30
 
 
-@pytest.mark.parametrize(("frame_format", "shared"), [("raw", True), ("raw", False), ("jpeg", True), ("png", False)])
+@pytest.mark.slow("10 s: a benchmark in small; what comes over the network is tested with the source")
+@pytest.mark.parametrize(("frame_format", "shared"), [("raw", True), ("jpeg", False)])
 def test_a_row_in_small(frame_format: str, shared: bool, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(str(TOOLS))
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(TOOLS), str(TOOLS.parent), *sys.path]))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -100,25 +99,7 @@ def test_the_least_possible_level_is_that_of_the_worst_axis():
     assert normal_level_m(covariance, 1e-5) == pytest.approx(4.417 * 2e-5, rel=1e-3)
 
 
-def test_scenes_are_told_apart_by_scale_and_jaw():
-    from benchmarks.integrity_stats import by_scale
-
-    near = {"focal_px": 960.0, "depth_m": 0.1, "jaw_exact": True}
-    far = line(focal_px=500.0, depth_m=0.2, jaw_exact=False, valid=[False] * 10, floor_m=[1e-3] * 10)
-    rows = by_scale([line(**near), far])
-    assert [(row["low"], row["jaw_exact"], row["scenes"]) for row in rows] == [(8.0, True, 1), (0.0, False, 1)]
-    assert [row["available"][0] for row in rows] == [row["possible"][0] for row in rows] == [1.0, 0.0]
-
-
-def test_targets_name_what_is_missed():
-    from benchmarks.integrity_stats import figures, targets
-
-    met = [ok for _, _, ok in targets(figures([line()]))]
-    assert met == [True, True, True, None, None, True, None, True, True]
-    bad = figures([line(error_m=[1e-3] * 10, nees=[60.0] * 10, camera_alerts=[[3, "moved"]])])
-    assert [ok for _, _, ok in targets(bad)] == [False, False, True, None, None, True, None, False, False]
-
-
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
     from benchmarks.integrity_misleading import CONDITIONS
     from benchmarks.integrity_scenes import make_integrity_scene
@@ -139,6 +120,7 @@ def test_scenes_of_all_conditions_can_be_made_and_come_back_the_same():
             assert np.array_equal(again.simulator.truth(40).cam_T_grip, simulator.truth(40).cam_T_grip)
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_conditions_hide_what_they_say():
     from benchmarks.integrity_misleading import CONDITIONS
     from benchmarks.integrity_runs import View, _view
@@ -156,6 +138,7 @@ def test_conditions_hide_what_they_say():
     assert share("grasp", View.BOTH_TIPS) > 0.6
 
 
+@pytest.mark.slow("10 s: a benchmark in small; the figures that it computes are tested beside it")
 def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(tmp_path: Path):
     from benchmarks import integrity, integrity_report, integrity_table
 
@@ -188,13 +171,3 @@ def test_a_whole_run_in_small_goes_on_where_it_was_cut_off(tmp_path: Path):
         assert f"(integrity/{picture}.png)" in report
         assert (tmp_path / "integrity" / f"{picture}.png").stat().st_size > 5000
     assert json.loads((tmp_path / "integrity.json").read_text())["total"]["scenes"] == 2
-
-
-def test_unknown_conditions_are_one_line(capsys: pytest.CaptureFixture[str]):
-    from benchmarks import integrity
-
-    parser = argparse.ArgumentParser()
-    integrity.add_parser(parser.add_subparsers())
-    assert integrity.run(parser.parse_args(["integrity", "--only", "nothing like this"])) == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "no such condition" in error

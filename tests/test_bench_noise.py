@@ -24,6 +24,7 @@ def own_statistics(model, scenes: int = 200):
     return statistics(np.swapaxes(z, 0, 1))
 
 
+@pytest.mark.slow("5 s: the noise of a benchmark, no part of what is installed")
 @pytest.mark.parametrize("regime", REGIMES)
 def test_streams_are_nowhere_milder_than_what_was_measured(regime: str):
     """All axes together: few scenes were measured, so that a single axis scatters."""
@@ -77,6 +78,7 @@ def test_frames_without_an_error_are_left_out():
     assert np.isfinite(found.step_variance).all() and np.isfinite(found.tails).all()
 
 
+@pytest.mark.slow("5 s: the noise of a benchmark, no part of what is installed")
 def test_the_fit_gives_back_the_model_that_made_the_series():
     """Two parts and a level with known variances, as measured series of it."""
     from benchmarks import noise_fit
@@ -133,25 +135,3 @@ def test_vibration_has_the_drawn_frequencies_and_amplitudes():
     square = 0.5 * 0.5 * model.vibration.count * (large**2 - small**2) / (2.0 * np.log(large / small))
     assert np.mean(noise.motion[..., 0] ** 2) == pytest.approx(square, rel=0.2)
     assert (NoiseModel.load("quiet").streams(2, np.random.default_rng(1)).next(3).motion) is None
-
-
-def test_a_regime_that_is_not_there_is_refused():
-    from benchmarks.noise_model import NoiseModel
-
-    with pytest.raises(ValueError, match="no noise regime 'loud'; one of quiet, working, rough"):
-        NoiseModel.load("loud")
-
-
-def test_every_measured_scene_can_be_made_and_is_its_own():
-    from benchmarks.noise_measured import REGIMES as MEASURED
-    from benchmarks.noise_measured import SIZE, simulator
-    from benchmarks.scene import config_for
-
-    config = config_for(SIZE)
-    for regime in MEASURED.values():
-        a, b, again = (simulator(regime, 1, scene, config) for scene in (0, 1, 0))
-        assert a.scenario == again.scenario and a.seed == again.seed
-        assert a.scenario != b.scenario and a.seed != b.seed
-        assert a.scenario.fps == 60.0
-        moved_m = np.linalg.norm([a.truth(k).tcp_shift_m for k in range(30)], axis=1)
-        assert (moved_m.max() > 1e-6) == (regime.name == "rough")

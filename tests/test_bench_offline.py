@@ -35,6 +35,7 @@ def test_discs_lie_where_they_are_projected_to():
         assert window.sum() / 160.0 == pytest.approx(abs(area), rel=1e-3)
 
 
+@pytest.mark.slow("5 s: a benchmark in small; plane and intrinsics have tests of their own")
 def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     """Against bounds that are ten times the tool centre point's stated deviation, not the benchmark's own."""
     from benchmarks import offline, offline_plane
@@ -59,20 +60,7 @@ def test_a_trial_finds_the_gripper_and_a_gap_is_told_of():
     assert "first seed 1" in text and "MISSED: something" in text and "nan" not in text
 
 
-def test_what_is_missed_is_told():
-    from benchmarks import offline
-    from benchmarks.offline_plane import Errors
-
-    good = np.full(6, 1e-6)
-    nees = [1.0] * 95 + [100.0] * 5
-    assert offline.missed([Errors("perfect", "known", [good] * 100, nees)]) == []
-    far = [good] * 99 + [np.array([0.0, 0.0, 6e-5, 0.0, 0.0, 0.0])]
-    assert "largest error in z 0.0600 mm" in offline.missed([Errors("perfect", "known", far, nees)])[0]
-    assert offline.missed([Errors("printed, 0.05 mm", "known", far, nees)]) == []
-    assert "100 %" in offline.missed([Errors("perfect", "inferred", [good] * 100, [1.0] * 100)])[0]
-    assert "no result" in offline.missed([Errors("perfect", "known", refused=["why"])])[0]
-
-
+@pytest.mark.slow("5 s: a benchmark in small; plane and intrinsics have tests of their own")
 def test_everybody_calibrates_the_same_camera():
     """Errors of the mapping by their definition, and two other libraries near us on points of a known noise."""
     import msgspec

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
+@pytest.mark.slow("5 s: a benchmark in small; new references are tested with the monitor")
 def test_knocks_are_what_was_drawn_and_always_the_same():
     from benchmarks import knocks
 
@@ -33,6 +34,7 @@ def test_knocks_are_what_was_drawn_and_always_the_same():
     np.testing.assert_array_equal(again.simulator.render(4), drawn[7].simulator.render(4))
 
 
+@pytest.mark.slow("5 s: a benchmark in small; new references are tested with the monitor")
 def test_a_trial_ends_with_an_answer_that_is_held_against_the_truth():
     from benchmarks import recalibration
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +31,7 @@ def ring(tools_importable: None, rendered: Path) -> Path:
     return rendered
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_the_loop_is_measured_in_turns_and_nothing_that_was_stopped_stays_stopped(ring: Path):
     from benchmarks import record_loop
 
@@ -47,6 +46,7 @@ def test_the_loop_is_measured_in_turns_and_nothing_that_was_stopped_stays_stoppe
     assert measured["dropped"] == {"off": 0, "on": 0, "stalled": 0}
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(tools_importable: None, tmp_path: Path):
     from benchmarks import stalled_disk
 
@@ -65,6 +65,7 @@ def test_a_frozen_disk_keeps_every_writer_waiting_until_it_goes_on(tools_importa
     assert not os.path.ismount(directory)
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_bytes_by_policy(ring: Path):
     from benchmarks import record_bytes
 
@@ -78,6 +79,7 @@ def test_bytes_by_policy(ring: Path):
     assert every["bytes_per_frame"] > none["bytes_per_frame"] + 2_000 > 2_500
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     from benchmarks import record_hour
 
@@ -93,16 +95,7 @@ def test_an_hour_in_small_is_whole_and_of_one_piece(ring: Path, tmp_path: Path):
     assert not recording.faults
 
 
-def test_commands_that_are_not_there_have_no_row(
-    tools_importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-):
-    from benchmarks import record_hour
-
-    monkeypatch.setattr(record_hour, "COMMANDS", {"prophesy": ("--out", "future"), "schema": ("--no-such-option",)})
-    read = record_hour.read(tmp_path, record_hour.Plan(commands=("prophesy", "schema")))
-    assert list(read) == ["schema"] and read["schema"]["code"] == 2 and "no-such-option" in read["schema"]["said"]
-
-
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_kills_are_counted_and_what_they_cost(ring: Path):
     from benchmarks import record_killed
 
@@ -112,6 +105,7 @@ def test_kills_are_counted_and_what_they_cost(ring: Path):
     assert tried["loss_s"] == pytest.approx((tried["delivered"] - tried["in_file"]) / 60.0)
 
 
+@pytest.mark.slow("15 s: a benchmark in small; recordings have tests of their own")
 def test_memory_over_frames(ring: Path):
     from benchmarks import record_memory
 
@@ -135,89 +129,3 @@ def test_slopes_and_their_errors_are_right(tools_importable: None):
         found.append((slope["mib_per_hour"] - 0.7) / slope["sigma_mib_per_hour"])
     # Student's t with 8 degrees of freedom: its standard deviation is 1.15.
     assert abs(np.mean(found)) < 0.3 and 0.9 < np.std(found) < 1.45
-
-
-def results(**changes: Any) -> dict[str, Any]:
-    """All targets just reached, but for the changes."""
-
-    def times(median_us: float, p99_us: float) -> dict[str, float]:
-        return {"median": median_us, "p99": p99_us, "max": 9_000.0}
-
-    def row(published: tuple[float, float], loop: tuple[float, float]) -> dict[str, Any]:
-        return {"frames": 10, "published_us": times(*published), "loop_us": times(*loop)}
-
-    at = {"on": (1_099.0, 2_499.0), "stalled": (1_099.0, 2_499.0), "code": 0, "took_s": 59.0, "loss_s": 2.0}
-    at |= {"opened": True, "mib": 1.0} | changes
-    off = (1_000.0, 2_000.0)
-    done = {"took_s": at["took_s"], "cpu_s": 1.0, "code": at["code"], "said": "no such thing"}
-    slope = {"mib_per_hour": at["mib"], "sigma_mib_per_hour": 0.1}
-    tries = [{"loss_s": 0.3, "opened": True}, {"loss_s": at["loss_s"], "opened": at["opened"]}]
-    policy = {"frames": 600, "bytes_per_hour": 1e9, "bytes_per_frame": 5e3, "images_dropped": 0}
-    loop = {"how": "a stall", "dropped": {"off": 0, "on": 0, "stalled": 7}, "off": row(off, off)}
-    machine = {"packages": {}, "commit": "", "date": "", "cpu": "", "cpus": 2, "system": "", "load_before": 0.0}
-    return {
-        "machine": machine | {"load_after": 0.0, "python": ""},
-        "loop": {"a": loop | {"on": row(off, at["on"]), "stalled": row(at["stalled"], off)}},
-        "bytes": {"a": {"some": policy}},
-        "hour": {
-            "written": {"frames": 9, "images": 3, "alerts": 1, "files": 1, "bytes": 1e9, "written_s": 3.0},
-            "read": {"report": done, "export": done | {"took_s": 70.0}},
-        },
-        "killed": {"tries": tries, "span_s": (1.0, 6.0)},
-        "memory": {
-            "frames": 9, "hours": 1.0, "took_s": 2.0, "written": 9, "dropped": 0, "files": 5,
-            "looks": [{"hours": 1.0, "daemon_mib": 100.0, "process_mib": 200.0}],
-            "slopes": {"daemon_mib": slope, "process_mib": slope | {"mib_per_hour": 0.0}},
-        },
-    }  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("changes", "missed"),
-    [
-        ({}, []),
-        ({"on": (1_101.0, 2_499.0)}, ["whole loop, on: median"]),
-        ({"on": (1_099.0, 2_501.0)}, ["whole loop, on: 99 %"]),
-        ({"stalled": (1_101.0, 2_501.0)}, ["published, on, disk stalled: median", "published, on, disk stalled: 99 %"]),
-        ({"took_s": 60.0}, ["report of an hour"]),
-        ({"code": 3}, ["gripmon report of an hour is done", "gripmon export of an hour is done"]),
-        ({"loss_s": 2.01}, ["kill -9"]),
-        ({"opened": False}, ["opens"]),
-        ({"mib": 1.01}, ["daemon's side"]),
-        ({"on": (float("nan"), 2_499.0)}, ["whole loop, on: median"]),
-    ],
-)
-def test_what_is_not_reached_is_said(tools_importable: None, changes: dict[str, Any], missed: list[str]):
-    from benchmarks import record_report
-
-    made = results(**changes)
-    not_met = [what for what, _, met in record_report.verdicts(made) if not met]
-    assert len(not_met) == len(missed)
-    assert all(part in what for part, what in zip(missed, not_met, strict=True))
-    text = record_report.as_text(made)
-    assert text.count("NOT MET") == len(missed)
-    assert all(part in text for part in ("a stall", "50 GB last", "an hour of recording", "2 times", "MiB an hour"))
-
-
-def test_a_missed_target_ends_with_code_1(tools_importable: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    import argparse
-    import json
-
-    from benchmarks import record
-
-    commands = argparse.ArgumentParser().add_subparsers()
-    record.add_parser(commands)
-    arguments = commands.choices["record"].parse_args(["--quick", "--json", str(tmp_path / "all.json")])
-    for changes, code in (({}, 0), ({"loss_s": 2.1}, 1)):
-        monkeypatch.setattr(record, "measure", lambda plans, changes=changes: results(**changes))
-        assert record.run(arguments) == code
-        assert len(json.loads((tmp_path / "all.json").read_text())["killed"]["tries"]) == 2
-
-
-def test_quick_measures_everything_with_less(tools_importable: None):
-    from benchmarks import record
-
-    full, quick = record.full_plans(), record.quick_plans()
-    assert list(full) == list(quick) == [*record.PARTS, "memory"]
-    assert quick["killed"] == replace(full["killed"], tries=10)
-    assert quick["hour"].frames == full["hour"].frames == 216_000

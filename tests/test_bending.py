@@ -7,9 +7,9 @@ import pytest
 from support.plates import pose, true_uv
 from support.simulated import PAPER_LENS, STRONG_LENS
 
-from gripmon.calibrate.bending import FEWEST, bends
-from gripmon.calibrate.targets import Chequerboard
+from gripmon.calibrate.detection.bending import FEWEST, bends
 from gripmon.model.camera import FisheyeLens, LensSettings
+from gripmon.model.targets import Chequerboard
 
 BOARD = Chequerboard(9, 7, 0.01)
 FISHEYE = FisheyeLens(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from support.shown_edges import OPENING_M
 
 from gripmon.judge.causes import BlurWatch, FingerWatch, JawWatch, ResidualWatch
@@ -44,7 +45,7 @@ def test_edges_that_contradict_the_fit_otherwise_than_usually_are_worth_asking_a
     assert [watch.add(frame([0.2, 0.0, -0.2, 0.0, 0.0])) for _ in range(5)][-1]
 
 
-def test_jaws_that_are_seen_elsewhere_against_the_report_than_usually_are_worth_asking_about():
+def test_jaws_seen_elsewhere_than_usually_are_worth_asking_about():
     rng = np.random.default_rng(6)
     watch = JawWatch()
 
@@ -56,3 +57,22 @@ def test_jaws_that_are_seen_elsewhere_against_the_report_than_usually_are_worth_
     assert not any(watch.add(None, OPENING_M) for _ in range(20))
     assert not any(watch.add(reported_m(), OPENING_M + 2e-4) for _ in range(5))
     assert [watch.add(reported_m() - 3e-4, OPENING_M + 2e-4) for _ in range(5)] == [False, False, True, True, True]
+
+
+@pytest.mark.parametrize(
+    ("scatter_m", "off_m", "asks"),
+    [
+        (1e-4, 2.8e-4, False),
+        (1e-4, 3.2e-4, True),
+        (0.0, 4.8e-5, False),
+        (0.0, 5.2e-5, True),
+    ],
+)
+def test_jaws_are_elsewhere_from_three_standard_deviations_and_fifty_micrometres_on(
+    scatter_m: float, off_m: float, asks: bool
+):
+    watch = JawWatch()
+    for index in range(20):
+        watch.add(OPENING_M, OPENING_M + (scatter_m if index % 2 else -scatter_m))
+    usual_m = OPENING_M  # the middle of two values as far above as below
+    assert [watch.add(OPENING_M, usual_m + off_m) for _ in range(5)][-1] is asks

@@ -65,7 +65,7 @@ def test_iteration_ends_when_the_client_is_closed(publisher: Published, endpoint
     reader.start()
     put_until(publisher, frame_record(5), lambda: seqs)
     client.close()
-    reader.join(20.0)
+    reader.join(60.0)
     assert not reader.is_alive()
     assert set(seqs) <= {5}
 

@@ -145,7 +145,7 @@ class _Waiter:
     def wake(self) -> None: ...
 
 
-def test_who_waits_for_a_transform_is_told_when_its_age_is_known_or_that_takes_too_long():
+def test_who_waits_for_a_transform_hears_when_its_age_is_known():
     inbox, waiter = Inbox(), _Waiter()
     inbox.join(waiter)
     message = to_json(frame_record())

@@ -15,7 +15,7 @@ from support.remote_monitor import remote_monitor
 from gripmon.client import Policy, Unusable
 from gripmon.model.records import Verdict
 
-TEXT = (Path(__file__).resolve().parent.parent / "docs" / "client.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).resolve().parent.parent / "docs" / "howto" / "client.md").read_text(encoding="utf-8")
 EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 SERVO, REQUIRE, ITERATE, ASYNCIO, CALLBACK, FLEET = EXAMPLES
 

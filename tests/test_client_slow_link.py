@@ -90,7 +90,7 @@ def polled(client: TransformClient, seconds_s: float, policy: Policy | None = No
 
 
 def none_is_old(rows: list[Told]) -> None:
-    """The bound that docs/client.md states, and more: no usable reading claims to be younger than it is."""
+    """The bound that docs/howto/client.md states, and more: no usable reading claims to be younger than it is."""
     usable = [row for row in rows if row.reading.usable]
     assert max((row.true_age_s for row in usable), default=0.0) <= POLICY.max_age_s + BOUND_S
     assert max((row.true_age_s - row.reading.age_s for row in usable), default=0.0) < 0.5 * BOUND_S

@@ -270,7 +270,7 @@ def test_an_answer_says_when_what_was_done_can_not_be_kept():
     assert answer.text == "as you like; but state not kept: disk full" and not answer.durable
 
 
-def test_a_chain_that_can_not_be_kept_is_not_tried_again_and_one_that_is_counts_at_once():
+def test_a_chain_that_cannot_be_kept_is_not_tried_again():
     disk = Disk(full=True)
     keeper = StateKeeper(disk)
     known = MonitorState((reference_record(1),), alerts_raised=7)

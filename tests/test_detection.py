@@ -11,12 +11,13 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-from gripmon.calibrate.chequers import _Turns
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import ends_all_round
+from gripmon.calibrate.detection.chequers import _Turns
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import Chequerboard, parse_target
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import Chequerboard, parse_target
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,
@@ -210,3 +211,20 @@ def test_more_than_the_plate_has_is_told_where_the_plate_ends_all_round(target: 
     part = T.copy()
     part[0, 3] += 0.09
     assert isinstance(detect(render(LENS, part, plate, look), more), Sighting)
+
+
+@pytest.mark.parametrize(("part", "ends"), [(0.24, True), (0.36, False)])
+@pytest.mark.parametrize("squares", [False, True], ids=["discs", "squares"])
+def test_a_plate_ends_where_what_follows_differs_by_less_than_three_tenths_of_its_contrast(
+    squares: bool, part: float, ends: bool
+):
+    """Drawn by hand: dark on 200 grey levels, and beyond one side another ground by ``part`` of the contrast."""
+    grey, step, dark = np.full((400, 400), 200, np.uint8), 40, 60
+    cells = np.stack(np.meshgrid(np.arange(5), np.arange(5)), axis=-1).reshape(-1, 2)
+    for column, row in cells.tolist():
+        if not squares:
+            cv2.circle(grey, (100 + step * column, 100 + step * row), 9, dark, -1)
+        elif (column + row) % 2 == 0 and max(column, row) < 4:
+            grey[100 + step * row : 100 + step * (row + 1), 100 + step * column : 100 + step * (column + 1)] = dark
+    grey[: 92 if squares else 80] = round(200 - part * (200 - dark))
+    assert ends_all_round(grey, cells, 100.0 + step * cells, squares) is ends

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
+from gripmon.calibrate.bundle import centre_offsets_px
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.discs import centre_offsets_px
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import Charuco, CircleGrid, Target, name_of, parse_target
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, make_camera
 from gripmon.model.records import Array
+from gripmon.model.targets import Charuco, CircleGrid, Target, name_of, parse_target
 
 LENS = BrownConradyLens(
     width_px=640, height_px=480, fx_px=760.0, fy_px=761.0, cx_px=316.0, cy_px=244.0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.judge.drift.windows import LENGTHS, Windows
+from gripmon.judge.drift.statistics import LENGTHS, Windows
 
 
 def fed(series: np.ndarray) -> Windows:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gripmon.judge.drift.extremes import BLOCK_FRAMES, FEWEST_BLOCKS, KEPT_BLOCKS, Extremes
+from gripmon.judge.drift.statistics import BLOCK_FRAMES, FEWEST_BLOCKS, KEPT_BLOCKS, Extremes
 
 ALIKE_ONE = np.ones((1, 1))
 CHANCE = 1e-4
@@ -39,7 +39,7 @@ def test_of_exponential_tails_the_next_block_exceeds_the_limit_as_often_as_state
     assert exceeded == pytest.approx(chance, rel=0.2)
 
 
-def test_of_normal_errors_the_limit_is_on_the_safe_side_and_not_far_from_the_right_one():
+def test_for_normal_errors_the_limit_is_safe_and_close():
     rng, normal = np.random.default_rng(2), stats.chi2(6)
     limits = shown(largest(normal, rng, KEPT_BLOCKS, 200)).limits(CHANCE)[0]
     right = exact(normal, CHANCE)

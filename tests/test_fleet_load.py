@@ -10,6 +10,7 @@ import pytest
 pytestmark = pytest.mark.usefixtures("tools_importable")
 
 
+@pytest.mark.slow("20 s: the load of a whole fleet; one monitor and its readers are in the default run")
 def test_a_small_fleet():
     import importlib
 

@@ -14,8 +14,8 @@ from support.plates import Look
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.free_pose import FreePose, off_plate
 from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.plane_equations import FreePose, off_plate
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb

@@ -66,7 +66,7 @@ def test_on_a_full_disk_nothing_gets_into_force_and_no_revision_is_used_twice(tm
             wait_until(lambda: any("a restart would lose it" in text for text in alerts), "the alert", 60.0)
             in_force = witness.newest
             for command in ("reset", "accept"):
-                (said,) = session.get(f"{PREFIX}/cmd/{command}", timeout=10.0)
+                (said,) = session.get(f"{PREFIX}/cmd/{command}", timeout=60.0)
                 reply = from_json(said.ok.payload.to_bytes(), CommandReply)
                 assert not reply.done and reply.revision == in_force and "No space left" in reply.text
             (told,) = ask(session, f"{PREFIX}/cmd/state")

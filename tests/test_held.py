@@ -25,6 +25,11 @@ PERIOD_S = 0.05
 WHOLE, HIDDEN, AGAIN = 6, 26, 8  # frames in which all shows, in which something is hidden, and after that
 GATE = 22.46  # 99.9 % of chi-square with six degrees of freedom
 
+MEASUREMENTS = [
+    "edges",
+    pytest.param("corners", marks=pytest.mark.slow("2 s each; by edges, as it comes, is in the default run")),
+]
+
 Mask = Callable[[np.ndarray], None]
 
 
@@ -91,7 +96,7 @@ def honest(record: FrameRecord) -> bool:
 # --- too little to go on ---
 
 
-@pytest.mark.parametrize("measurement", ["edges", "corners"])
+@pytest.mark.parametrize("measurement", MEASUREMENTS)
 @pytest.mark.parametrize("mask", [two_edges, nothing])
 def test_too_few_edges_are_held_with_a_growing_covariance_then_unknown(mask: Mask, measurement: str):
     records = run(mask, measurement)
@@ -155,7 +160,7 @@ def test_with_one_finger_gone_the_estimate_goes_on_less_certain(measurement: str
 
 
 @pytest.mark.parametrize("mask", [roots, far_parts, tips])
-@pytest.mark.parametrize("measurement", ["edges", "corners"])
+@pytest.mark.parametrize("measurement", MEASUREMENTS)
 def test_whatever_shows_the_covariance_covers_the_error(mask: Mask, measurement: str):
     records = run(mask, measurement)
     assert all(honest(r) for r in records)

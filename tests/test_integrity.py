@@ -133,7 +133,7 @@ def test_refits_are_the_fits_of_the_rows_that_are_kept(unknowns: int):
         np.testing.assert_allclose(found.covariance[k], covariance, atol=1e-9)
 
 
-def test_the_covariance_of_a_refit_is_that_of_its_errors_where_weights_and_errors_differ():
+def test_a_refits_covariance_is_honest_where_weights_are_wrong():
     """Rows err four times as much as their weights say, which ``middle`` knows."""
     rng = np.random.default_rng(4)
     model = Model(rng)
@@ -270,7 +270,7 @@ def test_with_nothing_wrong_errors_exceed_the_bound_no_more_often_than_stated(ri
 
 
 @pytest.mark.parametrize("risk", [1e-3, 3e-4])
-def test_whatever_one_edge_shows_errors_exceed_the_bound_no_more_often_than_its_prior_allows(risk: float):
+def test_one_wrong_edge_exceeds_the_bound_as_seldom_as_its_prior_allows(risk: float):
     """Times its prior, its errors beyond the bound are within the risk, from a bias that hides in the noise to one that
     nobody can miss.
     """
@@ -341,7 +341,7 @@ def test_hypotheses_doubt_what_their_names_say():
     assert prior["the jaw opening is wrong"] == OPENING
 
 
-def test_hypotheses_say_which_doubt_the_opening_which_begin_suddenly_and_which_is_about_the_ends():
+def test_hypotheses_know_what_kind_they_are():
     found = of_two_fingers(has_opening=True)
     assert [found.name[k] for k in np.flatnonzero(found.opening)] == ["the jaw opening is wrong"]
     assert {found.name[k] for k in np.flatnonzero(found.sudden)} == {

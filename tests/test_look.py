@@ -98,7 +98,7 @@ def test_a_small_motion_is_no_contradiction():
     assert agreement.supports(RISK, 0) and not agreement.contradicts(RISK, 0)
 
 
-def test_a_pose_where_most_patches_agree_is_not_contradicted_by_a_slightly_better_one():
+def test_a_slightly_better_pose_contradicts_nothing():
     def agreement(here: int) -> LookAgreement:
         agree = np.array([[here], [32]])
         odds = 4.0 * agree - 21.0

@@ -240,7 +240,7 @@ def test_the_page_lists_what_there_is(server: tuple[MetricsServer, int]):
     tally.state(state)
     tally.alert(alert_record())
     tally.transform(frame_record())
-    page = (ROOT / "docs" / "metrics.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "howto" / "metrics.md").read_text(encoding="utf-8")
     found = {name for name in scraped(port) if name.startswith("gripmon_")}
     families = {re.sub(r"(?<=_seconds)_(bucket|sum|count)$", "", name) for name in found}
     assert set(re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)) == families

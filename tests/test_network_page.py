@@ -1,4 +1,4 @@
-"""docs/network_camera.md: what it tells a driver to send is understood."""
+"""docs/howto/network_camera.md: what it tells a driver to send is understood."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from gripmon.model.records import Frame, FrameNote, from_json
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS = ROOT / "configs"
-PAGE = (ROOT / "docs" / "network_camera.md").read_text()
+PAGE = (ROOT / "docs" / "howto" / "network_camera.md").read_text()
 
 
 def block(language: str) -> str:

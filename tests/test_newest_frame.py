@@ -96,7 +96,7 @@ def test_a_frame_wakes_the_waiting_consumer():
     consumer = threading.Thread(target=lambda: got.append(newest.read()))
     consumer.start()
     reader.put(frame_of(3))
-    consumer.join(5.0)
+    consumer.join(60.0)
     assert isinstance(got[0], Frame)
     newest.close()
 
@@ -107,7 +107,7 @@ def test_an_exception_in_the_reader_surfaces_after_its_last_frame():
     with reader.changed:
         reader.items += [frame_of(0), RuntimeError("driver broke")]
         reader.changed.notify_all()
-    newest._thread.join(5.0)
+    newest._thread.join(60.0)
     assert isinstance(newest.read(), Frame)
     for _ in range(2):
         with pytest.raises(RuntimeError, match="driver broke"):
@@ -124,7 +124,7 @@ def test_the_readers_end_comes_after_its_last_frame():
     with reader.changed:
         reader.items += [frame_of(0), None]
         reader.changed.notify_all()
-    newest._thread.join(5.0)
+    newest._thread.join(60.0)
     assert isinstance(newest.read(), Frame)
     assert newest.read() is None and newest.read() is None
     newest.close()
@@ -138,7 +138,7 @@ def test_close_ends_the_thread_and_wakes_the_consumer():
     consumer.start()
     newest.close()
     newest.close()
-    consumer.join(5.0)
+    consumer.join(60.0)
     assert got == [None]
     assert not newest._thread.is_alive()
     assert reader.closed_by == "gripmon-frames", "the capture is released by the thread that used it"
@@ -155,5 +155,5 @@ def test_close_does_not_wait_for_a_driver_that_hangs(caplog: pytest.LogCaptureFi
     newest.close()
     assert newest._thread.is_alive() and "left behind" in caplog.text
     hanging.set()
-    newest._thread.join(5.0)
+    newest._thread.join(60.0)
     assert not newest._thread.is_alive()

@@ -27,11 +27,11 @@ from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import Coincidence, GivenCamera
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.calibrate.targets import CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper, contents_of, load_gripper
 from gripmon.model.records import Image
+from gripmon.model.targets import CircleGrid, Target
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.background import _TILE_PX
 from gripmon.teach.onboarding import KnownGripper, UnknownGripper, measure_known, measure_outlines, outlines_of

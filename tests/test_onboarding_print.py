@@ -14,9 +14,9 @@ from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import Sighting
-from gripmon.calibrate.targets import Target
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
+from gripmon.model.targets import Target
 from gripmon.teach.onboarding import UnknownGripper
 from gripmon.teach.onboarding.plate_print import plate_print
 

@@ -115,7 +115,10 @@ def errors(known: bool, print_m: float) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 @pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("print_m", [0.0, 5e-5])
+@pytest.mark.parametrize(
+    "print_m",
+    [pytest.param(0.0, marks=pytest.mark.slow("9 s: sampled; with an uneven print it is in the default run")), 5e-5],
+)
 def test_errors_have_the_spread_that_the_covariance_states(known: bool, print_m: float):
     _, sizes, p_values = errors(known, print_m)
     # Mean and coverage of a chi-square with six degrees of freedom; limits that chance passes once in ten thousand.
@@ -134,6 +137,7 @@ def test_a_perfect_plate_gives_the_tcp_to_hundredths_of_a_millimetre(known: bool
     assert (worst < [2e-5, 2e-5, 5e-5]).all()
 
 
+@pytest.mark.slow("16 s: sampled; the spread for a known camera is in the default run")
 @pytest.mark.parametrize("known", [True, False])
 def test_an_uncertain_camera_counts(known: bool):
     """Cameras drawn from the stated covariance, the image made by the true one."""

@@ -87,6 +87,7 @@ def test_errors_of_the_print_dont_average_out():
     assert sigma[1] > 0.95 * sigma[0]
 
 
+@pytest.mark.slow("9 s: sampled; the mean's spread is in the default run")
 def test_one_print_in_images_from_different_places_isnt_taken_for_new_ones():
     """Whichever way its errors come into each image, the mean's stated spread holds them."""
     sizes, one = [], []
@@ -159,7 +160,7 @@ def test_tilt_gap_and_misfit_are_warned_of_in_words():
     assert any("right_inner_far" in w and "uncertainty x" in w for w in average([found], False).warnings)
 
 
-def test_an_inferred_gripper_that_is_no_rectangle_by_far_is_refused_and_one_that_hardly_is_warned_of():
+def test_an_inferred_gripper_that_is_no_rectangle_is_refused_or_warned_of():
     def bent(by_m: float) -> Trial:
         corners_m = CORNERS_M.copy()
         corners_m[3, 0] += by_m

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from support.policy_runs import (
     ACQUIRING,
@@ -16,6 +19,7 @@ from support.policy_runs import (
     OCCLUDED,
     RAISED,
     RECALIBRATING,
+    SETTINGS,
     SUSPECT,
     TRACKING,
     UNKNOWN,
@@ -25,6 +29,7 @@ from support.policy_runs import (
     Run,
     explained,
     seen,
+    settled,
     told,
 )
 
@@ -261,3 +266,28 @@ def test_alerts_in_the_tables_live_once(table: list[Row]):
                 alive.remove(alert.alert_id)
                 dead.add(alert.alert_id)
     assert {each.alert.alert_id for each in run.policy.alerts.open} == alive
+
+
+def test_standing_still_is_within_half_of_what_is_worth_a_warning():
+    """Of where the transform came to rest, not of the frame before."""
+    run = settled()
+    half_mm = 0.5e3 * SETTINGS.warn_m
+    for _ in range(3):
+        run.feed(seen(1.0))
+    for part, still in ((0.9, 4), (-0.9, 5), (1.1, 1), (1.1, 2)):
+        run.feed(seen(1.0 + part * half_mm))
+        assert run.policy.still_frames == still, part
+
+
+@pytest.mark.parametrize(
+    ("shift_mm", "turn_rad", "moved"),
+    [(0.29, 0.0, False), (0.31, 0.0, True), (0.0, 0.0029, False), (0.0, 0.0031, True)],
+)
+def test_a_camera_that_swings_has_moved_by_more_than_three_standard_deviations(
+    shift_mm: float, turn_rad: float, moved: bool
+):
+    """A swing of 0.1 mm and 1 mrad along one other axis: it is the way's length that counts."""
+    evidence = seen(shift_mm, turn_rad=turn_rad)
+    swing = np.array([0.0, 1e-8, 0.0, 1e-6, 0.0, 0.0])
+    assert evidence.moved and replace(evidence, swing=swing).moved is moved
+    assert not replace(seen(9.0, present=False), swing=swing).moved

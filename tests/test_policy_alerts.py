@@ -47,7 +47,7 @@ def test_severity_follows_the_limits_at_the_tcp(x_mm: float, turn_rad: float, se
     assert alert.since_ns == run.stamp_ns
 
 
-def test_a_drift_that_gets_worse_is_said_at_once_and_one_that_gets_better_after_a_while():
+def test_a_worse_drift_is_reported_at_once_a_better_one_later():
     run = settled()
     [raised] = run.feed(seen(0.05)).alerts
     [worse] = run.feed(seen(0.2)).alerts

@@ -30,7 +30,7 @@ from gripmon.model.records import AlertKind, Cause, Protection, Verdict
 K = AlertKind
 
 
-def test_a_transform_is_suspect_while_its_error_may_be_beyond_an_alert_limit_and_says_why():
+def test_a_transform_is_suspect_while_its_error_may_exceed_an_alert_limit():
     """At the limit it is valid still; the covariance has no say, nor whether the mount moved."""
     run = settled()
     limit_m, limit_rad = SETTINGS.alert_limit_m, SETTINGS.alert_limit_rad

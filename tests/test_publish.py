@@ -105,7 +105,7 @@ def test_the_last_transform_can_be_asked_for(publisher: Published, session: zeno
 
 
 def test_a_question_before_the_first_state_is_answered_in_words(session: zenoh.Session):
-    replies = list(session.get(f"{PREFIX}/state", timeout=5.0))
+    replies = list(session.get(f"{PREFIX}/state", timeout=20.0))
     assert [reply.err.payload.to_string() for reply in replies] == ["nothing published on this key yet"]
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from support.box_models import random_rotation
 from support.simulated import nominal_cam_T_grip
 
-from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, rivals, solutions
+from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, rivals, solutions
 
 FOCAL_PX = 962.0
 PLANE_GRIP_M = np.array(
@@ -174,7 +174,7 @@ def test_too_few_corners_or_corners_on_a_line_are_refused(points_grip_m: np.ndar
 
 
 @pytest.mark.parametrize("points_grip_m", SETS, ids=NAMES)
-def test_corners_that_are_all_seen_at_one_place_are_refused_or_say_how_bad_the_fit_is(points_grip_m: np.ndarray):
+def test_corners_all_at_one_place_are_refused_or_fit_badly(points_grip_m: np.ndarray):
     """Gross nonsense must never come out as a good pose."""
     xy = np.full((len(points_grip_m), 2), 0.05)
     try:
@@ -184,7 +184,7 @@ def test_corners_that_are_all_seen_at_one_place_are_refused_or_say_how_bad_the_f
     assert found.weighted_rms > 5.0 or found.cam_T_grip[2, 3] > 10.0
 
 
-def test_all_poses_that_a_plane_allows_are_found_best_first_and_in_front_of_the_camera():
+def test_all_poses_of_a_plane_are_found_best_first():
     """Against both minima that OpenCV's refinement reaches from the closed form."""
     rng = np.random.default_rng(7)
     twins = 0
@@ -225,3 +225,14 @@ def test_corners_behind_the_camera_give_no_pose_behind_it():
                 assert (points_grip_m @ pose.cam_T_grip[2, :3] + pose.cam_T_grip[2, 3] > 0.0).all()
             if points_grip_m is GENERAL_GRIP_M:
                 assert found[0].weighted_rms > 5.0, "and no solid looks like its own mirror image"
+
+
+@pytest.mark.parametrize(("best_rms", "freedom_scale"), [(0.5, 1.0), (2.0, 8.0)], ids=["a good fit", "a bad one"])
+def test_a_pose_is_a_rival_up_to_sixteen_more_squares(best_rms: float, freedom_scale: float):
+    """Twelve residuals of six corners, six degrees of freedom; where they are too large, so may the difference be."""
+    squares = 12 * best_rms**2
+    poses = [
+        Recalibration(np.eye(4), np.eye(6), float(np.sqrt((squares + more * freedom_scale) / 12)))
+        for more in (0.0, 15.5, 16.5)
+    ]
+    assert rivals(poses, 6) == poses[:2]

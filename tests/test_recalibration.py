@@ -131,12 +131,14 @@ def test_mean_corners_are_the_corners_of_one_gripper_at_the_mean_opening(opening
     assert (sigma_px > 0.01).all() and (sigma_px < 0.025).all()
 
 
-def test_a_corner_that_is_wrong_in_some_frames_does_not_pull_its_mean():
+@pytest.mark.parametrize("off_px", [0.4, 30.0])
+def test_a_corner_that_is_wrong_in_some_frames_does_not_pull_its_mean(off_px: float):
+    """By tens of pixels, and by just more than the five standard deviations of 0.05 px from which it is left out."""
     frames = Scene().frames(20)
     clean = mean_corners(frames, TRUE_T)
     for k in (2, 9, 10, 15):
         xy = frames[k].xy.copy()
-        xy[int(clean.corner[1])] += 30.0 / 962.0
+        xy[int(clean.corner[1])] += off_px / 962.0
         frames[k] = replace(frames[k], xy=xy)
     pulled = mean_corners(frames, TRUE_T)
     assert 962.0 * np.abs(pulled.xy - clean.xy).max() < 0.05
@@ -400,3 +402,14 @@ def test_a_finger_that_is_bent_by_a_tenth_of_a_millimetre_is_noticed(bend_m: tup
         chance = fingers_disagree(pool(Scene(bend_m=bend_m).frames(20, seed), TRUE_T))
         assert chance is not None and chance < UNLIKELY
     assert fingers_disagree(pool(Scene(fingers=("left",)).frames(20), TRUE_T)) is None
+
+
+@pytest.mark.parametrize(("chance", "refused_so"), [(0.03, False), (0.013, True)])
+def test_fingers_that_show_as_one_gripper_by_a_chance_of_two_per_cent_are_refused(
+    chance: float, refused_so: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """How that chance is found is tested above."""
+    monkeypatch.setattr("gripmon.judge.recalibrate.recalibrator.fingers_disagree", lambda pooled: chance)
+    answer = outcome(Scene().frames(24))
+    assert (isinstance(answer, Refusal) and answer.reason is RefusalReason.FINGERS) is refused_so
+    assert isinstance(answer, Proposal) is not refused_so

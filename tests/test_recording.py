@@ -325,7 +325,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
 
 def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
     script = (
-        "import sys; from pathlib import Path; from recorded import *; w = recorder(Path(sys.argv[1]));"
+        "import sys; from pathlib import Path; from support.recorded import *; w = recorder(Path(sys.argv[1]));"
         "w.offer(frame(0), record(0), lambda: trace(0)); w.close(10.0);"
         "assert w.frames_written == 1, w.failure; assert 'rerun' not in sys.modules"
     )

@@ -48,7 +48,7 @@ def no_child_left() -> Iterator[None]:
     before = set(psutil.Process().children())
     yield
     # One that has all it needs may write on for a while.
-    _, alive = psutil.wait_procs(set(psutil.Process().children()) - before, timeout=30.0)
+    _, alive = psutil.wait_procs(set(psutil.Process().children()) - before, timeout=120.0)
     assert not alive
 
 
@@ -79,7 +79,7 @@ def running_worker(writer: ProcessRecorder) -> int:
 
 def test_a_killed_daemon_leaves_a_complete_file(tmp_path: Path) -> None:
     script = (
-        "import os, signal, sys, time; from pathlib import Path; from recorded import *;"
+        "import os, signal, sys, time; from pathlib import Path; from support.recorded import *;"
         "w = recorder(Path(sys.argv[1]), flush_period_s=0.5); wait_until(lambda: w.path is not None);"
         "[w.offer(frame(i), record(i), lambda i=i: trace(i)) for i in range(50)];"
         "print(w.process_id, flush=True); time.sleep(1.0); w.offer(frame(50), record(50), lambda: None);"
@@ -126,7 +126,7 @@ def test_frames_that_a_killed_process_took_with_it_are_counted(tmp_path: Path) -
     writer = recorder(tmp_path, flush_period_s=10.0)
     worker = running_worker(writer)
     offer(writer, 0, 20)
-    time.sleep(0.5)  # handed over, not flushed
+    wait_until(lambda: writer._worker is not None and writer._worker.frames_sent == 20)  # handed over, not flushed
     os.kill(worker, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
     assert writer.dropped == 20
@@ -332,3 +332,11 @@ def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytes
     writer.close(10.0)
     assert writer.dropped == 35 and "no truth here" in str(writer.failure)
     assert "gripmon-images" not in Path("/proc/self/maps").read_text()
+
+
+def test_the_recording_process_finds_the_package_where_the_daemon_has_it_from() -> None:
+    """A checkout that isn't installed: neither the working directory nor the rooms themselves are searched."""
+    import gripmon
+    from gripmon.record.write import process
+
+    assert Path(process._HOME) == Path(gripmon.__file__).resolve().parents[1]

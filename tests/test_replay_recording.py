@@ -19,12 +19,13 @@ from support import recorded
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.cli import main
-from gripmon.cli.recorded_run import RecordedRun, as_recorded_before_bounds
+from gripmon.cli.recorded_run import RecordedRun
 from gripmon.cli.replay import _recorder
 from gripmon.cli.replay_differences import Differences
 from gripmon.cli.replaying import replay
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.recorded_run import as_recorded_before_bounds
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
@@ -150,6 +151,7 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
     assert 0 < len(last) < len(then), "each file brings what it takes"
 
 
+@pytest.mark.slow("4 s: what is shown of a replay; that it decides the same is in the default run")
 def test_a_thinned_recording_says_what_is_missing(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = sequence_config(sequence, "{image_rate_hz: 2.0, around_alert_s: 0.0, min_free_bytes: 0}", "thin.yaml")
     recording = tmp_path / "thin.rrd"
@@ -220,6 +222,7 @@ def contents(path: Path, entity: str, component: str) -> dict[int, Any]:
     return values
 
 
+@pytest.mark.slow("4 s: what is shown of a replay; that it decides the same is in the default run")
 def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Drifts, limits, states and the log of both; what is replayed is a recording of its own, to be replayed again."""
     then, both = tmp_path / "then.rrd", tmp_path / "both.rrd"
@@ -299,7 +302,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         ([tmp_path / "other.rrd"], 3, "is a recording of the application 'somebody_else'"),
         ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
         ([tmp_path / "nothing.rrd"], 3, "is empty"),
-        ([tmp_path / "none.rrd"], 2, "there is no recording; an .rrd file"),
+        ([tmp_path / "none.rrd"], 2, "there is no such file; recordings of gripmon run"),
         ([tmp_path / "old-0001.rrd", sequence], 2, "is no .rrd file; one input, or several .rrd files of one run"),
         ([tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
         ([tmp_path / "old-0001.rrd", tmp_path / "empty"], 2, "empty: no recordings and no images in it"),

@@ -108,7 +108,7 @@ def test_two_steps_of_one_alert_are_two_events():
     assert second.moved.size_m == pytest.approx(4e-3, abs=5e-6)
 
 
-def test_a_new_reference_ends_what_the_old_one_was_off_by_but_not_what_the_calibration_is():
+def test_a_new_reference_ends_the_old_ones_offset_not_the_calibrations():
     run = stepped()
     renewed = msgspec.structs.replace(
         REFERENCE,

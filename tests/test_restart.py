@@ -315,6 +315,7 @@ def test_a_changed_calibration_and_a_fresh_start_begin_anew_with_the_next_revisi
     ]
 
 
+@pytest.mark.slow("13 s: refusals of the state file are tested without a daemon")
 def test_another_robots_state_and_a_file_in_use_are_refused_in_one_line(cell: Cell):
     keep(cell.config, 2e-5)
     before = cell.kept.read_bytes()
@@ -377,6 +378,7 @@ def test_a_name_that_can_not_be_is_wrong_usage(cell: Cell, robot: str):
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "can't be part of a Zenoh key" in done.stderr
 
 
+@pytest.mark.slow("5 s: two commands that have no business there; what a restart keeps is in the default run")
 def test_replay_and_check_leave_the_state_alone(cell: Cell, pictures: Path, tmp_path: Path):
     keep(cell.config, 2e-5)
     before = {path.name: path.read_bytes() for path in cell.folder.glob("kept*")}

@@ -65,7 +65,7 @@ SIGMA = np.array([1e-3, 1e-3, 3e-3, 4e-3, 4e-3, 1e-3])
 
 
 def test_errors_are_what_the_covariance_says_and_smaller_than_the_closed_form_s():
-    sizes, closed, refined = [], [], []
+    sizes, closed, refined, left_out = [], [], [], 0
     covariance = np.tile(np.diag(np.square(SIGMA)), (12, 1, 1))
     for seed in range(60):
         cam_T_base, _, base_T_ee, exact = poses(seed)
@@ -76,6 +76,8 @@ def test_errors_are_what_the_covariance_says_and_smaller_than_the_closed_form_s(
         sizes.append(error @ np.linalg.solve(found.covariance[:6, :6], error) / 6.0)
         closed.append(perturbation_between(start[0], cam_T_base))
         refined.append(error)
+        left_out += not found.used.all()
+    assert left_out <= 8, "one set in twenty, where none is wrong"
     assert 0.75 < np.mean(sizes) < 1.4
     assert np.sqrt(np.mean(np.square(refined))) < 0.8 * np.sqrt(np.mean(np.square(closed)))
 

@@ -8,21 +8,22 @@ from dataclasses import replace
 import cv2
 import msgspec
 import numpy as np
+import pytest
 import yaml
 from support.plates import pose, render
 from test_robot_world import columns, transform
 
 from gripmon.calibrate.detection import detect
+from gripmon.calibrate.detection.boards import upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
-from gripmon.calibrate.targets import parse_target
-from gripmon.calibrate.upright import upright
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.model.camera import BrownConradyLens
 from gripmon.model.geometry import invert
 from gripmon.model.provenance import provenance_of
+from gripmon.model.targets import parse_target
 
 LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)
 TARGET = "charuco:8x6:0.03:0.022:DICT_4X4_250"
@@ -97,3 +98,17 @@ def test_a_chequerboard_is_turned_by_its_colours():
     part = replace(sighting, uv_px=sighting.uv_px[1:], plate_m=sighting.plate_m[1:])
     assert isinstance(upright(image, part, target), NotFound)
     assert isinstance(upright(np.full_like(image, 90), sighting, target), NotFound)
+
+
+@pytest.mark.parametrize(("contrast_dn", "tells"), [(44, True), (36, False)])
+def test_colours_tell_from_a_fifth_of_the_grey_levels_range_on(contrast_dn: int, tells: bool):
+    """Of 12 squares 10 are dark or light, one is black and one white, so that they span 200 grey levels."""
+    target, step = parse_target("chequerboard:5x4:0.02"), 40
+    cells = np.stack(np.meshgrid(np.arange(5), np.arange(4)), axis=-1).reshape(-1, 2)
+    image = np.full((240, 280), 100, np.uint8)
+    for column, row in np.argwhere(np.indices((4, 3)).sum(axis=0) % 2 == 1).tolist():
+        image[60 + step * row : 60 + step * (row + 1), 60 + step * column : 60 + step * (column + 1)] += contrast_dn
+    image[60:100, 60:100], image[60:100, 100:140] = 20, 220
+    plate_m = np.column_stack([0.02 * cells, np.zeros(20)])
+    at = Sighting(60.0 + step * cells, plate_m, np.tile(np.eye(2), (20, 1, 1)), np.arange(20), (280, 240))
+    assert isinstance(upright(image, at, target), Sighting) is tells

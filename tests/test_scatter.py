@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from support.drift_noise import COVARIANCE, autocorrelated, claimed
 
-from gripmon.judge.drift.scatter import PRIOR_SHARE, PRIOR_WINDOWS, Scatter
-from gripmon.judge.drift.windows import LENGTHS, Windows
+from gripmon.judge.drift.statistics import LENGTHS, PRIOR_SHARE, PRIOR_WINDOWS, Scatter, Windows
 
 FRAMES, STREAMS = 12_000, 24
 NO_MORE = np.ones((len(LENGTHS), STREAMS))

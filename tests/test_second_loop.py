@@ -262,7 +262,7 @@ def test_whatever_a_stranger_sends_is_refused_in_one_line():
 
 
 def test_the_pulse_on_the_page_is_one():
-    page = (Path(__file__).parent.parent / "docs" / "laser.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parent.parent / "docs" / "howto" / "laser.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
     told = of_message(from_json(block.encode(), LaserPulse))
     assert told.until_ns - told.stamp_ns == 250_000_000

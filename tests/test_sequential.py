@@ -41,14 +41,38 @@ def test_an_unmoved_camera_is_said_to_move_no_more_often_than_stated(noise: str,
     assert alarms[-500:].sum() <= 64 * 500 / 864
 
 
+def noticed_within(test: SequentialTest, noise: np.ndarray, deviations: float) -> np.ndarray:
+    """(s,) frames until each stream notices a step in ``noise`` (n, s, 6); the size in standard deviations."""
+    direction = np.linalg.cholesky(COVARIANCE) @ np.full(6, 1.0 / np.sqrt(6.0))
+    moved = np.array([finding.moved for finding in feed(test, noise + deviations * direction)])
+    return np.where(moved.any(axis=0), 1 + moved.argmax(axis=0), np.iinfo(int).max)
+
+
 @pytest.mark.parametrize("noise", NOISES)
-def test_at_a_rate_that_cells_want_there_is_none_in_hours(noise: str):
-    """One alarm a day: 256,000 frames at 60 frames/s are 71 minutes."""
-    shifts = NOISES[noise](np.random.default_rng(2), 1000, 256)
-    assert not onsets(SequentialTest(DriftSettings(), 256), shifts).any()
+def test_at_a_rate_that_cells_want_there_is_none_in_an_hour_and_steps_are_noticed(noise: str):
+    """One alarm a day: 256,000 frames at 60 frames/s are 71 minutes.  A test that never speaks would pass that."""
+    rng, test = np.random.default_rng(2), SequentialTest(DriftSettings(), 256)
+    assert not onsets(test, NOISES[noise](rng, 1000, 256)).any()
+    assert noticed_within(test, white(rng, 30, 256), 60.0).max() <= 10
 
 
-def test_what_may_be_tolerated_is_no_drift_and_errors_that_belong_together_make_none_of_it():
+@pytest.mark.slow("40 s; the same contract at a rate of alarms that can be counted is in the default run")
+def test_with_learnt_limits_there_is_none_in_hours_and_steps_are_noticed():
+    """One alarm a day, 64 streams.  When all windows are full and limits are learnt there follow three and a half
+    hours, in which twenty times the rate would be noticed with a chance of 95 %.
+    """
+    rng, test = np.random.default_rng(36), SequentialTest(DriftSettings(), 64)
+
+    def noise(frames: int) -> np.ndarray:
+        return np.concatenate([kind(rng, frames, 32) for kind in (white, autocorrelated)], axis=1)
+
+    for _ in range(LEARNT_FRAMES // 3000):
+        feed(test, noise(3000))
+    assert not any(onsets(test, noise(3000)).any() for _ in range(4))
+    assert noticed_within(test, noise(30), 60.0).max() <= 10
+
+
+def test_what_is_tolerated_is_no_drift_though_errors_are_correlated():
     """An offset up to the tolerance, in any direction, on top of noise."""
     settings = DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0, tolerated_m=2e-5, tolerated_rad=1e-3)
     rng = np.random.default_rng(3)
@@ -118,6 +142,7 @@ def test_learnt_limits_keep_the_contract_where_alarms_can_be_counted():
         assert 0 < of_noise.sum() <= 16 * 5000 / 864
 
 
+@pytest.mark.slow("8 s: how much is gained; that the contract is kept is in the default run")
 def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_one():
     """The same step in the same streams: excess after it, before and after enough of the noise has been seen."""
     rng, test, excess = np.random.default_rng(32), SequentialTest(PLAIN, 16), {}
@@ -135,6 +160,7 @@ def test_a_calm_stream_is_watched_more_closely_than_before_and_than_a_bursting_o
     assert excess["calm", LEARNT_FRAMES] > 1.5 * excess["bursting", LEARNT_FRAMES]
 
 
+@pytest.mark.slow("4 s: a finer point of learning; that the contract is kept is in the default run")
 def test_a_motion_is_no_noise_to_learn_limits_from():
     """Two streams with the same noise, of which one has made a step of a thousand standard deviations.
 

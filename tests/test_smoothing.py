@@ -187,7 +187,15 @@ def rms(values):
     return np.sqrt(np.mean(np.square(values), axis=0))
 
 
-@pytest.mark.parametrize(("frames", "share"), [(1.0, 0.0), (5.0, 0.5), (40.0, 0.7), (1e6, 0.9)])
+@pytest.mark.parametrize(
+    ("frames", "share"),
+    [
+        (1.0, 0.0),
+        pytest.param(5.0, 0.5, marks=pytest.mark.slow("3 s: between its neighbours")),
+        pytest.param(40.0, 0.7, marks=pytest.mark.slow("3 s: between its neighbours")),
+        (1e6, 0.9),
+    ],
+)
 def test_the_claimed_covariance_is_honest_for_errors_that_last(frames: float, share: float):
     """From white noise to a background that never moves: mean normalised error of some independent streams."""
     covariance, nees, better = spread(), [], []

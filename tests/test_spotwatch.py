@@ -151,7 +151,7 @@ def test_an_alert_is_raised_updated_acknowledged_and_cleared(known):
     assert after[-1].motion is None and after[-1].probability_moved < 0.5
 
 
-def test_an_open_alert_says_how_the_camera_moved_as_soon_as_that_is_known_much_better(known):
+def test_an_open_alert_is_updated_when_the_motion_is_known_better(known):
     """The first pulses hardly tell it; whoever reads the alert alone must not be left with what they said."""
     rng = np.random.default_rng(12)
     moved = true_world().moved(np.radians(0.7) * AXES[3])

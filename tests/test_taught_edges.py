@@ -10,9 +10,8 @@ from support.taught_scenes import CAMERA, OPENING_M, arrays, bevelled, image_of,
 
 from gripmon.model.geometry import invert
 from gripmon.simulate.solids import finger_solids
+from gripmon.teach.edges.estimate import pool, slopes
 from gripmon.teach.edges.lines import EdgePoints, find_line, settle_line
-from gripmon.teach.edges.pooling import pool
-from gripmon.teach.edges.shape import slopes
 from gripmon.track.edges.prediction import Prediction, SamplingSettings, lay_out, predict
 from gripmon.track.edges.profiles import profile_offsets_px
 from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
@@ -95,7 +94,7 @@ def test_an_offset_in_metres_grows_in_the_image_as_the_gripper_comes_nearer():
     assert shifts[1] / shifts[0] == pytest.approx(depth_m / (depth_m - 0.04), rel=0.03)
 
 
-def test_creases_are_used_where_they_were_taught_and_edges_are_shifted_while_they_show_as_taught():
+def test_taught_creases_and_shifts_are_used_while_they_show_as_taught():
     crease, outline = "L_in_near_along", "R_tip_in"
     edges = {crease: taught_edge(crease=True), outline: taught_edge()}
     otherwise = {crease: taught_edge(), outline: taught_edge(crease=True)}

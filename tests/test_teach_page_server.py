@@ -16,22 +16,18 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.simulated import PAPER_LENS
 from support.taught_by_hand import Rig, make_rig
 
-from gripmon.calibrate.plane import GivenCamera
-from gripmon.cli.plane_inputs import _read_rough
+from gripmon.daemon.calibrations import read_rough_corners
 from gripmon.io.sources import Waiting
 from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.edges.bench import Bench, Found
-from gripmon.teach.onboarding import UnknownGripper
 from gripmon.teach.page import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
 from gripmon.teach.page.desk import BadRequest, Labels
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
 DEADLINE_S = 30.0
-INFER = UnknownGripper(GivenCamera(PAPER_LENS))
 
 
 class Told:
@@ -346,12 +342,12 @@ def test_without_a_gripper_rough_corners_are_written_as_infer_reads_them(tmp_pat
             status, answer = save(corners, replace=True)
             assert status == 200 and why in str(answer["refused"]) and not path.exists()
         assert save(put)[1]["next"] == "the next command"
-        assert {n: list(at) for n, at in _read_rough(path, INFER).items()} == put
+        assert {n: list(at) for n, at in read_rough_corners(path, None).items()} == put
         before = path.read_bytes()
         moved = put | {"left_inner_far": [7.0, 8.0]}
         assert save(moved)[1]["exists"] == [str(path)] and path.read_bytes() == before
         assert save(moved, replace=True)[1]["written"] == {str(path): "rough corners"}
-        assert _read_rough(path, INFER)["left_inner_far"] == (7.0, 8.0)
+        assert read_rough_corners(path, None)["left_inner_far"] == (7.0, 8.0)
         assert list(tmp_path.iterdir()) == [path]
     finally:
         server.close()

@@ -243,7 +243,7 @@ def test_a_knock_across_lined_fingers_before_a_background_like_them_misleads_in_
 # --- references ---
 
 
-def test_no_reference_is_taken_while_the_ends_are_hidden_and_one_is_when_they_are_seen():
+def test_no_reference_is_taken_while_the_ends_are_hidden():
     """Past the limit, and standing still for long enough, but for the proof."""
     policy = PolicySettings(settle_frames=4, limit_m=5e-4)
     settings = MonitorSettings(policy=policy, recalibration=RecalibrationSettings(frames=4, sure_sigma_m=1e-4))
@@ -383,7 +383,7 @@ def test_a_knock_has_to_prove_itself_strictly(monkeypatch: pytest.MonkeyPatch):
     assert not knock_followed(monkeypatch)
 
 
-def test_where_the_first_frames_differ_from_the_reference_is_in_the_bound_until_a_person_says_otherwise():
+def test_what_first_frames_differ_by_is_in_the_bound_until_accepted():
     """Knocked before it was started, marks taken for the fingers' ends, or a wrong model: an image doesn't tell."""
     frames, truths = frames_of(scene(20))
     away = np.array([0.0, 0.0, 2e-3, 0.0, 0.0, 0.0])

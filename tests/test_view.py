@@ -90,7 +90,9 @@ def monitor_config(folder: Path, port: int, web_port: int, recording: str) -> Pa
     return path
 
 
-@pytest.mark.parametrize("enabled", [True, False])
+@pytest.mark.parametrize(
+    "enabled", [True, pytest.param(False, marks=pytest.mark.slow("8 s: with files beside it is in the default run"))]
+)
 def test_another_process_sees_what_a_monitor_does(tmp_path: Path, enabled: bool):
     """With and without files beside it."""
     view = ViewSettings(port=free_port(), web_port=free_port())
@@ -118,6 +120,7 @@ def test_another_process_sees_what_a_monitor_does(tmp_path: Path, enabled: bool)
         assert set().union(*map(seqs_of, files)) == judged, "the viewer's end was none of the file's"
 
 
+@pytest.mark.slow("5 s: a stalled recording process costs nothing either, in test_recording_faults")
 def test_a_viewer_that_stands_still_costs_no_frames(tmp_path: Path):
     view = ViewSettings(port=free_port(), web_port=free_port(), memory_limit_bytes=10_000_000)
     settings = recorded.settings(image_format="png", image_every=1, around_alert_s=0.0, queue_images=64)
@@ -178,6 +181,7 @@ def refused(*arguments: str) -> str:
     return line
 
 
+@pytest.mark.slow("7 s: words of the viewer's errors; that it shows is in the default run")
 def test_what_cannot_be_shown_is_said_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -187,8 +191,8 @@ def test_what_cannot_be_shown_is_said_in_one_line(
     (tmp_path / "text.rrd").write_text("no recording")
     (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
     for arguments, code, said in (
-        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no recording; an .rrd file"),
-        (("empty",), 2, f"{tmp_path}/empty: there is no recording; an .rrd file"),
+        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run"),
+        (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run"),
         (("text.rrd",), 2, f"{tmp_path}/text.rrd: is no recording; an .rrd file of gripmon's"),
         (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
     ):

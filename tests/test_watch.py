@@ -91,7 +91,7 @@ def test_the_rate_is_that_of_the_last_frames():
     assert watch.frames_per_s(30.1) == pytest.approx(10.0)
 
 
-def test_drift_certainty_and_protection_are_those_of_the_last_transform_while_it_counts():
+def test_drift_and_protection_are_the_last_transforms_while_it_counts():
     watch = Watch(SETTINGS, now_s=0.0)
     assert (watch.tcp_shift_m, watch.sigma_m) == (None, None)
     covariance = np.diag([1e-10, 4e-10, 2.5e-9, 1.0, 1.0, 1.0]).ravel().tolist()

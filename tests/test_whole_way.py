@@ -90,6 +90,7 @@ def gripmon(words: str) -> int:
     return main(words.split())
 
 
+@pytest.mark.slow("17 s: each calibration has tests of its own; from teaching to a knock is in the default run")
 def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, calibrated: Path):
     camera = to_settings(read_yaml(calibrated / "camera.yaml"), CameraCalibration)
     lens = new_user.PAPER_LENS

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
 
 import msgspec
 import pytest
 import zenoh
-from support import wire_page
 from support.loopback import (
     alert_record,
     frame_record,
@@ -25,12 +26,20 @@ from support.sample_messages import FOLDER, SAMPLES, kept, payload
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import MESSAGES, FrameRecord, from_json, schema_name
 
-PAGE = wire_page.PAGE.read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parent.parent / "docs" / "reference" / "wire.md").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def tables(tools_importable: None) -> ModuleType:
+    """What fills the marks of the page with tables when the site is built."""
+    from pages import messages
+
+    return messages
 
 
 @pytest.mark.parametrize("name", SAMPLES)
 def test_the_code_still_writes_these_bytes(name: str):
-    assert payload(name) == kept(name), "the wire has changed; is it meant? then run tests/sample_messages.py"
+    assert payload(name) == kept(name), "the wire has changed; if meant: python -m support.sample_messages, in tests/"
 
 
 def test_the_folder_holds_these_samples_and_nothing_else():
@@ -81,14 +90,11 @@ def test_a_plain_reader_gets_what_was_meant():
 # --- the page ---
 
 
-def test_the_tables_are_those_of_the_code():
-    assert wire_page.put_into(PAGE) == PAGE, "run tests/wire_page.py"
-
-
-def test_the_page_names_every_field_and_every_word():
+def test_the_page_names_every_field_and_every_word(tables: ModuleType):
     """Read as a person reads it: the rows of each table, the words of each enumeration."""
-    fields, words = wire_page.fields_in(PAGE), wire_page.words_in(PAGE)
-    for name, node in wire_page.definitions().items():
+    page = tables.put_into(PAGE)
+    fields, words = tables.fields_in(page), tables.words_in(page)
+    for name, node in tables.definitions().items():
         if "properties" in node:
             assert fields[name] == list(node["properties"]), name
         else:
@@ -96,9 +102,9 @@ def test_the_page_names_every_field_and_every_word():
             assert words[name] == enum, name
 
 
-def test_the_page_says_which_enumerations_are_open():
-    said = {name: how for how, name in re.findall(r"\((open|closed)\)[^\n]*\n\n<!-- (\w+) -->", PAGE)}
-    for name, node in wire_page.definitions().items():
+def test_the_page_says_which_enumerations_are_open(tables: ModuleType):
+    said = {name: how for how, name in re.findall(r"\((open|closed)\)[^\n]*\n\n<!-- table: (\w+) -->", PAGE)}
+    for name, node in tables.definitions().items():
         if "properties" not in node and name != "CommandName":
             assert said[name] == ("open" if "anyOf" in node else "closed"), name
 
@@ -107,18 +113,18 @@ def test_every_sample_is_mentioned_and_every_mentioned_one_exists():
     assert set(re.findall(r"`(\w+)\.json`", PAGE)) == set(SAMPLES)
 
 
-def test_every_fault_of_a_command_is_explained():
+def test_every_fault_of_a_command_is_explained(tables: ModuleType):
     table = PAGE[PAGE.index("| fault | means |") :]
-    faults = wire_page.definitions()["CommandFault"]["anyOf"][0]["enum"]
+    faults = tables.definitions()["CommandFault"]["anyOf"][0]["enum"]
     assert sorted(re.findall(r"`(\w+)`", "\n".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))) == sorted(
         faults
     )
 
 
-def test_every_command_is_explained():
+def test_every_command_is_explained(tables: ModuleType):
     table = PAGE[PAGE.index("| name | argument | does |") : PAGE.index("A key with a wildcard")]
     named = re.findall(r"`(\w+)`", "\n".join(re.findall(r"^\| (`.*?) \|", table, re.MULTILINE)))
-    assert sorted(named) == sorted(wire_page.definitions()["CommandName"]["enum"])
+    assert sorted(named) == sorted(tables.definitions()["CommandName"]["enum"])
 
 
 PRIORITIES = {"real time": 1, "interactive high": 2, "data high": 4}

@@ -1,8 +1,7 @@
 """Camera and plate poses together, from all points of all views: weighted, robust least squares on the manifold.
 
-Levenberg-Marquardt (Marquardt, 1963) in the parameters of the lens and, for each view, a perturbation of its pose; the
-Jacobian is analytic.  Wrong points are found by their size against the rest (Tukey's biweight on a robust scale) and
-then left out.
+The unknowns are the parameters of the lens and, for each view, a perturbation of its pose; the Jacobian is analytic.
+Wrong points are found by their size against the rest (Tukey's biweight on a robust scale) and then left out.
 """
 
 from __future__ import annotations
@@ -13,17 +12,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.discs import centre_offsets_px
 from gripmon.calibrate.lens_models import LensModel
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.model.geometry import perturb
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import perturb, skew
+from gripmon.model.least_squares import (
+    TUKEY,
+    Equations,
+    covariance_of,
+    minimise,
+    normal_equations,
+    robust_scale,
+    tukey_weights,
+    whitening,
+)
 from gripmon.model.records import Array
 
 LARGEST_ITERATIONS = 200
-CONVERGED = 1e-10
-"""Relative decrease of the cost at which iterations end."""
-BIWEIGHT = 4.685
-"""Tukey's constant: 95 % efficiency for normal errors."""
 OUTLIER = 5.0
 """Normalised residual, in robust standard deviations, beyond which a point is left out at the end."""
 STRANGE = 0.5
@@ -31,6 +36,10 @@ STRANGE = 0.5
 PARALLEL = float(np.cos(np.radians(3.0)))
 ROUNDS = 12
 """Rounds of weights, and of the offsets of discs' centres, at most."""
+
+
+_State = tuple[Array, list[Array]]
+"""Parameters of the lens, and the views' poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +74,7 @@ class BundleProblem:
 
     def __init__(self, model: LensModel, sightings: Sequence[Sighting], free: Array):
         self._model, self._sightings, self._free = model, sightings, free
-        self._whiten: list[Array] = [_whitening(s.covariance_px) for s in sightings]
+        self._whiten: list[Array] = [whitening(s.covariance_px) for s in sightings]
         self._offsets: list[Array] = [np.zeros(s.uv_px.shape) for s in sightings]
 
     def solve(self, parameters: Array, cam_T_plate: Sequence[Array]) -> Bundle:
@@ -77,8 +86,8 @@ class BundleProblem:
             before = parameters
             parameters, poses = self._minimise(parameters, poses, weights)
             sizes = self._sizes(parameters, poses)
-            scale = _robust_scale(np.concatenate(sizes))
-            weights = [_biweight(size, scale) for size in sizes]
+            scale = max(robust_scale(np.concatenate(sizes), 2), 1e-9)
+            weights = [tukey_weights(size, TUKEY * scale) for size in sizes]
             if turn > 0 and np.allclose(parameters, before, rtol=1e-9, atol=1e-12):
                 break
         used = [size <= OUTLIER * scale for size in sizes]
@@ -113,8 +122,8 @@ class BundleProblem:
         sizes = self._sizes(parameters, poses)
         return float(sum((w * np.square(np.where(w > 0.0, s, 0.0))).sum() for s, w in zip(sizes, weights, strict=True)))
 
-    def _normal(self, parameters: Array, poses: Sequence[Array], weights: Sequence[Array]) -> tuple[Array, Array]:
-        """Normal matrix and right-hand side: p free parameters, then 6 for each view."""
+    def _equations(self, parameters: Array, poses: Sequence[Array], weights: Sequence[Array]) -> Equations:
+        """Assembled view by view: p free parameters, then 6 for each view."""
         p = self._free.shape[1]
         n = p + 6 * len(poses)
         normal, side = np.zeros((n, n)), np.zeros(n)
@@ -125,44 +134,34 @@ class BundleProblem:
             uv_px, by_parameters, by_point = self._model.project(parameters, turned + T[:3, 3])
             residual = sighting.uv_px - self._offsets[k] - uv_px
             # x' = x + rho + omega x (R x_plate): position, then rotation, camera axes.
-            by_pose = np.concatenate([by_point, -by_point @ _skews(turned)], axis=2)
+            by_pose = np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
             rows = whiten @ np.concatenate([by_parameters @ self._free, by_pose], axis=2)
             values = np.einsum("nij,nj->ni", whiten, residual)
             good = (weight > 0.0) & np.isfinite(values).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
-            root = np.sqrt(weight[good])
-            a = (rows[good] * root[:, None, None]).reshape(-1, p + 6)
-            b = (values[good] * root[:, None]).ravel()
             own = np.concatenate([np.arange(p), p + 6 * k + np.arange(6)])
-            normal[np.ix_(own, own)] += a.T @ a
-            side[own] += a.T @ b
+            view = normal_equations(rows[good], values[good], weight[good])
+            normal[np.ix_(own, own)] += view[0]
+            side[own] += view[1]
         return normal, side
 
     def _minimise(self, parameters: Array, poses: list[Array], weights: Sequence[Array]) -> tuple[Array, list[Array]]:
-        damping, cost = 1e-4, self._cost(parameters, poses, weights)
-        if not np.isfinite(cost):
+        if not np.isfinite(self._cost(parameters, poses, weights)):
             raise CalibrationError("the start is outside of what the lens model maps; more views, or another model")
         p = self._free.shape[1]
-        for _ in range(LARGEST_ITERATIONS):
-            normal, side = self._normal(parameters, poses, weights)
-            scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-            scaled = normal / np.outer(scale, scale)
-            improved = False
-            while damping < 1e12:
-                step = np.linalg.solve(scaled + damping * np.eye(len(scale)), side / scale) / scale
-                trial = parameters + self._free @ step[:p]
-                moved = [perturb(T, step[p + 6 * k : p + 6 * k + 6]) for k, T in enumerate(poses)]
-                new = self._cost(trial, moved, weights) if (trial[:2] > 0.0).all() else np.inf
-                if new < cost:
-                    improved = True
-                    break
-                damping *= 10.0
-            if not improved:
-                return parameters, poses
-            gain = cost - new
-            parameters, poses, cost, damping = trial, moved, new, max(0.1 * damping, 1e-12)
-            if gain <= CONVERGED * cost:
-                return parameters, poses
-        normals = np.stack([T[:3, 2] for T in poses])
+
+        def cost(at: _State) -> float:
+            return self._cost(*at, weights) if (at[0][:2] > 0.0).all() else np.inf
+
+        def moved(at: _State, step: Array) -> _State:
+            steps = step[p:].reshape(-1, 6)
+            return at[0] + self._free @ step[:p], [perturb(T, xi) for T, xi in zip(at[1], steps, strict=True)]
+
+        found = minimise(
+            (parameters, poses), cost, lambda at: self._equations(*at, weights), moved, iterations=LARGEST_ITERATIONS
+        )
+        if found.converged:
+            return found.state
+        normals = np.stack([T[:3, 2] for T in found.state[1]])
         if len(poses) > 1 and (normals @ normals.T).min() > PARALLEL:
             raise CalibrationError(DEGENERATE)
         raise CalibrationError(
@@ -180,18 +179,17 @@ class BundleProblem:
 
     def _conclude(self, parameters: Array, poses: list[Array], used: list[NDArray[np.bool_]]) -> Bundle:
         weights = [u.astype(float) for u in used]
-        normal, _ = self._normal(parameters, poses, weights)
+        normal, _ = self._equations(parameters, poses, weights)
         freedom = 2 * int(sum(u.sum() for u in used)) - len(normal)
         if freedom <= 0:
             raise CalibrationError(
                 f"{len(normal)} unknowns and {freedom + len(normal)} measured coordinates; more points or views"
             )
         variance = self._cost(parameters, poses, weights) / freedom
-        scale = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
-        scaled = normal / np.outer(scale, scale)
-        if np.linalg.cond(scaled) > 1e13:
-            raise CalibrationError(DEGENERATE)
-        covariance = variance * np.linalg.inv(scaled) / np.outer(scale, scale)
+        try:
+            covariance = covariance_of(normal, variance)
+        except np.linalg.LinAlgError:
+            raise CalibrationError(DEGENERATE) from None
         residuals = self._residuals(parameters, poses)
         return Bundle(
             parameters, tuple(poses), covariance, tuple(residuals), tuple(used), float(np.sqrt(variance)), freedom
@@ -204,26 +202,30 @@ DEGENERATE = (
 )
 
 
-def _skews(points: Array) -> Array:
-    """(n, 3) -> (n, 3, 3), the matrices of the cross products."""
-    out = np.zeros((len(points), 3, 3))
-    x, y, z = points.T
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
-    out[:, 1, 0], out[:, 2, 0], out[:, 2, 1] = z, -y, x
-    return out
+RIM_POINTS = 24
 
 
-def _whitening(covariance: Array) -> Array:
-    out: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return out
+def centre_offsets_px(camera: Camera, cam_T_plate: Array, plate_m: Array, radius_m: float) -> Array:
+    """(n, 2): centre of area of each disc's image less the image of its centre; 0 where a rim leaves the lens."""
+    angles = 2.0 * np.pi / RIM_POINTS * np.arange(RIM_POINTS)
+    # The polygon through the rim is a little smaller than the disc; its centre is the same to a thousandth of that.
+    rim = radius_m * np.stack([np.cos(angles), np.sin(angles), np.zeros(RIM_POINTS)], axis=1)
+    points = (plate_m[:, None] + rim).reshape(-1, 3) @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3]
+    rims = camera.project(points).reshape(len(plate_m), RIM_POINTS, 2)
+    centres = camera.project(plate_m @ cam_T_plate[:3, :3].T + cam_T_plate[:3, 3])
+    offsets = _centroids(rims) - centres
+    return np.where(np.isfinite(offsets), offsets, 0.0)
 
 
-def _robust_scale(sizes: Array) -> float:
-    """Standard deviation of one coordinate from lengths of pairs: their median is 1.1774 of it."""
-    return max(float(np.median(sizes)) / 1.1774, 1e-9)
-
-
-def _biweight(sizes: Array, scale: float) -> Array:
-    share = np.minimum(sizes / (BIWEIGHT * scale), 1.0)
-    out: Array = np.square(1.0 - np.square(share))
-    return out
+def _centroids(polygons: Array) -> Array:
+    """(n, k, 2) -> (n, 2), centres of area (shoelace formula), reckoned about the first corner for exactness."""
+    origin = polygons[:, :1]
+    x, y = np.moveaxis(polygons - origin, 2, 0)
+    x1, y1 = np.roll(x, -1, axis=1), np.roll(y, -1, axis=1)
+    cross = x * y1 - x1 * y
+    area = cross.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        out: Array = np.stack([((x + x1) * cross).sum(axis=1), ((y + y1) * cross).sum(axis=1)], axis=1) / (
+            3.0 * area[:, None]
+        )
+    return out + origin[:, 0]

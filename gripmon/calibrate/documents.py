@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from gripmon.model.camera import LensSettings
+from gripmon.model.geometry import invert, to_record
 from gripmon.model.provenance import Digest, Provenance
 from gripmon.model.records import Transform
 from gripmon.model.records.values import Covariance
+
+if TYPE_CHECKING:
+    from gripmon.calibrate.robot_world import RobotWorld
 
 _Length = Annotated[float, Meta(ge=0.0)]
 
@@ -75,3 +81,59 @@ class HandEyeCalibration(
     residuals: HandEyeResiduals
     warnings: tuple[str, ...] = ()
     provenance: Provenance
+
+
+class RobotWorldResiduals(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How well the poses fit, each axis."""
+
+    rms_m: _Length
+    rms_rad: _Length
+    poses: Annotated[int, Meta(ge=3)]
+    used: Annotated[int, Meta(ge=3)]
+    outliers: Annotated[tuple[str, ...], Meta(description="poses that were left out")] = ()
+
+
+class RobotWorldCalibration(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
+    tag="gripmon.robot_world_calibration/1",
+):  # fmt: skip
+    """``transforms`` by name, two of them: ``cam_T_base`` and ``ee_T_target``, or of a camera on the hand ``cam_T_ee``
+    and ``base_T_target``, and the inverse of the first one.  ``covariance`` (12·12, row by row) of the ``parameters``:
+    position then rotation of the first two, axes of the frame that each maps to.
+    """
+
+    transforms: dict[str, Transform]
+    parameters: tuple[str, ...]
+    sigmas: dict[str, float]
+    covariance: tuple[float, ...]
+    residuals: RobotWorldResiduals
+    provenance: Provenance
+
+
+def robot_world_document(
+    found: RobotWorld, names: Sequence[str], provenance: Provenance, *, eye_in_hand: bool
+) -> RobotWorldCalibration:
+    """What a file holds of a result; ``names`` (n,) of the poses."""
+    first, second, inverse = (
+        ("cam_T_ee", "base_T_target", "ee_T_cam") if eye_in_hand else ("cam_T_base", "ee_T_target", "base_T_cam")
+    )
+    axes = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
+    parameters = tuple(f"{transform}.{axis}" for transform in (first, second) for axis in axes)
+    return RobotWorldCalibration(
+        transforms={
+            first: to_record(found.cam_T_base),
+            second: to_record(found.ee_T_target),
+            inverse: to_record(invert(found.cam_T_base)),
+        },
+        parameters=parameters,
+        sigmas=dict(zip(parameters, np.sqrt(found.covariance.diagonal()).tolist(), strict=True)),
+        covariance=tuple(found.covariance.ravel().tolist()),
+        residuals=RobotWorldResiduals(
+            rms_m=found.rms_m,
+            rms_rad=found.rms_rad,
+            poses=len(names),
+            used=int(found.used.sum()),
+            outliers=tuple(name for name, used in zip(names, found.used, strict=True) if not used),
+        ),
+        provenance=provenance,
+    )

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from gripmon.calibrate.bundle import DEGENERATE, Bundle, BundleProblem
-from gripmon.calibrate.doubts import USELESS_FOCAL, check_fit, doubts_of
+from gripmon.calibrate.intrinsics_result import USELESS_FOCAL, IntrinsicsResult, check_fit, doubts_of
 from gripmon.calibrate.lens_models import LensModel, ModelName, parameter_names
 from gripmon.calibrate.plate_pose import lens_vector, merit, model_of, plate_pose, plate_pose_start
 from gripmon.calibrate.sighting import CalibrationError, Sighting
@@ -48,42 +47,6 @@ ASSUMED_CENTRE = 0.01
 """Standard deviation of the principal point about the image's centre, in its widths, where a single view can't tell;
 and that of the aspect about 1."""
 ASSUMED_ASPECT = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class IntrinsicsResult:
-    """A calibrated camera.
-
-    ``covariance`` (p, p) of the p ``parameters``, keys of ``camera``; the rest was held fixed.  One a view:
-    ``cam_T_plate`` (4, 4) and ``pose_covariance`` (6, 6) (position then rotation, camera axes), ``residuals_px`` (n, 2)
-    and ``used`` (n,).  ``criterion``: Bayes' information criterion of each model that was tried, the smallest is best.
-    """
-
-    model: ModelName
-    camera: LensSettings
-    parameters: tuple[str, ...]
-    covariance: Array
-    cam_T_plate: tuple[Array, ...]
-    pose_covariance: tuple[Array, ...]
-    residuals_px: tuple[Array, ...]
-    used: tuple[NDArray[np.bool_], ...]
-    rms_px: float
-    warnings: tuple[str, ...] = ()
-    criterion: dict[str, float] | None = None
-    cross_validated_rms_px: float | None = None
-
-    @property
-    def view_rms_px(self) -> tuple[float, ...]:
-        """Root mean square of each view's residuals that were used, u and v each."""
-        return tuple(
-            float(np.sqrt(np.mean(np.square(r[u])))) if u.any() else math.inf
-            for r, u in zip(self.residuals_px, self.used, strict=True)
-        )
-
-    @property
-    def values(self) -> dict[str, float]:
-        """All parameters by name, those that were held, too."""
-        return dict(zip(parameter_names(self.model), lens_vector(self.camera).tolist(), strict=True))
 
 
 def calibrate(

@@ -15,10 +15,9 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2
 
 from gripmon.calibrate.bundle import Bundle
-from gripmon.calibrate.free_pose import FreePose, off_plate
 from gripmon.calibrate.intrinsics import lens_vector, model_of, plate_pose
 from gripmon.calibrate.lens_models import LensModel, parameter_names
-from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, Standing, stand
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import perturb, perturbation_between

@@ -8,6 +8,10 @@ The contact plane of the fingertips is the plate's x-y plane (self-viewing metho
 
 with both z axes into the plate.  h is the height of the contact plane in the gripper's frame; the paper's, 0, if its
 origin lies between the fingertips.
+
+Beside it a gripper's pose from all edges of it that an image shows, no plate considered, and how it stands off the
+plate then.  Edges that rise from the contact plane tell tilts several times better than corners in it: a plane that is
+tilted a little looks nearly the same, a finger that leans doesn't.
 """
 
 from __future__ import annotations
@@ -18,7 +22,8 @@ import numpy as np
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import perturb, perturbation_between, skew
+from gripmon.model.geometry import invert, perturb, perturbation_between, skew
+from gripmon.model.least_squares import fit, whitening
 from gripmon.model.records import Array
 
 FEWEST_CORNERS = 2
@@ -27,7 +32,6 @@ LARGEST_MISFIT = 0.1
 """Part of the corners' spread up to which residuals still mean inaccuracy, not another gripper."""
 SMALLEST_SPREAD_M = 1e-5
 NO_RECTANGLE = "the innermost corners are no rectangle; two corners on each of two parallel fingertips, by their names"
-_ITERATIONS = 4
 _SIGNS = np.array([[-1.0, -1.0], [-1.0, 1.0], [1.0, -1.0], [1.0, 1.0]])
 """Of x and y of the innermost corners."""
 
@@ -66,7 +70,8 @@ def stand(
     weight = _on_plate(cam_T_plate, xy, plate_xy, heights, variance)
     if corners_m is None:
         sides, start = infer_rectangle(plate_xy)
-        q, shift, sides = _refine_rectangle(plate_xy, weight, sides, start)
+        inner = plate_xy[:INFERRED_FROM], weight[:INFERRED_FROM], 0.5 * _SIGNS * sides
+        q, shift, sides = _refine(*inner, start[:2], start[2:], sides)
         known = np.concatenate([(plate_xy - shift) @ _turn(q), np.zeros((len(xy), 1))], axis=1)
         rectangle = 0.5 * _SIGNS * sides
         residuals = np.zeros((len(xy), 2))  # what lies outside the rectangle is as it shows
@@ -78,7 +83,7 @@ def stand(
         known = corners_m
         q, shift = coincide_linear(corners_m, plate_xy)
         _check_shape(corners_m, plate_xy, q, shift)
-        q, shift = _refine(plate_xy, weight, corners_m, q, shift)
+        q, shift, _ = _refine(plate_xy, weight, corners_m[:, :2], q, shift)
         residuals = (plate_xy - shift) @ _turn(q) - corners_m[:, :2]
     plate_T_grip = np.eye(4)
     plate_T_grip[:2, :2], plate_T_grip[:2, 3], plate_T_grip[2, 3] = _turn(q), shift, -contact_m
@@ -173,55 +178,40 @@ def infer_rectangle(plate_xy_m: Array) -> tuple[Array, Array]:
     return sides, np.concatenate([q, plate_xy_m[:INFERRED_FROM].mean(axis=0)])
 
 
-def _refine(plate_xy: Array, weight: Array, corners_m: Array, q: Array, shift: Array) -> tuple[Array, Array]:
-    """The rotation and shift with the least weighted residuals (Gauss-Newton; ``weight`` (c, 2, 2) whitens)."""
-    for _ in range(_ITERATIONS):
-        turned = corners_m[:, :2] @ _turn(q).T
-        rows = np.zeros((len(corners_m), 2, 3))
+def _refine(
+    plate_xy: Array, weight: Array, corners_xy: Array, q: Array, shift: Array, sides: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """Rotation, shift, and with ``sides`` (2,) those of the rectangle, with the least weighted residuals (``weight``
+    (c, 2, 2) whitens).
+    """
+    start = np.concatenate([[0.0], shift, [] if sides is None else sides])
+
+    def turned_by(unknown: Array) -> Array:
+        return _turn(np.array([np.cos(unknown[0]), np.sin(unknown[0])])) @ q
+
+    def linearised(unknown: Array) -> tuple[Array, Array]:
+        now = turned_by(unknown)
+        own = corners_xy if sides is None else 0.5 * _SIGNS * unknown[3:]
+        turned = own @ _turn(now).T
+        rows = np.zeros((len(own), 2, len(unknown)))
         rows[:, 0, 0], rows[:, 1, 0] = -turned[:, 1], turned[:, 0]
         rows[:, 0, 1] = rows[:, 1, 2] = 1.0
-        step = _least_squares(weight, rows, plate_xy - turned - shift)
-        q, shift = _turn(_unit(step[0])) @ q, shift + step[1:]
-    return q, shift
+        if sides is not None:
+            rows[:, :, 3], rows[:, :, 4] = 0.5 * _SIGNS[:, :1] * now, 0.5 * _SIGNS[:, 1:] * np.array([-now[1], now[0]])
+        return weight @ rows, np.einsum("nij,nj->ni", weight, plate_xy - turned - unknown[1:3])
 
-
-def _refine_rectangle(plate_xy: Array, weight: Array, sides: Array, start: Array) -> tuple[Array, Array, Array]:
-    """The same with the rectangle's sides unknown, from its four corners."""
-    q: Array = start[:2]
-    shift: Array = start[2:]
-    points, weight = plate_xy[:INFERRED_FROM], weight[:INFERRED_FROM]
-    for _ in range(_ITERATIONS):
-        turned = (0.5 * _SIGNS * sides) @ _turn(q).T
-        rows = np.zeros((INFERRED_FROM, 2, 5))
-        rows[:, 0, 0], rows[:, 1, 0] = -turned[:, 1], turned[:, 0]
-        rows[:, 0, 1] = rows[:, 1, 2] = 1.0
-        rows[:, :, 3], rows[:, :, 4] = 0.5 * _SIGNS[:, :1] * q, 0.5 * _SIGNS[:, 1:] * np.array([-q[1], q[0]])
-        step = _least_squares(weight, rows, points - turned - shift)
-        q, shift, sides = _turn(_unit(step[0])) @ q, shift + step[1:3], sides + step[3:]
-    return q, shift, sides
+    found = fit(start, linearised, np.add).state
+    return turned_by(found), found[1:3], found[3:]
 
 
 def _apart(cam_T_grip: Array, xy: Array, variance: Array, corners_m: Array) -> Array | None:
     """Tilt and gap with which the corners, no plate considered, are best explained; None where they don't tell."""
     if len(corners_m) < 4 or np.linalg.svd(corners_m - corners_m.mean(axis=0), compute_uv=False)[1] < 1e-4:
         return None
-    whiten = np.linalg.inv(np.linalg.cholesky(variance))
-    free: Array = np.zeros(6)
-    for _ in range(_ITERATIONS):
-        # Moved in its own axes: shift, then turn.
-        moved = perturb(np.eye(4), free)
-        points = (corners_m @ moved[:3, :3].T + moved[:3, 3]) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3]
-        x, y, z = points.T
-        by_point = np.zeros((len(xy), 2, 3))
-        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
-        by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
-        turned = corners_m @ moved[:3, :3].T
-        by_motion = np.concatenate([np.broadcast_to(np.eye(3), (len(xy), 3, 3)), -skew(turned)], axis=2)
-        rows = by_point @ cam_T_grip[:3, :3] @ by_motion
-        free = perturbation_between(
-            np.eye(4), perturb(moved, _least_squares(whiten, rows, xy - points[:, :2] / points[:, 2:]))
-        )
-    return np.array([free[3], free[4], -free[2]])
+    own = perturbation_between(
+        np.eye(4), invert(cam_T_grip) @ pose_of_points(cam_T_grip, corners_m, xy, whitening(variance))
+    )
+    return np.array([own[3], own[4], -own[2]])
 
 
 def _on_plate(cam_T_plate: Array, xy: Array, plate_xy: Array, heights: Array, variance: Array) -> Array:
@@ -231,24 +221,75 @@ def _on_plate(cam_T_plate: Array, xy: Array, plate_xy: Array, heights: Array, va
     # d(xy)/d(plate x, y), inverted.
     by_plate = (cam_T_plate[:2, :2] - xy[:, :, None] * cam_T_plate[2, :2]) / z
     slope = np.linalg.inv(by_plate)
-    return np.linalg.inv(np.linalg.cholesky(slope @ variance @ slope.transpose(0, 2, 1)))
-
-
-def _least_squares(whiten: Array, rows: Array, values: Array) -> Array:
-    a = (whiten @ rows).reshape(-1, rows.shape[2])
-    b = np.einsum("nij,nj->ni", whiten, values).ravel()
-    out: Array = np.linalg.lstsq(a, b, rcond=None)[0]
-    return out
+    return whitening(slope @ variance @ slope.transpose(0, 2, 1))
 
 
 def _turn(q: Array) -> Array:
     return np.array([[q[0], -q[1]], [q[1], q[0]]])
 
 
-def _unit(angle_rad: float) -> Array:
-    return np.array([np.cos(angle_rad), np.sin(angle_rad)])
-
-
 def _spread(xy_m: Array) -> float:
     """Root mean square distance from the middle."""
     return float(np.sqrt(np.mean(np.sum(np.square(xy_m - xy_m.mean(axis=0)), axis=1))))
+
+
+@dataclass(frozen=True, slots=True)
+class FreePose:
+    """``cam_T_grip`` (4, 4) with the ``covariance`` (6, 6) of its error (position then rotation, camera axes), measured
+    through ``camera``; ``points_m`` (n, 3) of the gripper, which stand for what was measured.
+    """
+
+    cam_T_grip: Array
+    covariance: Array
+    camera: Camera
+    points_m: Array
+
+    def through(self, camera: Camera) -> Array:
+        """``cam_T_grip`` (4, 4) that the same image shows if ``camera`` took it: least squares over the points."""
+        out = self.cam_T_grip
+        if camera is self.camera:
+            return out
+        uv_px = self.camera.project(self.points_m @ out[:3, :3].T + out[:3, 3])
+        xy = camera.undistort(uv_px)
+        seen = np.isfinite(xy).all(axis=1)
+        return pose_of_points(out, self.points_m[seen], xy[seen])
+
+    def own_slopes(self, cam_T_plate: Array, contact_m: float) -> Array:
+        """(3, 6): what the pose's own independent errors, in their standard deviations, do to :func:`off_plate`."""
+        scale = np.sqrt(self.covariance.diagonal())
+        variances, axes = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        roots = (scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))).T
+        up, down = (
+            np.array([off_plate(perturb(self.cam_T_grip, s * r), cam_T_plate, contact_m) for r in roots])
+            for s in (0.5, -0.5)
+        )
+        out: Array = (up - down).T
+        return out
+
+
+def pose_of_points(start: Array, points_m: Array, xy: Array, whiten: Array | None = None) -> Array:
+    """The pose (4, 4) near ``start`` that shows points (n, 3) at ideal coordinates ``xy`` (n, 2) with the least
+    residuals, which ``whiten`` (n, 2, 2) makes comparable.
+    """
+
+    def linearised(pose: Array) -> tuple[Array, Array]:
+        turned = points_m @ pose[:3, :3].T
+        x, y, z = (turned + pose[:3, 3]).T
+        by_point = np.zeros((len(z), 2, 3))
+        by_point[:, 0, 0] = by_point[:, 1, 1] = 1.0 / z
+        by_point[:, 0, 2], by_point[:, 1, 2] = -x / z**2, -y / z**2
+        rows = np.concatenate([by_point, -by_point @ skew(turned)], axis=2)
+        values = xy - np.stack([x / z, y / z], axis=1)
+        return (rows, values) if whiten is None else (whiten @ rows, np.einsum("nij,nj->ni", whiten, values))
+
+    return fit(start, linearised, perturb).state
+
+
+def off_plate(cam_T_grip: Array, cam_T_plate: Array, contact_m: float) -> Array:
+    """(3,): tilt about the gripper's x and y (rad) by which its contact plane, z = ``contact_m``, leaves the plate, and
+    the gap (m) at its middle, the gripper nearer to the camera than the plate.
+    """
+    rotation, normal = cam_T_grip[:3, :3], cam_T_plate[:3, 2]
+    across = rotation.T @ np.cross(normal, rotation[:, 2])
+    contact = cam_T_grip[:3, 3] + contact_m * rotation[:, 2]
+    return np.array([across[0], across[1], -normal @ (contact - cam_T_plate[:3, 3])])

@@ -4,30 +4,54 @@ Dornaika and Horaud, "Simultaneous robot-world and hand-eye calibration" (IEEE T
 for every pose ``cam_T_target = cam_T_base base_T_ee ee_T_target``, the first and the last unknown.  Closed form by
 quaternions, then all at once.  A camera on the hand is the same with ``ee_T_base`` for ``base_T_ee``: what comes out is
 ``cam_T_ee`` and ``base_T_target`` then.
+
+How inexact the arm is shows in what its poses leave unexplained beside a target's own covariances.  A target's pose
+from one image is known to some hundredths of a millimetre, most arms aren't: weighed by the images alone, the poses
+seen best count for far more than they know.  Two variances, of the arm's positions and rotations, are estimated by
+restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from gripmon.calibrate.robot_world_noise import arm_sigmas, arm_slopes, with_arm
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import invert, make_transform, perturb, skew
+from gripmon.model.least_squares import (
+    TUKEY,
+    covariance_of,
+    minimise,
+    normal_equations,
+    robust_scale,
+    tukey_weights,
+    whitening,
+)
 from gripmon.model.records import Array
 
 FEWEST_POSES = 3
 LEAST_TURN_RAD = 5e-3
-BIWEIGHT = 4.685
-"""Tukey's constant: 95 % efficiency for normal errors."""
 FALSE_OUTLIERS = 0.05
 """How many good poses of a whole data set may be left out, on average."""
-_ITERATIONS = 60
 _ROUNDS, _ARM_ROUNDS = 20, 5
+_LEAST_M, _LEAST_RAD = 1e-7, 1e-7
+_MOST_M, _MOST_RAD = 0.1, 0.5
+_STARTS = (1e-5, 2e-4, 3e-3)
+FARTHEST_M = 20.0
+"""No camera measures a target's pose beyond: such numbers are millimetres."""
+SUSPECT_RAD = 0.02
+"""What is left of the rotations (each axis) from which it is asked whether another reading fits."""
+HOPELESS_RAD = 0.1
+"""What no arm and no camera are off by."""
+_BETTER = 0.1
+_AGREEING = 0.7
+_OFFSETS = (1, -1, 2, -2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,7 +133,7 @@ def refine(
     count = len(cam_T_target)
     if 6 * count <= 12:
         raise CalibrationError(f"{count} pose(s); at least {FEWEST_POSES}, better ten")
-    whiten = None if covariance is None else _whitening(covariance)
+    whiten = None if covariance is None else whitening(covariance)
     used = np.ones(count, dtype=bool)
     weights: Array = np.ones(count)
     sigmas: Array | None = None
@@ -118,10 +142,12 @@ def refine(
         if covariance is not None and inexact_arm and turn < _ARM_ROUNDS:
             by_arm, rows = arm_slopes(base_T_ee, cam_T_base, ee_T_target), slopes(base_T_ee, cam_T_base, ee_T_target)
             sigmas = arm_sigmas(covariance, by_arm, rows, values, weights, sigmas)
-            whiten = _whitening(with_arm(covariance, by_arm, sigmas))
+            whiten = whitening(with_arm(covariance, by_arm, sigmas))
         root = whiten if whiten is not None else _weights_of(values[used])
         if count > FEWEST_POSES:
-            weights = _biweight(_sizes(root, values), 6)
+            sizes = _sizes(root, values)
+            # Lengths of six coordinates: their usual one is what one coordinate's standard deviation is otherwise.
+            weights = tukey_weights(sizes, TUKEY * _scale(sizes, 6) * float(np.sqrt(3.0)))
         before = cam_T_base, ee_T_target
         cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, before, root, weights)
         if (
@@ -164,41 +190,113 @@ def slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
 def _minimise(
     cam_T_target: Array, base_T_ee: Array, start: tuple[Array, Array], whiten: Array, weights: Array
 ) -> tuple[Array, Array]:
-    """Gauss-Newton, halved where it overshoots."""
-
     def cost(at: tuple[Array, Array]) -> float:
         return float((weights * np.square(_sizes(whiten, residuals(cam_T_target, base_T_ee, *at)))).sum())
 
-    here, best = start, cost(start)
-    for _ in range(_ITERATIONS):
-        a = (whiten @ slopes(base_T_ee, *here)) * np.sqrt(weights)[:, None, None]
-        values = (whiten @ residuals(cam_T_target, base_T_ee, *here)[:, :, None])[:, :, 0]
-        b = values * np.sqrt(weights)[:, None]
-        step = np.linalg.lstsq(a.reshape(-1, 12), b.ravel(), rcond=None)[0]
-        for _ in range(15):
-            trial = perturb(here[0], step[:6]), perturb(here[1], step[6:])
-            new = cost(trial)
-            if new <= best:
-                break
-            step = 0.5 * step
-        else:
-            return here
-        gain, here, best = best - new, trial, new
-        if gain <= 1e-12 * best:
-            break
-    return here
+    def equations(at: tuple[Array, Array]) -> tuple[Array, Array]:
+        values = (whiten @ residuals(cam_T_target, base_T_ee, *at)[:, :, None])[:, :, 0]
+        return normal_equations(whiten @ slopes(base_T_ee, *at), values, weights)
+
+    def moved(at: tuple[Array, Array], step: Array) -> tuple[Array, Array]:
+        return perturb(at[0], step[:6]), perturb(at[1], step[6:])
+
+    return minimise(start, cost, equations, moved, tolerance=1e-12, damping=1e-9).state
+
+
+def arm_slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
+    """(n, 6, 6): what errors of the arm's poses (position, then rotation about the hand's origin, camera axes) do to
+    the predicted ``cam_T_target``.
+    """
+    cam_R_ee = cam_T_base[:3, :3] @ base_T_ee[:, :3, :3]
+    out = np.tile(np.eye(6), (len(base_T_ee), 1, 1))
+    out[:, :3, 3:] = -skew(cam_R_ee @ ee_T_target[:3, 3])
+    return out
+
+
+def arm_sigmas(
+    covariance: Array, by_arm: Array, rows: Array, values: Array, weights: Array, before: Array | None
+) -> Array:
+    """Standard deviations (2,) of the arm's positions (m) and rotations (rad), each axis.
+
+    ``covariance`` (n, 6, 6) of the targets' poses, ``by_arm`` (n, 6, 6) of :func:`arm_slopes`, ``rows`` (n, 6, k) the
+    derivatives by the k unknowns, ``values`` (n, 6) the residuals, of which each pose's has one of the ``weights``
+    (n,).  Begun at what they were ``before``.
+    """
+    scaled = rows / np.linalg.norm(rows.reshape(-1, rows.shape[2]), axis=0)
+
+    def unlikely(log_sigmas: Array) -> float:
+        matrix = with_arm(covariance, by_arm, np.exp(log_sigmas))
+        inverse = np.linalg.inv(matrix)
+        squares = np.einsum("ni,nij,nj->n", values, inverse, values)
+        information = np.tensordot(scaled, weights[:, None, None] * (inverse @ scaled), axes=((0, 1), (0, 1)))
+        return float((weights * (np.linalg.slogdet(matrix)[1] + squares)).sum() + np.linalg.slogdet(information)[1])
+
+    bounds = [(np.log(_LEAST_M), np.log(_MOST_M)), (np.log(_LEAST_RAD), np.log(_MOST_RAD))]
+    starts = [np.log([s, s]) for s in _STARTS] if before is None else [np.log(before)]
+    found = [minimize(unlikely, start, method="L-BFGS-B", bounds=bounds, options={"ftol": 1e-6}) for start in starts]
+    out: Array = np.exp(min(found, key=lambda each: each.fun).x)
+    return out
+
+
+def with_arm(covariance: Array, by_arm: Array, sigmas: Array) -> Array:
+    """``covariance`` (n, 6, 6) with what an arm's errors of standard deviations (2,), m and rad, add to it."""
+    position, rotation = by_arm[:, :, :3] * sigmas[0], by_arm[:, :, 3:] * sigmas[1]
+    out: Array = covariance + position @ position.transpose(0, 2, 1) + rotation @ rotation.transpose(0, 2, 1)
+    return out
 
 
 def _conclude(
     cam_T_target: Array, base_T_ee: Array, at: tuple[Array, Array], whiten: Array, used: NDArray[np.bool_]
 ) -> RobotWorld:
-    a = (whiten @ slopes(base_T_ee, *at))[used].reshape(-1, 12)
     values = residuals(cam_T_target, base_T_ee, *at)
     freedom = 6 * int(used.sum()) - 12
-    size = np.linalg.norm(a, axis=0)
     variance = max(float(np.square(_sizes(whiten, values)[used]).sum()) / freedom, 1e-18)
-    covariance = variance * np.linalg.inv((a / size).T @ (a / size)) / np.outer(size, size)
-    return RobotWorld(at[0], at[1], covariance, values, used, freedom)
+    normal, _ = normal_equations((whiten @ slopes(base_T_ee, *at))[used], values[used])
+    return RobotWorld(at[0], at[1], covariance_of(normal, variance), values, used, freedom)
+
+
+def check_target_scale(cam_T_target: Array) -> None:
+    """ValueError for poses (n, 4, 4) of a target that no camera sees so far away."""
+    far_m = float(np.median(np.linalg.norm(cam_T_target[:, :3, 3], axis=1)))
+    if far_m > FARTHEST_M:
+        raise ValueError(f"the target is {far_m:.4g} m from the camera (median): millimetres? metres")
+
+
+def check_reading(found: RobotWorld, cam_T_target: Array, base_T_ee: Array) -> None:
+    """:class:`CalibrationError` where large residuals go away if the poses (n, 4, 4) are read otherwise, and where they
+    are larger than any arm's and camera's errors.
+    """
+    if found.rms_rad < SUSPECT_RAD:
+        return
+    left_deg = np.degrees(found.rms_rad)
+    for text, target, arm in _readings(cam_T_target, base_T_ee):
+        try:
+            other = refine(target, arm, solve(target, arm))
+        except CalibrationError:
+            continue
+        if other.rms_rad < _BETTER * found.rms_rad and other.used.mean() >= _AGREEING:
+            raise CalibrationError(f"{text} ({np.degrees(other.rms_rad):.2g} degrees are left, else {left_deg:.2g})")
+    if found.rms_rad > HOPELESS_RAD:
+        raise CalibrationError(
+            f"the poses of arm and target contradict each other: {left_deg:.2g} degrees are left on average; each "
+            "target's pose with the arm's at that time"
+        )
+
+
+def _readings(cam_T_target: Array, base_T_ee: Array) -> Iterator[tuple[str, Array, Array]]:
+    # Inverting the arm's poses or the target's comes to the same: which of them it is can't be told.
+    text = (
+        "the poses fit with the arm's or the target's inverted: base_T_ee and cam_T_target; or --eye-in-hand is missing"
+    )
+    yield f"{text}, or too much", cam_T_target, np.linalg.inv(base_T_ee)
+    for offset in _OFFSETS:
+        count = len(base_T_ee) - abs(offset)
+        if count <= FEWEST_POSES:
+            continue
+        own, other = max(offset, 0), max(-offset, 0)
+        which = "later" if offset > 0 else "earlier"
+        text = f"arm and target are out of step: targets fit the arm's poses {abs(offset)} row(s) {which}"
+        yield text, cam_T_target[other : other + count], base_T_ee[own : own + count]
 
 
 def _check_turns(cam_T_target: Array, base_T_ee: Array) -> None:
@@ -213,11 +311,6 @@ def _check_turns(cam_T_target: Array, base_T_ee: Array) -> None:
             )
 
 
-def _whitening(covariance: Array) -> Array:
-    out: Array = np.linalg.inv(np.linalg.cholesky(covariance))
-    return out
-
-
 def _weights_of(values: Array) -> Array:
     """(6, 6), makes residuals unit: positions and rotations by their own robust scale."""
     sizes = [_scale(np.linalg.norm(part, axis=1), 3) for part in (values[:, :3], values[:, 3:])]
@@ -229,16 +322,8 @@ def _sizes(whiten: Array, values: Array) -> Array:
     return out
 
 
-def _biweight(sizes: Array, freedom: int) -> Array:
-    # Lengths of six coordinates: their usual one is what one coordinate's standard deviation is otherwise.
-    share = np.minimum(sizes / (BIWEIGHT * _scale(sizes, freedom) * np.sqrt(freedom / 2.0)), 1.0)
-    out: Array = np.square(1.0 - np.square(share))
-    return out
-
-
 def _scale(sizes: Array, freedom: int) -> float:
-    """Standard deviation of one coordinate from lengths of vectors of so many: their median against the chi one's."""
-    return max(float(np.median(sizes)) / float(np.sqrt(chi2.median(freedom))), 1e-12)
+    return max(robust_scale(sizes, freedom), 1e-12)
 
 
 def _left(q: Array) -> Array:

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 
 
-class CalibrationError(ValueError):
-    """Why there is no calibration; one line for a person: what is wrong; what would be right."""
+class CalibrationError(NoResultError, ValueError):
+    """Why there is no calibration; one line for a person: what is wrong; what would be right.  ``details``: further
+    lines, such as what is wrong with each of several images.
+    """
+
+    def __init__(self, text: str, details: Sequence[str] = ()):
+        super().__init__(text)
+        self.details = tuple(details)
 
 
 @dataclass(frozen=True, slots=True)

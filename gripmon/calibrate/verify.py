@@ -13,12 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from gripmon.calibrate.documents import CalibratedGripper
 from gripmon.calibrate.intrinsics import lens_vector, model_of
 from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
-from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.records import Array
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record, perturb, perturbation_between
+from gripmon.model.least_squares import whitening
+from gripmon.model.records import Array, Transform
 
 CHANCE = 1e-3
 """Of two measurements of one pose being called different ones."""
@@ -27,6 +30,26 @@ NEGLIGIBLE_PX = 1e-3
 _GRID = 25
 _DRAWS = 4000
 _SEED = 7
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """What is compared, by its ``name``: a ``lens`` with the covariance of its ``parameters``, a ``cam_T_grip`` with
+    ``covariance`` (36), or both; ``kind`` is what it comes from, ``notes`` on its origin, for people, ``pose_notes``
+    more about the transform.
+    """
+
+    name: str
+    kind: str
+    lens: LensSettings | None = None
+    parameters: tuple[str, ...] = ()
+    lens_covariance: tuple[float, ...] = ()
+    cam_T_grip: Transform | None = None
+    covariance: tuple[float, ...] = ()
+    gripper: CalibratedGripper | None = None
+    jaw_opening_m: float | None = None
+    notes: tuple[str, ...] = ()
+    pose_notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,6 +137,86 @@ def agreeing(cam_T_grip: Sequence[Array], covariances: Sequence[Array]) -> NDArr
     best = np.lexsort((spread, -agree.sum(axis=1)))[0]
     out: NDArray[np.bool_] = agree[best]
     return out
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Whether two calibrations are the ``same``: not told apart at the ``level`` of false alarms, or the difference is
+    ``within`` what doesn't matter.  ``warnings``: what else may explain it.
+    """
+
+    same: bool
+    within: bool
+    level: float
+    difference: HandEyeDifference | CameraDifference
+    warnings: tuple[str, ...] = ()
+
+
+def verify(
+    first: Calibrated,
+    second: Calibrated,
+    *,
+    level: float = 0.01,
+    tolerance_m: float | None = None,
+    tolerance_rad: float | None = None,
+    tolerance_px: float | None = None,
+) -> Verdict:
+    """Compare two hand/eye calibrations, or two cameras, by their uncertainties; ``tolerance_m`` and ``tolerance_rad``
+    (shift of the TCP and turn), or ``tolerance_px`` (anywhere in the image): differences that don't matter, however
+    significant.  :class:`~gripmon.model.errors.InputError` for what can't be compared.
+    """
+    try:
+        if first.cam_T_grip is not None and second.cam_T_grip is not None:
+            if tolerance_px is not None:
+                raise InputError("--tolerance-px: is for two cameras; leave it out")
+            return _hand_eyes(first, second, level, tolerance_m, tolerance_rad)
+        if first.lens is not None and second.lens is not None:
+            if tolerance_m is not None or tolerance_rad is not None:
+                raise InputError("--tolerance-mm: is for hand/eye calibrations; leave it out")
+            return _cameras(first, second, level, tolerance_px)
+    except CalibrationError as error:
+        raise InputError(f"calibrate verify: {first.name} and {second.name}: {error}") from None
+    raise InputError(f"{first.name} is {first.kind}, {second.name} is {second.kind}; two of one kind")
+
+
+def _hand_eyes(
+    first: Calibrated, second: Calibrated, level: float, tolerance_m: float | None, tolerance_rad: float | None
+) -> Verdict:
+    assert first.cam_T_grip is not None and second.cam_T_grip is not None
+    warnings = []
+    if first.lens is not None and second.lens is not None and first.lens != second.lens:
+        warnings.append("made with different camera calibrations, which may explain a difference")
+    if first.gripper is not None and second.gripper is not None and first.gripper != second.gripper:
+        warnings.append(f"made with different gripper files ({first.gripper.name}, {second.gripper.name})")
+    found = compare_hand_eye(
+        from_record(first.cam_T_grip),
+        np.reshape(first.covariance, (6, 6)),
+        from_record(second.cam_T_grip),
+        np.reshape(second.covariance, (6, 6)),
+    )
+    within = (
+        tolerance_m is not None
+        and tolerance_rad is not None
+        and float(np.linalg.norm(found.position_m)) <= tolerance_m
+        and float(np.linalg.norm(found.rotation_rad)) <= tolerance_rad
+    )
+    return Verdict(found.p_value >= level or within, within, level, found, tuple(warnings))
+
+
+def _cameras(first: Calibrated, second: Calibrated, level: float, tolerance_px: float | None) -> Verdict:
+    calibrated = []
+    for one in (first, second):
+        assert one.lens is not None
+        count = len(one.parameters)
+        calibrated.append(CalibratedCamera(one.lens, one.parameters, np.reshape(one.lens_covariance, (count, count))))
+    found = compare_cameras(*calibrated)
+    within = found.largest_px <= max(tolerance_px or 0.0, NEGLIGIBLE_PX)
+    if found.p_value is None and tolerance_px is None and not within:
+        raise InputError(
+            f"{first.name} and {second.name}: up to {found.largest_px:.3g} px apart, and neither says how certain it "
+            "is; --tolerance-px PX for a difference that doesn't matter"
+        )
+    return Verdict(within or (found.p_value is not None and found.p_value >= level), within, level, found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,7 +327,7 @@ def _root(calibrated: CalibratedCamera, xy: Array) -> Array:
 def _chance(apart_px: Array, covariance: Array, roots: Array) -> float:
     """Probability of a largest ``dᵀ cov⁻¹ d`` as large as that of ``apart_px`` (n, 2), from drawn errors."""
     # What neither camera left free has no variance; there a thousandth of a pixel counts.
-    inverse_root = np.linalg.inv(np.linalg.cholesky(covariance + NEGLIGIBLE_PX**2 * np.eye(2)))
+    inverse_root = whitening(covariance + NEGLIGIBLE_PX**2 * np.eye(2))
     observed = np.square(inverse_root @ apart_px[:, :, None]).sum(axis=(1, 2)).max()
     whitened = inverse_root @ roots
     draws = np.random.default_rng(_SEED).standard_normal((whitened.shape[2], _DRAWS))

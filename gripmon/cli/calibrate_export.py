@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 from gripmon.cli import calibration_files as files
 from gripmon.cli import common
 from gripmon.cli.calibrate_import import CAMERA_FORMATS
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.cli.calibration_sources import Calibrated
+    from gripmon.calibrate.verify import Calibrated
 
 HAND_EYE_FORMATS = ("ros-static", "urdf", "easy_handeye2", "json")
 _FRAMES = {
@@ -73,7 +74,7 @@ def add_parser(methods: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate export``."""
-    from gripmon.cli.calibration_sources import read_calibrated
+    from gripmon.daemon.calibrations import read_calibrated
 
     out = None if arguments.out is None else Path(arguments.out)
     if out is not None:
@@ -98,21 +99,18 @@ def _check_options(arguments: argparse.Namespace) -> None:
     if not camera and arguments.format != "easy_handeye2":
         unused += [o for o in frames if o in ("--robot-base-frame", "--tracking-marker-frame")]
     if unused:
-        raise common.CommandFailedError(
-            f"{unused[0]}: has no meaning with --format {arguments.format}; leave it out", common.EXIT_USAGE
-        )
+        raise InputError(f"{unused[0]}: has no meaning with --format {arguments.format}; leave it out")
 
 
 def _notes(source: Calibrated, arguments: argparse.Namespace) -> tuple[str, ...]:
     from gripmon.model.provenance import provenance_of
 
-    options = {"--format": arguments.format, "--name": arguments.name, "--fit": arguments.fit}
-    options |= {option: getattr(arguments, key) for key, (option, _) in _FRAMES.items()}
-    options |= {"--gripper-in-camera": arguments.gripper_in_camera, "--out": arguments.out}
-    made = provenance_of(files.command_line("export", [arguments.calibration], options), [source.path])
+    frames = [option.removeprefix("--") for option, _ in _FRAMES.values()]
+    options = files.options_of(arguments, "format", "name", "fit", *frames, "gripper-in-camera", "out")
+    made = provenance_of(files.command_line("export", [arguments.calibration], options), [Path(arguments.calibration)])
     return (
         f"written {made.time} by gripmon {made.gripmon}: {made.command}",
-        f"from {source.path}, SHA-256 {made.inputs[0].sha256}",
+        f"from {source.name}, SHA-256 {made.inputs[0].sha256}",
         *source.notes,
         *(() if arguments.format in CAMERA_FORMATS else source.pose_notes),
     )
@@ -120,26 +118,21 @@ def _notes(source: Calibrated, arguments: argparse.Namespace) -> tuple[str, ...]
 
 def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
     from gripmon.calibrate.interchange.cameras import write_camera
-    from gripmon.calibrate.interchange.fault import InterchangeError
 
     if source.lens is None:
-        raise common.CommandFailedError(
-            f"{source.path}: is {source.kind} without a camera; a camera calibration, a hand/eye calibration or a "
-            "configuration",
-            common.EXIT_USAGE,
+        raise InputError(
+            f"{source.name}: is {source.kind} without a camera; a camera calibration, a hand/eye calibration or a "
+            "configuration"
         )
-    try:
-        exported = write_camera(
-            source.lens,
-            arguments.format,
-            notes,
-            name=_name(arguments),
-            file=str(source.path),
-            suffix=Path(arguments.out or "").suffix,
-            fit=arguments.fit,
-        )
-    except InterchangeError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    exported = write_camera(
+        source.lens,
+        arguments.format,
+        notes,
+        name=_name(arguments),
+        file=source.name,
+        suffix=Path(arguments.out or "").suffix,
+        fit=arguments.fit,
+    )
     for warning in exported.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     return exported.data
@@ -149,10 +142,9 @@ def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Na
     from gripmon.calibrate.interchange.hand_eye import HandEye, write_hand_eye
 
     if source.cam_T_grip is None:
-        raise common.CommandFailedError(
-            f"{source.path}: is {source.kind}, which has no hand/eye transform; a hand/eye calibration, a "
-            "configuration, a monitor's state or its estimates",
-            common.EXIT_USAGE,
+        raise InputError(
+            f"{source.name}: is {source.kind}, which has no hand/eye transform; a hand/eye calibration, a "
+            "configuration, a monitor's state or its estimates"
         )
     frames = {key: getattr(arguments, key) or default for key, (_, default) in _FRAMES.items()}
     try:
@@ -165,7 +157,7 @@ def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Na
         )
         return write_hand_eye(hand_eye, arguments.format, notes).encode()
     except ValueError as error:
-        raise common.CommandFailedError(f"calibrate export: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"calibrate export: {error}") from None
 
 
 def _name(arguments: argparse.Namespace) -> str:
@@ -173,7 +165,5 @@ def _name(arguments: argparse.Namespace) -> str:
 
     name = arguments.name or "gripmon"
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
-        raise common.CommandFailedError(
-            f"--name {name}: isn't a plain name; letters, digits, _ . and -", common.EXIT_USAGE
-        )
+        raise InputError(f"--name {name}: isn't a plain name; letters, digits, _ . and -")
     return str(name)

@@ -56,19 +56,14 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate import``."""
     from gripmon.calibrate.documents import CameraCalibration
     from gripmon.calibrate.interchange.cameras import ReadOptions, format_of, read_camera
-    from gripmon.calibrate.interchange.fault import InterchangeError
-    from gripmon.cli.calibration_sources import read_bytes
+    from gripmon.daemon.calibrations import read_bytes
     from gripmon.model.provenance import provenance_of
 
     out, path = Path(arguments.out), Path(arguments.file)
     files.check_output(out, force=arguments.force)
     data = read_bytes(path)
-    try:
-        kind = arguments.format or format_of(data, str(path))
-        options = ReadOptions(arguments.camera, arguments.size, arguments.fisheye)
-        camera = read_camera(data, str(path), kind, options)
-    except InterchangeError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    kind = arguments.format or format_of(data, str(path))
+    camera = read_camera(data, str(path), kind, ReadOptions(arguments.camera, arguments.size, arguments.fisheye))
     said = {
         "--format": arguments.format,
         "--camera": arguments.camera,

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import calibration_files as files
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.documents import CameraCalibration
-    from gripmon.laser.pointer.calibrating import LaserResult, Spots
+    from gripmon.laser.api import CalibratedLaser
     from gripmon.laser.pointer.document import LaserCalibration
     from gripmon.laser.pointer.planning import Plan
-    from gripmon.laser.pointer.samples import Samples
-    from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise
-    from gripmon.model.records import Array
+    from gripmon.model.provenance import Provenance
 
 LONGEST_ARM_M = 20.0
 _DESCRIPTION = """\
@@ -83,34 +81,32 @@ def _reach(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate laser``."""
+    from gripmon.daemon.config.calibrated import read_camera
+    from gripmon.laser.api import PoseNoise, calibrate_laser
+    from gripmon.laser.pointer.samples import plan_table
+
     out = Path(arguments.out)
-    files.check_output(out, force=arguments.force)
+    _check_outputs(arguments)
+    camera = read_camera(Path(arguments.camera))
+    with files.errors_of("laser"):
+        found = calibrate_laser(
+            [Path(name) for name in arguments.data],
+            camera,
+            refine_lens=arguments.refine_lens,
+            arm_noise=None if arguments.arm_noise is None else PoseNoise(*arguments.arm_noise),
+            progress=common.progress_bar,
+        )
+    for line in found.unseen:
+        print(line, file=sys.stderr)
+    with files.errors_of("laser --plan"):
+        planned = None if arguments.plan is None else found.plan(arguments.reach, arguments.poses)
+    written = found.document(_provenance(found, arguments))
     if arguments.picture is not None:
-        files.check_picture(Path(arguments.picture), force=arguments.force)
+        files.write_picture(found.picture(), Path(arguments.picture))
     if arguments.recording is not None:
-        files.check_output(Path(arguments.recording), force=arguments.force, option="--recording")
-    if arguments.plan is not None:
-        if arguments.reach is None:
-            raise common.CommandFailedError("--plan needs --reach: how far the arm reaches; metres", common.EXIT_USAGE)
-        files.check_output(Path(arguments.plan), force=arguments.force, option="--plan")
-    calibration = _camera(arguments.camera)
-    samples, spots, inputs, notes = _data(arguments, calibration)
-    prior = _prior(calibration, arguments)
-    if prior is None:
-        notes = (*notes, f"{arguments.camera} says nothing of the camera's errors: it counts as exact")
-    result = _calibrated(calibration, prior, samples, spots, arguments)
-    written = _document(result, samples, notes, inputs, arguments)
-    planned = _planned(result, arguments)
-    if arguments.picture is not None:
-        from gripmon.laser.pointer.picture import draw
-
-        files.write_picture(draw(result, samples.base_T_ee, written), Path(arguments.picture))
-    if arguments.recording is not None:
-        _record(result, samples.base_T_ee, Path(arguments.recording))
+        _record(found, Path(arguments.recording))
     if planned is not None:
-        from gripmon.cli.laser_tables import write_plan
-
-        write_plan(planned, Path(arguments.plan))
+        files.write_bytes(plan_table(planned), Path(arguments.plan), "--plan")
     files.write_document(written, out)
     _report(written)
     if planned is not None:
@@ -119,138 +115,37 @@ def run(arguments: argparse.Namespace) -> int:
     return common.EXIT_DONE
 
 
-def _camera(name: str) -> CameraCalibration:
-    from gripmon.daemon.config.calibrated import read_camera
-    from gripmon.daemon.config.errors import ConfigError
-
-    try:
-        return read_camera(Path(name))
-    except ConfigError as error:
-        raise common.CommandFailedError(f"--camera: {error}", common.EXIT_USAGE) from None
-
-
-def _data(
-    arguments: argparse.Namespace, calibration: CameraCalibration
-) -> tuple[Samples, Spots, list[Path], tuple[str, ...]]:
-    """Samples that have a spot, their spots, all input files, and what is to be noted."""
-    from gripmon.cli import laser_tables
-    from gripmon.laser.pointer.samples import picked
-
-    paths = [Path(name) for name in arguments.data]
-    samples, origins = laser_tables.read_tables(paths)
-    size_px = (calibration.camera.width_px, calibration.camera.height_px)
-    spots, kept, missing = laser_tables.find_spots(samples, origins, size_px)
-    for line in missing:
-        print(line, file=sys.stderr)
-    if not kept:
-        raise common.CommandFailedError(f"calibrate laser: none of {len(samples)} images shows a spot")
-    inputs = [*paths, Path(arguments.camera), *laser_tables.image_files(samples, origins)]
-    return picked(samples, kept), spots, inputs, tuple(missing)
+def _check_outputs(arguments: argparse.Namespace) -> None:
+    files.check_output(Path(arguments.out), force=arguments.force)
+    if arguments.picture is not None:
+        files.check_picture(Path(arguments.picture), force=arguments.force)
+    if arguments.plan is not None and arguments.reach is None:
+        raise InputError("--plan needs --reach: how far the arm reaches; metres")
+    for option in ("recording", "plan"):
+        if getattr(arguments, option) is not None:
+            files.check_output(Path(getattr(arguments, option)), force=arguments.force, option=f"--{option}")
 
 
-def _calibrated(
-    calibration: CameraCalibration,
-    prior: LensPrior | None,
-    samples: Samples,
-    spots: Spots,
-    arguments: argparse.Namespace,
-) -> LaserResult:
-    from gripmon.calibrate.sighting import CalibrationError
-    from gripmon.laser.pointer.calibrating import calibrate
-    from gripmon.model.camera import make_camera
-
-    try:
-        camera = make_camera(calibration.camera)
-    except ValueError as error:
-        raise common.CommandFailedError(f"--camera {arguments.camera}: {error}", common.EXIT_USAGE) from None
-    try:
-        return calibrate(
-            camera,
-            samples.base_T_ee,
-            spots,
-            samples.groups,
-            lens=prior,
-            refine_lens=arguments.refine_lens,
-            pose_noise=_noise(arguments.arm_noise),
-        )
-    except CalibrationError as error:
-        raise common.CommandFailedError(f"calibrate laser: {error}") from None
-
-
-def _noise(given: tuple[float, float] | None) -> PoseNoise | None:
-    from gripmon.laser.pointer.spot_problem import PoseNoise
-
-    return None if given is None else PoseNoise(*given)
-
-
-def _prior(calibration: CameraCalibration, arguments: argparse.Namespace) -> LensPrior | None:
-    """What the camera's file knows of its lens; None where it says nothing of its errors."""
-    import numpy as np
-
-    from gripmon.calibrate.intrinsics import lens_vector, model_of
-    from gripmon.calibrate.lens_models import LensModel, parameter_names
-    from gripmon.laser.pointer.spot_problem import LensPrior
-
-    camera = calibration.camera
-    count = len(calibration.parameters)
-    kind = model_of(camera)
-    names, values = parameter_names(kind), lens_vector(camera)
-    unknown = [key for key in calibration.parameters if key not in names]
-    if count == 0 or unknown or len(values) != len(names):
-        if not arguments.refine_lens:
-            return None
-        raise common.CommandFailedError(
-            f"--refine-lens: {arguments.camera} has no covariance of parameters that can be refined; a file of gripmon "
-            "calibrate intrinsics",
-            common.EXIT_USAGE,
-        )
-    free = tuple(names.index(key) for key in calibration.parameters)
-    model = LensModel(kind, camera.width_px, camera.height_px)
-    return LensPrior(model, values, free, np.array(calibration.covariance).reshape(count, count))
-
-
-def _document(
-    result: LaserResult, samples: Samples, notes: tuple[str, ...], inputs: list[Path], arguments: argparse.Namespace
-) -> LaserCalibration:
-    from gripmon.laser.pointer.calibrating import groups_of
-    from gripmon.laser.pointer.document import document
-    from gripmon.laser.pointer.planar_start import SEED
+def _provenance(found: CalibratedLaser, arguments: argparse.Namespace) -> Provenance:
+    from gripmon.laser.api import SEED
     from gripmon.model.provenance import provenance_of
 
-    noise = None if arguments.arm_noise is None else ":".join(f"{value:g}" for value in arguments.arm_noise)
-    options = {
-        "--camera": arguments.camera, "--out": arguments.out, "--picture": arguments.picture,
-        "--recording": arguments.recording, "--refine-lens": arguments.refine_lens, "--arm-noise": noise,
-        "--plan": arguments.plan, "--poses": arguments.poses if arguments.plan is not None else None,
-        "--reach": arguments.reach, "--force": arguments.force,
-    }  # fmt: skip
-    provenance = provenance_of(files.command_line("laser", arguments.data, options), inputs, SEED)
-    other = [name for name, k in zip(samples.names, result.candidate, strict=True) if k > 0]
-    if other:
-        notes = (*notes, f"not the brightest place but another one is the spot in: {', '.join(other)}")
-    orientations = len(groups_of(samples.groups, samples.base_T_ee))
-    return document(result.refined, samples.names, orientations, (*notes, *result.warnings), provenance)
+    options = files.options_of(arguments, "camera", "out", "picture", "recording", "refine-lens", "arm-noise", "plan")
+    if arguments.arm_noise is not None:
+        options["--arm-noise"] = ":".join(f"{value:g}" for value in arguments.arm_noise)
+    options |= {"--poses": arguments.poses if arguments.plan is not None else None}
+    options |= files.options_of(arguments, "reach", "force")
+    inputs = [*map(Path, arguments.data), Path(arguments.camera), *found.files]
+    return provenance_of(files.command_line("laser", arguments.data, options), inputs, SEED)
 
 
-def _record(result: LaserResult, base_T_ee: Array, path: Path) -> None:
+def _record(found: CalibratedLaser, path: Path) -> None:
     from gripmon.record.write.laser_scene import write
 
     try:
-        write(path, result.refined, base_T_ee, result.uv_px)
+        write(path, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
     except OSError as error:
         raise common.not_writable(path, error, "--recording") from None
-
-
-def _planned(result: LaserResult, arguments: argparse.Namespace) -> Plan | None:
-    from gripmon.calibrate.sighting import CalibrationError
-    from gripmon.laser.pointer.planning import Arm, plan
-
-    if arguments.plan is None:
-        return None
-    try:
-        return plan(result.refined, Arm(arguments.reach), arguments.poses)
-    except CalibrationError as error:
-        raise common.CommandFailedError(f"calibrate laser --plan: {error}") from None
 
 
 def _report_plan(planned: Plan) -> None:

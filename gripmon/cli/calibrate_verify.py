@@ -5,14 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gripmon.cli import calibration_files as files
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.verify import CameraDifference, HandEyeDifference
-    from gripmon.cli.calibration_sources import Calibrated
+    from gripmon.calibrate.verify import Calibrated, CameraDifference, HandEyeDifference, Verdict
 
 DEFAULT_LEVEL = 0.01
 
@@ -80,112 +82,116 @@ def _share(text: str) -> float:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate verify``."""
-    from gripmon.calibrate.sighting import CalibrationError
-    from gripmon.cli.calibration_sources import read_calibrated
+    from gripmon.calibrate.api import verify
+    from gripmon.daemon.calibrations import measure_again, read_calibrated
 
-    if (arguments.tolerance_mm is None) is not (arguments.tolerance_deg is None):
-        raise common.CommandFailedError(
-            "--tolerance-mm and --tolerance-deg: one without the other; both or none", common.EXIT_USAGE
-        )
+    mm, deg = arguments.tolerance_mm, arguments.tolerance_deg
+    if (mm is None) is not (deg is None):
+        raise InputError("--tolerance-mm and --tolerance-deg: one without the other; both or none")
     first = read_calibrated(Path(arguments.first))
-    warnings: list[str] = []
+    doubts: tuple[str, ...] = ()
     if _are_images(arguments.second):
-        from gripmon.cli.verifying import measured
-
-        second = measured(first, arguments, warnings)
-    else:
-        _check_no_image_options(arguments)
-        if len(arguments.second) > 1:
-            raise common.CommandFailedError(
-                f"{arguments.second[1]}: a third calibration; two of them, or images", common.EXIT_USAGE
+        target = None if arguments.target is None else files.target_of(arguments.target)
+        with files.errors_of("verify"):
+            second, doubts = measure_again(
+                first, arguments.second, arguments.config, target, jaw_opening_m=arguments.jaw_opening
             )
-        second = read_calibrated(Path(arguments.second[0]))
-    try:
-        result = _compared(first, second, arguments, warnings)
-    except CalibrationError as error:
-        raise common.CommandFailedError(
-            f"calibrate verify: {first.path} and {second.path}: {error}", common.EXIT_USAGE
-        ) from None
-    if arguments.json:
-        print(json.dumps({**result["values"], "same": result["same"], "level": arguments.level, "warnings": warnings}))
     else:
-        print("\n".join([*result["lines"], *(f"warning: {w}" for w in warnings), result["verdict"]]))
-    return common.EXIT_DONE if result["same"] else common.EXIT_FAILED
+        second = _other(arguments)
+    found = verify(
+        first,
+        second,
+        level=arguments.level,
+        tolerance_m=None if mm is None else 1e-3 * mm,
+        tolerance_rad=None if deg is None else math.radians(deg),
+        tolerance_px=arguments.tolerance_px,
+    )
+    found = replace(found, warnings=(*doubts, *found.warnings))
+    given = mm is not None or arguments.tolerance_px is not None
+    if arguments.json:
+        print(json.dumps(_values(found, given=given)))
+    else:
+        print("\n".join([*_lines(found), *(f"warning: {w}" for w in found.warnings), _verdict(found, given=given)]))
+    return common.EXIT_DONE if found.same else common.EXIT_FAILED
 
 
 def _are_images(names: list[str]) -> bool:
-    from gripmon.io.sources.folder import IMAGE_SUFFIXES
+    from gripmon.model.images import IMAGE_SUFFIXES
 
     return any(Path(n).is_dir() or Path(n).suffix.lower() in IMAGE_SUFFIXES for n in names)
 
 
-def _check_no_image_options(arguments: argparse.Namespace) -> None:
+def _other(arguments: argparse.Namespace) -> Calibrated:
+    from gripmon.daemon.calibrations import read_calibrated
+
     for option in ("config", "target", "jaw_opening"):
         if getattr(arguments, option) is not None:
-            raise common.CommandFailedError(
-                f"--{option.replace('_', '-')}: has a meaning only with images; leave it out", common.EXIT_USAGE
-            )
+            raise InputError(f"--{option.replace('_', '-')}: has a meaning only with images; leave it out")
+    if len(arguments.second) > 1:
+        raise InputError(f"{arguments.second[1]}: a third calibration; two of them, or images")
+    return read_calibrated(Path(arguments.second[0]))
 
 
-def _compared(
-    first: Calibrated, second: Calibrated, arguments: argparse.Namespace, warnings: list[str]
-) -> dict[str, Any]:
-    if first.cam_T_grip is not None and second.cam_T_grip is not None:
-        return _hand_eyes(first, second, arguments, warnings)
-    if first.lens is not None and second.lens is not None:
-        return _cameras(first, second, arguments)
-    raise common.CommandFailedError(
-        f"{first.path} is {first.kind}, {second.path} is {second.kind}; two of one kind", common.EXIT_USAGE
-    )
+def _values(found: Verdict, *, given: bool) -> dict[str, Any]:
+    from gripmon.calibrate.verify import HandEyeDifference
 
-
-def _hand_eyes(
-    first: Calibrated, second: Calibrated, arguments: argparse.Namespace, warnings: list[str]
-) -> dict[str, Any]:
-    import numpy as np
-
-    from gripmon.calibrate.verify import compare_hand_eye
-    from gripmon.model.geometry import from_record
-
-    if arguments.tolerance_px is not None:
-        raise common.CommandFailedError("--tolerance-px: is for two cameras; leave it out", common.EXIT_USAGE)
-    if first.lens is not None and second.lens is not None and first.lens != second.lens:
-        warnings.append("made with different camera calibrations, which may explain a difference")
-    if first.gripper is not None and second.gripper is not None and first.gripper != second.gripper:
-        warnings.append(f"made with different gripper files ({first.gripper.name}, {second.gripper.name})")
-    assert first.cam_T_grip is not None and second.cam_T_grip is not None
-    found = compare_hand_eye(
-        from_record(first.cam_T_grip),
-        np.reshape(first.covariance, (6, 6)),
-        from_record(second.cam_T_grip),
-        np.reshape(second.covariance, (6, 6)),
-    )
-    shift_mm = 1e3 * float(np.linalg.norm(found.position_m))
-    turn_deg = math.degrees(float(np.linalg.norm(found.rotation_rad)))
-    within = (
-        arguments.tolerance_mm is not None
-        and shift_mm <= arguments.tolerance_mm
-        and turn_deg <= arguments.tolerance_deg
-    )
-    same = found.p_value >= arguments.level or within
-    values = {
-        "kind": "hand_eye",
-        "position_m": found.position_m.tolist(),
-        "position_sigma_m": found.position_sigma_m.tolist(),
-        "rotation_rad": found.rotation_rad.tolist(),
-        "rotation_sigma_rad": found.rotation_sigma_rad.tolist(),
-        "chi2": found.chi2,
-        "degrees_of_freedom": 6,
-        "p_value": found.p_value,
-        "position_p_value": found.position_p,
-        "rotation_p_value": found.rotation_p,
-        "within_tolerance": within if arguments.tolerance_mm is not None else None,
+    difference: Any = found.difference
+    said = {
+        "within_tolerance": found.within if given else None,
+        "same": found.same,
+        "level": found.level,
+        "warnings": list(found.warnings),
     }
-    lines = _hand_eye_lines(found, shift_mm, turn_deg)
-    return {"values": values, "lines": lines, "same": same, "verdict": _verdict(same, within, arguments.level)}
+    if isinstance(difference, HandEyeDifference):
+        return {
+            "kind": "hand_eye",
+            "position_m": difference.position_m.tolist(),
+            "position_sigma_m": difference.position_sigma_m.tolist(),
+            "rotation_rad": difference.rotation_rad.tolist(),
+            "rotation_sigma_rad": difference.rotation_sigma_rad.tolist(),
+            "chi2": difference.chi2,
+            "degrees_of_freedom": 6,
+            "p_value": difference.p_value,
+            "position_p_value": difference.position_p,
+            "rotation_p_value": difference.rotation_p,
+            **said,
+        }
+    return {
+        "kind": "camera",
+        "largest_px": difference.largest_px,
+        "largest_sigma_px": difference.largest_sigma_px if difference.p_value is not None else None,
+        "at_px": difference.at_px.tolist(),
+        "rms_px": difference.rms_px,
+        "turn_rad": difference.turn_rad.tolist(),
+        "largest_turned_px": difference.largest_turned_px,
+        "p_value": difference.p_value,
+        "compared": difference.compared,
+        **said,
+    }
 
 
-def _hand_eye_lines(found: HandEyeDifference, shift_mm: float, turn_deg: float) -> list[str]:
+def _lines(found: Verdict) -> list[str]:
+    from gripmon.calibrate.verify import HandEyeDifference
+
+    difference = found.difference
+    return _hand_eye_lines(difference) if isinstance(difference, HandEyeDifference) else _camera_lines(difference)
+
+
+def _verdict(found: Verdict, *, given: bool) -> str:
+    if found.same and found.within:
+        return "same: within the tolerance" if given else "same: the difference is negligible"
+    if not found.same and found.difference.p_value is None:
+        return "different: beyond the tolerance"
+    return (
+        f"same (not told apart at a level of {found.level:g})"
+        if found.same
+        else (f"different (at a level of {found.level:g})")
+    )
+
+
+def _hand_eye_lines(found: HandEyeDifference) -> list[str]:
+    shift_mm = 1e3 * math.hypot(*found.position_m.tolist())
+    turn_deg = math.degrees(math.hypot(*found.rotation_rad.tolist()))
     lines = ["second less first, camera axes    " + "".join(f"{axis:<19}" for axis in "xyz").rstrip()]
     rows = (
         ("TCP (mm)", 1e3 * found.position_m, 1e3 * found.position_sigma_m),
@@ -204,53 +210,6 @@ def _hand_eye_lines(found: HandEyeDifference, shift_mm: float, turn_deg: float) 
 
 def _chance(probability: float) -> str:
     return "probability below 1e-9" if probability < 1e-9 else f"probability {probability:.2g}"
-
-
-def _verdict(same: bool, within: bool, level: float, *, given: bool = True) -> str:
-    if same and within:
-        return "same: within the tolerance" if given else "same: the difference is negligible"
-    return f"same (not told apart at a level of {level:g})" if same else f"different (at a level of {level:g})"
-
-
-def _cameras(first: Calibrated, second: Calibrated, arguments: argparse.Namespace) -> dict[str, Any]:
-    import numpy as np
-
-    from gripmon.calibrate.verify import NEGLIGIBLE_PX, CalibratedCamera, compare_cameras
-
-    if arguments.tolerance_mm is not None:
-        raise common.CommandFailedError("--tolerance-mm: is for hand/eye calibrations; leave it out", common.EXIT_USAGE)
-    calibrated = []
-    for one in (first, second):
-        assert one.lens is not None
-        count = len(one.parameters)
-        calibrated.append(CalibratedCamera(one.lens, one.parameters, np.reshape(one.lens_covariance, (count, count))))
-    found = compare_cameras(*calibrated)
-    within = arguments.tolerance_px is not None and found.largest_px <= arguments.tolerance_px
-    within = within or found.largest_px <= NEGLIGIBLE_PX
-    if found.p_value is None and arguments.tolerance_px is None and not within:
-        raise common.CommandFailedError(
-            f"{first.path} and {second.path}: up to {found.largest_px:.3g} px apart, and neither says how certain it "
-            "is; --tolerance-px PX for a difference that doesn't matter",
-            common.EXIT_USAGE,
-        )
-    same = within or (found.p_value is not None and found.p_value >= arguments.level)
-    values = {
-        "kind": "camera",
-        "largest_px": found.largest_px,
-        "largest_sigma_px": found.largest_sigma_px if found.p_value is not None else None,
-        "at_px": found.at_px.tolist(),
-        "rms_px": found.rms_px,
-        "turn_rad": found.turn_rad.tolist(),
-        "largest_turned_px": found.largest_turned_px,
-        "p_value": found.p_value,
-        "compared": found.compared,
-        "within_tolerance": within if arguments.tolerance_px is not None else None,
-    }
-    lines = _camera_lines(found)
-    verdict = _verdict(same, within, arguments.level, given=arguments.tolerance_px is not None)
-    if not same and found.p_value is None:
-        verdict = "different: beyond the tolerance"
-    return {"values": values, "lines": lines, "same": same, "verdict": verdict}
 
 
 def _camera_lines(found: CameraDifference) -> list[str]:

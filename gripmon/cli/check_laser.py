@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatch, SpotWatchSettings
+    from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatchSettings
     from gripmon.laser.watch.foresight import Foresight
     from gripmon.model.records import Array
 
@@ -55,9 +56,7 @@ def refuse_without_laser(arguments: argparse.Namespace) -> None:
     for name in _OPTIONS:
         if getattr(arguments, name) is not None:
             option = name.replace("_", "-")
-            raise common.CommandFailedError(
-                f"--{option}: only has a meaning for a laser calibration; add --laser LASER.yaml", common.EXIT_USAGE
-            )
+            raise InputError(f"--{option}: only has a meaning for a laser calibration; add --laser LASER.yaml")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -87,36 +86,29 @@ def _settings(arguments: argparse.Namespace) -> SpotWatchSettings:
             continue
         if value > most:
             option = name.replace("_", "-")
-            raise common.CommandFailedError(f"--{option} {value:g}: too many; at most {most:g}", common.EXIT_USAGE)
+            raise InputError(f"--{option} {value:g}: too many; at most {most:g}")
         given[key] = value
     return SpotWatchSettings(**given)
 
 
 def _calibration(path: Path) -> LaserCalibration:
-    from gripmon.daemon.config.errors import ConfigError
     from gripmon.daemon.config.second import read_laser
 
     if not path.is_file():
-        raise common.CommandFailedError(
-            f"--laser {path}: there is no such file; a file of gripmon calibrate laser", common.EXIT_USAGE
-        )
-    try:
-        return read_laser(path, path)
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+        raise InputError(f"--laser {path}: there is no such file; a file of gripmon calibrate laser")
+    return read_laser(path, path)
 
 
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
     """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
-    from gripmon.calibrate.sighting import CalibrationError
     from gripmon.laser.watch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
     from gripmon.laser.watch.world import calibrated
 
     known = calibrated(calibration)
     try:
         found = foresight(known, settings, assumed_poses(known))
-    except CalibrationError as error:
-        raise common.CommandFailedError(f"{name}: {error}") from None
+    except NoResultError as error:
+        raise NoResultError(f"{name}: {error}") from None
     return {
         **_header(name, calibration, settings),
         "assumed": {
@@ -188,22 +180,19 @@ def _header_lines(report: dict[str, Any]) -> list[str]:
 
 
 def _judged(name: str, calibration: LaserCalibration, settings: SpotWatchSettings, paths: list[Path]) -> dict[str, Any]:
-    from gripmon.cli import laser_tables
-    from gripmon.laser.watch import SpotSeen, SpotWatch
+    from gripmon.laser.api import check_laser
 
-    samples, origins = laser_tables.read_tables(paths)
-    size_px = (calibration.camera.width_px, calibration.camera.height_px)
-    watch = SpotWatch(calibration, settings)
-    rows, last = [], None
-    candidates = laser_tables.candidates(samples, origins, size_px)
-    for k, (pose, found) in enumerate(zip(samples.base_T_ee, candidates, strict=True)):
-        last = watch.judge(SpotSeen(k, pose, found))
-        rows.append(_row(samples.names[k], last))
-    assert last is not None, "a table without samples is refused when it is read"
+    found = check_laser(calibration, paths, settings, common.progress_bar)
+    last = found.last
     return {
         **_header(name, calibration, settings),
-        **_conclusion(watch, rows, last),
-        "spots_judged": rows,
+        "verdict": found.verdict,
+        "text": found.text,
+        "cause": None if found.alert is None else str(found.alert.cause),
+        "causes": [{"cause": str(w.cause), "probability": w.probability} for w in last.causes],
+        "probability_moved": last.probability_moved,
+        "motion": None if last.motion is None else _motion_values(last.motion),
+        "spots_judged": [_row(sample, judged) for sample, judged in found.judged],
     }
 
 
@@ -240,27 +229,6 @@ def _values(array: Array | None) -> Any:
     out = array.astype(object)
     out[~np.isfinite(array)] = None
     return out.tolist()
-
-
-def _conclusion(watch: SpotWatch, rows: list[dict[str, Any]], last: SpotJudgement) -> dict[str, Any]:
-    """``same``; ``moved``; ``unclear`` where fewer than half of the spots could be believed."""
-    alert = watch.motion_alert  # of all spots: the one that was raised knew the first few only
-    believed = sum(row["used"] for row in rows)
-    if alert is not None:
-        verdict, text = "moved", alert.text
-    elif 2 * believed <= len(rows):
-        verdict = "unclear"
-        text = f"only {believed} of {len(rows)} spots can be believed, too few or too different to tell a motion by"
-    else:
-        verdict, text = "same", f"{believed} of {len(rows)} spots are where the calibration has them"
-    return {
-        "verdict": verdict,
-        "text": text,
-        "cause": None if alert is None else str(alert.cause),
-        "causes": [{"cause": str(w.cause), "probability": w.probability} for w in last.causes],
-        "probability_moved": last.probability_moved,
-        "motion": None if last.motion is None else _motion_values(last.motion),
-    }
 
 
 def _motion_values(motion: CameraMotion) -> dict[str, Any]:

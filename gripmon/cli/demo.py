@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common, viewing
 from gripmon.cli.run import run_daemon
+from gripmon.model.stopping import signals_exit
 
 if TYPE_CHECKING:
     from gripmon.cli.comparison import Comparison, Distribution, EventReport, TcpErrors
@@ -87,7 +88,12 @@ def run(arguments: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     bar = common.progress_bar(simulator.frame_count, "frame")
-    with bar as step, _Receiver(config, step) as receiver, ExitStack() as messages:
+    with (
+        signals_exit() as stop,
+        bar as step,
+        _Receiver(config, step) as receiver,
+        ExitStack() as messages,
+    ):
 
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:
             x, y, z = simulator.truth(seq).cam_T_grip[:3, 3].tolist()
@@ -100,6 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         code = run_daemon(
             config,
             out=out,
+            stop=stop,
             recording_name="demo",
             truth_tcp_m=truth_tcp_m,
             on_network=on_network,

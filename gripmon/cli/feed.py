@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Publish images over Zenoh in real time, as the driver of a wrist camera would, for a monitor whose
 configuration says source: {kind: zenoh}.  For trying things out, and as an example of a driver:
-docs/network_camera.md says what is on the wire."""
+docs/howto/network_camera.md says what is on the wire."""
 
 _EXAMPLES = """\
   gripmon feed images/ --robot arm1
   gripmon feed wrist.mp4 --robot arm1 --format jpeg --loop
   gripmon feed /dev/video0 --robot arm1 --connect tcp/192.168.1.2:7447
-  gripmon feed images/ --robot arm1 --zenoh-config mine/zenoh/robot.json5    docs/security.md
+  gripmon feed images/ --robot arm1 --zenoh-config mine/zenoh/robot.json5    docs/howto/security.md
 
 exit codes: 0 the images are at their end; 2 wrong usage; 3 nothing could be sent; 130 interrupted"""
 

@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gripmon.cli import common
-
-if TYPE_CHECKING:
-    from gripmon.record.read import Collection
 
 _DESCRIPTION = """\
 Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
@@ -63,31 +61,29 @@ def run(arguments: argparse.Namespace) -> int:
     json_path = None if arguments.json in (None, "-") else Path(arguments.json)
     for path, option in ((page_path, "--out"), (json_path, "--json")):
         _check_folder(path, option)
-    collection = _read([Path(name) for name in arguments.recordings])
-    from gripmon.analyse.report import build
+    from gripmon.analyse.api import report
     from gripmon.model.atomic import write_atomically
-    from gripmon.model.records import to_json
 
     millimetres, degrees = arguments.limit_mm, arguments.limit_deg
-    report, told = build(
-        collection.recordings,
-        collection.faults,
-        None if millimetres is None else 1e-3 * millimetres,
-        None if degrees is None else math.radians(degrees),
-    )
-    _say_faults(report.faults, told)
+    with ReadingBar() as progress:
+        found = report(
+            arguments.recordings,
+            limit_m=None if millimetres is None else 1e-3 * millimetres,
+            limit_rad=None if degrees is None else math.radians(degrees),
+            progress=progress,
+        )
+    for fault in found.faults:
+        print(f"report: {fault}", file=sys.stderr)
     if arguments.json == "-":
-        print(to_json(report).decode())
+        print(found.json().decode())
     elif json_path is not None:
-        _write(write_atomically, json_path, to_json(report) + b"\n", "--json")
+        _write(write_atomically, json_path, found.json() + b"\n", "--json")
     if page_path is not None:
-        from gripmon.analyse.report.page import page
-
-        with common.progress_bar(len(told), "recording") as step:
-            data = page(report, told, step)
+        with common.progress_bar(len(found.told), "recording") as step:
+            data = found.html(step)
         _write(write_atomically, page_path, data, "--out")
     if arguments.json != "-":
-        print(report.summary)
+        print(found.report.summary)
         print("\n".join(f"written: {path}" for path in (page_path, json_path) if path is not None))
     return common.EXIT_DONE
 
@@ -114,41 +110,12 @@ def _write(write: Any, path: Path, data: bytes, option: str) -> None:
         raise common.not_writable(path, error, option) from None
 
 
-def _read(paths: list[Path]) -> Collection:
-    """All recordings; ends the command where there is none, or nothing in them."""
-    from gripmon.record.read import open_recordings
+class ReadingBar:
+    """A progress bar on stderr of the bytes that are read, for a person; its context gives the function to call."""
 
-    for path in paths:
-        if not path.exists():
-            raise common.CommandFailedError(
-                f"report: {path}: there is no such file; recordings (.rrd), or folders of them", common.EXIT_USAGE
-            )
-    with _Bytes() as progress:
-        collection = open_recordings(paths, progress)
-    if not collection.recordings:
-        reasons = "; ".join(collection.faults) or "no recording (.rrd) there"
-        # A recording that is damaged, or another application's, isn't the user's mistake; any other file is.
-        recordings = any(path.suffix.lower() in (".rrd", ".jsonl") for path in paths)
-        raise common.CommandFailedError(f"report: {reasons}", common.EXIT_FAILED if recordings else common.EXIT_USAGE)
-    if not any(len(recording.frames) for recording in collection.recordings):
-        faults = [*collection.faults, *(fault for r in collection.recordings for fault in r.faults)]
-        raise common.CommandFailedError(
-            f"report: no frame could be read: {'; '.join(faults) or 'the recordings are empty'}", common.EXIT_FAILED
-        )
-    return collection
-
-
-def _say_faults(faults: tuple[str, ...], told: Any) -> None:
-    for fault in [*faults, *(fault for each in told for fault in each.report.faults)]:
-        print(f"report: {fault}", file=sys.stderr)
-
-
-class _Bytes:
-    """A progress bar on stderr of what is read, for a person."""
-
-    def __enter__(self) -> Any:
+    def __enter__(self) -> Callable[[int, int], None]:
         if not sys.stderr.isatty():
-            return None
+            return lambda _done, _total: None
         from tqdm import tqdm
 
         self._bar = tqdm(unit="B", unit_scale=True, file=sys.stderr, dynamic_ncols=True, desc="reading", leave=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import camera_source, common, promising, second_run, viewing
+from gripmon.model.stopping import StopRequest, signals_exit
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
@@ -32,7 +33,7 @@ from the last reference, checks in the picture that it still fits, and says so (
 
 A configuration with a section laser is that of a second camera, beside the robot: its calibration is
 tested with every pulse of a laser pointer on the arm, which the robot's program tells
-(docs/laser.md, Watching)."""
+(docs/howto/laser.md, Watching)."""
 
 _EXAMPLES = """\
   gripmon run configs/live_camera.yaml
@@ -83,6 +84,11 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
+    with signals_exit() as stop:
+        return _run(arguments, stop)
+
+
+def _run(arguments: argparse.Namespace, stop: StopRequest) -> int:
     second = second_run.load(arguments.config)
     if second is not None:
         if arguments.fresh_state:
@@ -96,6 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
             verbose=arguments.verbose,
             view=arguments.view,
             take_over=arguments.take_over,
+            stop=stop,
         )
     config = common.load(arguments.config)
     camera_source.look_ahead(config)
@@ -110,6 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         fresh_state=arguments.fresh_state,
         view=arguments.view,
         take_over=arguments.take_over,
+        stop=stop,
     )
 
 
@@ -117,6 +125,7 @@ def run_daemon(
     config: Config,
     *,
     out: Path | None,
+    stop: StopRequest,
     duration_s: float | None = None,
     verbose: bool = False,
     recording_name: str | None = None,
@@ -130,6 +139,7 @@ def run_daemon(
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
+    ``stop``: from :func:`gripmon.model.stopping.signals_exit`, in which this is called.
     ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
     goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
     ``warns``: it is logged when the view can't keep the alert limits.  ``keep_state``: what survives a restart is read
@@ -151,7 +161,7 @@ def run_daemon(
     if warns and (said := promising.warning(config)) is not None:
         _log.warning("%s", said)
     live = None if view is None else viewing.LiveView(settings.view, view, str(config.path))
-    with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None
         if kept is not None:
             opened.callback(kept.close)
@@ -194,6 +204,7 @@ def run_daemon(
             ),
             notices=_notices(kept),
             duration_s=duration_s,
+            stop=stop,
         )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli import camera_source, common
 from gripmon.cli.viewing import LiveView
+from gripmon.model.stopping import StopRequest
 
 if TYPE_CHECKING:
     from gripmon.daemon import Reports
@@ -30,23 +31,17 @@ class _Network:
 
 
 def load(path: str, *, check_source: bool = True) -> SecondConfig | None:
-    """The configuration if it is a second camera's, else None; a fault ends the command with exit code 2."""
-    from gripmon.daemon.config import ConfigError, is_second, load_second
+    """The configuration if it is a second camera's, else None."""
+    from gripmon.daemon.config import is_second, load_second
 
-    try:
-        return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    return load_second(Path(path), check_source=check_source) if is_second(Path(path)) else None
 
 
 def with_pulses(config: SecondConfig) -> SecondConfig:
-    """The same with the pulses of its table, where that was left out before; ends the command if it can't be read."""
-    from gripmon.daemon.config import ConfigError, load_pulses
+    """The same with the pulses of its table, where that was left out before."""
+    from gripmon.daemon.config import load_pulses
 
-    try:
-        return load_pulses(config)
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    return load_pulses(config)
 
 
 def run_second(
@@ -57,6 +52,7 @@ def run_second(
     verbose: bool,
     view: str | None = None,
     take_over: bool = False,
+    stop: StopRequest,
 ) -> int:
     """Open everything that the configuration names and run the daemon on it; returns the exit code."""
     import cv2
@@ -72,7 +68,7 @@ def run_second(
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
     live = None if view is None else LiveView(settings.view, view, str(config.path))
-    with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()
         network = _open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
@@ -100,6 +96,7 @@ def run_second(
             commands=network.commands,
             reports=with_source(network.reports, source),
             duration_s=duration_s,
+            stop=stop,
         )
 
 

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import hashlib
 import math
 import re
 import shlex
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon import __version__
 from gripmon.cli import common
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.model.records import Image
     from gripmon.teach.edges import Taught
-    from gripmon.track.edges import TaughtModel
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\
@@ -127,74 +122,47 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.page or arguments.corners is not None or arguments.live is not None:
         from gripmon.cli import teach_corners
 
-        return teach_corners.run(arguments)
+        return teach_corners.run(arguments, command(arguments))
     _check_usage(arguments)
-    import cv2
+    from gripmon.daemon.config import load_config
+    from gripmon.daemon.teaching import name_taught
+    from gripmon.teach.api import teach
 
-    from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
-
-    config = common.load(arguments.config, check_source=False, with_taught=False)
-    cv2.setNumThreads(1)
+    config = load_config(Path(arguments.config), check_source=False, with_taught=False)
     out = _out(arguments, config)
-    inputs = [_read(Path(name), config, arguments.jaw_opening) for name in arguments.images]
-    _check_different(inputs)
-    settings = config.settings.monitor
-    images = [
-        TeachingImage(
-            i.image, config.gripper.jaw_nominal_m if i.jaw_opening_m is None else i.jaw_opening_m, str(i.path)
-        )
-        for i in inputs
-    ]
-    try:
-        taught = teach(config.camera, config.gripper, settings.corners, settings.jaw_sigma_m, config.reference, images)
-    except TeachingRefused as refused:
-        raise common.CommandFailedError(f"teach: {refused}") from None
-    model = _model(config, taught, taught.used(inputs), arguments)
-    _write(model, out)
+    taught = teach(config, arguments.images, jaw_opening_m=arguments.jaw_opening, command=command(arguments))
+    _write(out, taught.text().encode(), "--out")
     if arguments.into_config:
-        config = _named_in(config, out)
-    print(_summary(config, taught, out))
+        config = name_taught(config, out)
+    print(_summary(config, taught.taught, out))
     if arguments.picture is not None:
-        _draw(config, model, taught.used(images)[0], Path(arguments.picture))
+        picture = Path(arguments.picture)
+        _write(picture, taught.picture(picture.suffix), "--picture")
     return common.EXIT_DONE
 
 
-def _named_in(config: Config, out: Path) -> Config:
-    """The configuration with the line that names the file, if it hadn't."""
-    import os
-
-    from gripmon.cli.teach_config import with_taught
-    from gripmon.model.atomic import write_atomically
-
-    if config.taught_path is None:
-        name = Path(os.path.relpath(out.resolve(), config.directory.resolve())).as_posix()
-        try:
-            write_atomically(config.path, with_taught(config.path, name).encode())
-        except OSError as error:
-            raise common.not_writable(config.path, error, "--into-config") from None
-    return common.load(str(config.path), check_source=False)
+def command(arguments: argparse.Namespace) -> str:
+    """The command line, as files name it that it writes."""
+    words = ["gripmon", "teach", *(["--page"] if arguments.page else []), *arguments.images]
+    for name in ("live", "corners", "config", "camera", "gripper", "reference", "out", "jaw_opening", "jaw_source"):
+        value = getattr(arguments, name)
+        words += [] if value is None else [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join(words)
 
 
 def _check_usage(arguments: argparse.Namespace) -> None:
     """Without corners by hand images and a configuration are needed; nothing else makes sense."""
+
+    def refuse(text: str) -> None:
+        raise common.CommandFailedError(f"teach: {text}", common.EXIT_USAGE)
+
     if not arguments.images:
-        raise common.CommandFailedError("teach: no image; image files, or --page --live DEVICE", common.EXIT_USAGE)
+        refuse("no image; image files, or --page --live DEVICE")
     if arguments.config is None:
-        raise common.CommandFailedError(
-            "teach: --config is missing; a configuration, or --page with --camera and --gripper", common.EXIT_USAGE
-        )
+        refuse("--config is missing; a configuration, or --page with --camera and --gripper")
     for option in ("camera", "gripper", "reference", "robot", "camera_name", "live_wait", "jaw_source"):
         if getattr(arguments, option) is not None:
-            name = option.replace("_", "-")
-            raise common.CommandFailedError(f"teach: --{name} goes with --page or --corners", common.EXIT_USAGE)
-
-
-@dataclass(frozen=True)
-class _Input:
-    path: Path
-    image: Image
-    sha256: str
-    jaw_opening_m: float | None
+            refuse(f"--{option.replace('_', '-')} goes with --page or --corners")
 
 
 def _out(arguments: argparse.Namespace, config: Config) -> Path:
@@ -222,99 +190,13 @@ def _out(arguments: argparse.Namespace, config: Config) -> Path:
     return out
 
 
-def _read(path: Path, config: Config, jaw_opening_m: float | None) -> _Input:
-    """An image that fits the camera, with its jaw opening; anything else ends the command with exit code 2."""
-    from gripmon.cli.teach_inputs import read_fitting_image
-
-    image = read_fitting_image(path, config.camera, config.gripper, config.settings.monitor.bit_depth)
-    opening_m = _opening(path, config, jaw_opening_m)
-    return _Input(path, image, hashlib.sha256(path.read_bytes()).hexdigest(), opening_m)
-
-
-def _opening(path: Path, config: Config, given_m: float | None) -> float | None:
-    """The jaw opening in an image; None for a gripper without jaw."""
-    from gripmon.cli.teach_inputs import read_opening
-    from gripmon.io.sources.folder import TIMESTAMPS_NAME
-
-    opening_m = read_opening(path, config.gripper, config, given_m)
-    if opening_m is None and config.gripper.has_jaw:
-        raise common.CommandFailedError(
-            f"{path}: its jaw opening isn't known (jaw.source is {config.settings.jaw.source}); --jaw-opening M, or "
-            f"jaw_opening_m in {path.parent / TIMESTAMPS_NAME}",
-            common.EXIT_USAGE,
-        )
-    return opening_m
-
-
-def _check_different(inputs: list[_Input]) -> None:
-    """The same image twice would make the scatter, and so the uncertainty, too small."""
-    seen: dict[str, Path] = {}
-    for one in inputs:
-        if one.sha256 in seen:
-            raise common.CommandFailedError(
-                f"{one.path}: is the same image as {seen[one.sha256]}; each image once", common.EXIT_USAGE
-            )
-        seen[one.sha256] = one.path
-
-
-def _model(config: Config, taught: Taught, inputs: list[_Input], arguments: argparse.Namespace) -> TaughtModel:
-    from datetime import UTC, datetime
-
-    from gripmon.track.edges import TaughtModel
-    from gripmon.track.edges.taught import Provenance, TaughtImage, identity
-
-    camera, gripper, reference = identity(
-        config.camera, config.gripper, config.reference.reference_id, config.cam_T_grip
-    )
-    return TaughtModel(
-        provenance=Provenance(
-            gripmon=__version__,
-            time=datetime.now(UTC).isoformat(timespec="seconds"),
-            command=_command(arguments),
-            images=tuple(TaughtImage(file=str(i.path), sha256=i.sha256, jaw_opening_m=i.jaw_opening_m) for i in inputs),
-            closure_px=taught.closure_px,
-        ),
-        camera=camera,
-        gripper=gripper,
-        reference=reference,
-        edge_settings=config.settings.monitor.corners.edges,
-        edges=taught.edges,
-        corners=taught.corners,
-    )
-
-
-def _command(arguments: argparse.Namespace) -> str:
-    words = ["gripmon", "teach", *arguments.images, "--config", arguments.config]
-    for option, value in (("--out", arguments.out), ("--jaw-opening", arguments.jaw_opening)):
-        words += [] if value is None else [option, str(value)]
-    return shlex.join(words)
-
-
-def _write(model: TaughtModel, out: Path) -> None:
+def _write(path: Path, data: bytes, option: str) -> None:
     from gripmon.model.atomic import write_atomically
-    from gripmon.teach.edges.document import to_yaml
 
     try:
-        write_atomically(out, to_yaml(model).encode())
+        write_atomically(path, data)
     except OSError as error:
-        raise common.not_writable(out, error) from None
-
-
-def _draw(config: Config, model: TaughtModel, image: Any, path: Path) -> None:
-    import cv2
-
-    from gripmon.model.atomic import write_atomically
-    from gripmon.teach.edges.picture import draw
-    from gripmon.track.edges import TaughtEdges
-
-    picture = draw(
-        config.camera, config.gripper, config.cam_T_grip, image, TaughtEdges.of_model(model, config.gripper), model
-    )
-    _, data = cv2.imencode(path.suffix, picture)
-    try:
-        write_atomically(path, data.tobytes())
-    except OSError as error:
-        raise common.not_writable(path, error, "--picture") from None
+        raise common.not_writable(path, error, option) from None
 
 
 def _summary(config: Config, taught: Taught, out: Path) -> str:

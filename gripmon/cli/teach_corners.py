@@ -14,23 +14,40 @@ from typing import TYPE_CHECKING
 from gripmon.cli import common
 
 if TYPE_CHECKING:
-    from gripmon.cli.teach_inputs import Inputs
+    from gripmon.daemon.teaching import Inputs
     from gripmon.teach.edges.bench import Found
-    from gripmon.teach.page import Desk, RoughDesk
+    from gripmon.teach.page import Desk, RoughDesk, Saved
 
 _LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
+_NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_name", "jaw_opening", "jaw_source")
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Handle ``gripmon teach --page`` and ``--corners``."""
-    from gripmon.cli import teach_rough
-    from gripmon.cli.teach_inputs import read_inputs
-
+def run(arguments: argparse.Namespace, command: str) -> int:
+    """Handle ``gripmon teach --page`` and ``--corners``; ``command`` goes into the files that are written."""
     _check_options(arguments)
-    if teach_rough.is_meant(arguments):
-        return _rough_page(arguments, teach_rough.rough_desk(arguments))
-    inputs = read_inputs(arguments)
+    from gripmon.daemon.teaching import Named, read_inputs, rough_desk
+
+    images = [Path(name) for name in arguments.images]
+    paths = {
+        name: None if getattr(arguments, name) is None else Path(getattr(arguments, name))
+        for name in ("out", "config", "camera", "gripper", "reference")
+    }
+    if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
+        if len(images) > 1:
+            text = f"teach: {len(images)} images, and no gripper; one image, to put rough corners in, or --gripper FILE"
+            raise common.CommandFailedError(text, common.EXIT_USAGE)
+        folder = paths["out"] or Path()
+        desk = rough_desk(images[0], paths["camera"], folder)
+        common.make_directory(folder)
+        return _rough_page(arguments, desk)
+    inputs = read_inputs(
+        Named(
+            command, images, **paths, live=arguments.live, jaw_opening_m=arguments.jaw_opening,
+            jaw_source=arguments.jaw_source, robot=arguments.robot, camera_name=arguments.camera_name,
+        )
+    )  # fmt: skip
+    common.make_directory(inputs.folder)
     return _page(arguments, inputs) if arguments.page else _without_page(arguments, inputs)
 
 
@@ -66,17 +83,22 @@ def _rough_page(arguments: argparse.Namespace, desk: RoughDesk) -> int:
         return _serve(arguments, desk)
     finally:
         if desk.saved is not None:
-            for path, what in desk.saved.written.items():
-                print(f"written: {path} ({what})")
-            for note in desk.saved.notes:
-                print(f"note: {note}")
-            print(f"next: {desk.saved.next}", flush=True)
+            _say(desk.saved)
+
+
+def _say(saved: Saved) -> None:
+    for note in saved.notes:
+        print(f"note: {note}")
+    for path, what in saved.written.items():
+        print(f"written: {path} ({what})")
+    if saved.next is not None:
+        print(f"next: {saved.next}")
+    sys.stdout.flush()
 
 
 def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Teach with a gripper."""
-    from gripmon.cli.teach_inputs import live_settings
-    from gripmon.cli.teach_saving import FileSaving
+    from gripmon.daemon.teaching import FileSaving, live_settings
     from gripmon.io.sources import SourceError, open_source
     from gripmon.teach.page import Desk
 
@@ -126,8 +148,7 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Once, with the corners in a file."""
     import numpy as np
 
-    from gripmon.cli.teach_inputs import read_rough
-    from gripmon.cli.teach_saving import FileSaving
+    from gripmon.daemon.teaching import FileSaving, read_rough
     from gripmon.teach.edges.snapping import FEWEST_PUT
     from gripmon.teach.page import SavingRefused
     from gripmon.teach.page.messages import Put, SaveOrder
@@ -155,12 +176,7 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
         raise common.CommandFailedError(
             f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace", common.EXIT_USAGE
         )
-    for note in saved.notes:
-        print(f"note: {note}")
-    for path, what in saved.written.items():
-        print(f"written: {path} ({what})")
-    if saved.next is not None:
-        print(f"next: {saved.next}")
+    _say(saved)
     return common.EXIT_DONE
 
 

@@ -107,7 +107,7 @@ def main(endpoint: str, folder: str, key: str, frame_format: str, prefix: str, *
         publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.BLOCK)
         wait_until(lambda: publisher.matching_status.matching, "a monitor that listens")
         alive = session.liveliness()
-        wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=5.0)), "the monitor to be alive")
+        wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=20.0)), "the monitor to be alive")
         for row in rows:
             if part:
                 row["stamp_ns"] = str(time.time_ns())

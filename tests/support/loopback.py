@@ -88,7 +88,7 @@ def plain_session(
 
 def ask(session: zenoh.Session, key: str) -> list[dict[str, object]]:
     """All replies to a plain ``get``, decoded by the standard library."""
-    replies = [reply for reply in session.get(key, timeout=5.0) if reply.ok is not None]
+    replies = [reply for reply in session.get(key, timeout=20.0) if reply.ok is not None]
     return [json.loads(reply.ok.payload.to_bytes()) for reply in replies]
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from gripmon.calibrate.targets import CircleGrid
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import exp_rotation, make_transform
 from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Array
+from gripmon.model.targets import CircleGrid
 from gripmon.simulate import Scenario, Simulator, write_sequence
 from gripmon.simulate.scenario import Background, Bump, JawScript, Sensor
 from support.plates import Look, pose, render
@@ -62,6 +62,14 @@ class _Plate:
 
 def make(folder: Path) -> NewUser:
     """Render everything."""
+    make_plates(folder)
+    work = _work()
+    write_sequence(work, folder / "work")
+    return NewUser(folder, np.array([work.truth(k).cam_T_grip for k in range(work.frame_count)]))
+
+
+def make_plates(folder: Path) -> None:
+    """Render the plate, and the gripper standing on it."""
     for name in ("plate", "standing"):
         (folder / name).mkdir(parents=True)
     rng = np.random.default_rng(5)
@@ -78,9 +86,6 @@ def make(folder: Path) -> NewUser:
         grip_T_plate = make_transform(rotation, middle - rotation @ (0.5 * size))
         simulator = _simulator(_Plate(nominal_cam_T_grip() @ grip_T_plate), 20 + number)
         cv2.imwrite(str(folder / "standing" / f"{number}.png"), simulator.render(0))
-    work = _work()
-    write_sequence(work, folder / "work")
-    return NewUser(folder, np.array([work.truth(k).cam_T_grip for k in range(work.frame_count)]))
 
 
 def corners_px(rng: np.random.Generator, off_px: float) -> dict[str, Array]:

@@ -9,10 +9,10 @@ import msgspec
 import numpy as np
 import yaml
 
-from gripmon.calibrate.targets import Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
 from support.plates import Look, render
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
 

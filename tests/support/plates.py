@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from gripmon.calibrate.targets import Charuco, Chequerboard, CircleGrid, Target
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
 
 Cover = tuple[Array, float]
 """A polygon (k, 2) in the image (px) and its grey value: something in front of the plate."""

@@ -49,7 +49,7 @@ class Cell:
         wait_until(lambda: self._images.matching_status.matching, "a monitor that looks")
         wait_until(lambda: self.pulses.matching_status.matching, "a monitor that listens")
         alive = session.liveliness()
-        wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=5.0)), "the monitor to be alive")
+        wait_until(lambda: list(alive.get(f"{prefix}/alive", timeout=20.0)), "the monitor to be alive")
 
     def show(self, images: list[Any], pose: dict[str, Any]) -> dict[str, Any]:
         """One dark frame and those of a pulse: what became of it."""

@@ -39,7 +39,7 @@ class RouterProcess:
         """Exit code, and what it said."""
         assert self.process is not None
         self.process.terminate()
-        _, said = self.process.communicate(timeout=20.0)
+        _, said = self.process.communicate(timeout=120.0)
         return self.process.returncode, said
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gripmon.calibrate.discs import centre_offsets_px
+from gripmon.calibrate.bundle import centre_offsets_px
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation

@@ -60,7 +60,10 @@ def new_monitor(settings: MonitorSettings | None = None, cam_T_grip: np.ndarray 
 
 @lru_cache(maxsize=16)
 def frames_of(scene: str) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
-    scenario = SCENES[scene]
+    return rendered(SCENES[scene])
+
+
+def rendered(scenario: Scenario) -> tuple[tuple[Frame, ...], tuple[FrameTruth, ...]]:
     simulator = Simulator(make_camera(PAPER_LENS), box_gripper(sharp=False), nominal_cam_T_grip(), scenario, 1)
     frames = tuple(simulator.frame(i) for i in range(simulator.frame_count))
     for frame in frames:

@@ -23,8 +23,8 @@ _METHOD = """\
 Every row of the first table is a condition on the project's own simulator: several scenes with another pose, jaw
 opening, gripper (two box fingers, tapered fingers, adaptive fingers that move on arcs), light, background and seed
 each, since systematic errors stay the same within a scene. A scene starts from a reference that is wrong by 0.1 mm
-and 1 mrad on each axis (standard deviations), and the monitor is told so; its first frame doesn't count. The rendered
-sequences come from another renderer (`../shared/data/rendered`, not in this repository); their jaw opening is as
+and 1 mrad on each axis (standard deviations), and the monitor knows that; its first frame doesn't count. The rendered
+sequences come from another renderer (not in this repository); their jaw opening is as
 reported (rounded to 0.1 mm; the default `jaw_sigma_m`), then the true one.
 
 The peers look at the same frames: `cv2.cornerSubPix` from where their last pose puts the corners, then
@@ -45,7 +45,7 @@ def as_markdown(results: dict[str, Any], pictures: list[Path]) -> str:
     rows = results["rows"]
     parts = [
         "# Accuracy",
-        "Written by `tools/bench accuracy --out docs`. Figures behind it: [accuracy.json](accuracy.json).",
+        "Written by `tools/bench accuracy --out docs/results`; the figures behind it: `accuracy.json` beside it.",
         "\n".join(f"- {line}" for line in about(results)),
         _METHOD,
         "## Results",

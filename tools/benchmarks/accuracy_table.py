@@ -36,7 +36,7 @@ def about(results: dict[str, Any]) -> list[str]:
     machine, plan = results["machine"], results["plan"]
     packages = ", ".join(f"{name} {version}" for name, version in machine["packages"].items())
     return [
-        f"gripmon {machine['commit']}, {machine['date']}, seed {plan['seed']}",
+        f"gripmon at commit {machine['commit']}, {machine['date']}, seed {plan['seed']}",
         f"{machine['cpu']}, {machine['cpus']} cores, {machine['system']}",
         f"Python {machine['python']}, {packages}",
         f"{plan['jobs']} rows at the same time, one thread each",

@@ -182,7 +182,7 @@ def as_markdown(results: dict[str, Any], pictures: list[str]) -> str:
     """The report as a file."""
     parts = [
         "# Integrity",
-        "Written by `tools/bench integrity --out docs`. Figures behind it: [integrity.json](integrity.json).",
+        "Written by `tools/bench integrity --out DIR`; the figures behind it: `integrity.json` beside it.",
         "\n".join(f"- {line}" for line in about(results)),
         _markdown_table(table(results)),
         "\n".join(f"- {line}" for line in LEGEND),

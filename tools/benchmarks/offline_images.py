@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.machine import ROOT
-from gripmon.calibrate.targets import Chequerboard, CircleGrid
 from gripmon.model.camera import LensSettings, PaperLens, make_camera
 from gripmon.model.geometry import exp_rotation, make_transform, perturb
 from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Array
+from gripmon.model.targets import Chequerboard, CircleGrid
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 

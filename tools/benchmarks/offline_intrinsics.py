@@ -20,10 +20,10 @@ from benchmarks.offline_images import views
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.intrinsics import calibrate
 from gripmon.calibrate.sighting import Sighting
-from gripmon.calibrate.targets import Chequerboard
 from gripmon.model.camera import BrownConradyLens, LensSettings, make_camera
 from gripmon.model.geometry import exp_rotation
 from gripmon.model.records import Array
+from gripmon.model.targets import Chequerboard
 
 LENS = BrownConradyLens(
     width_px=768,

@@ -24,7 +24,7 @@ Exit code 1 if a figure is not reached."""
 RATIO, TAIL, RECOVERY_S = 1.5, 1.10, 2.0
 MAX_AGE_S = 0.2
 AGE_BOUND_S = MAX_AGE_S + 0.05
-"""Nothing older is usable, whatever the link does: what docs/client.md promises with ``max_age_s`` 0.2."""
+"""Nothing older is usable, whatever the link does: what docs/howto/client.md promises with ``max_age_s`` 0.2."""
 _TITLES = {
     "alone": "one subscriber",
     "stopped": "and one that is stopped (SIGSTOP)",

@@ -9,11 +9,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import AffectedRange, Displacement, Event, Limits
 from gripmon.analyse.report.formats import COVERAGE
-from gripmon.analyse.report.lives import MOTIONS
-from gripmon.analyse.report.track import Track, displacement
+from gripmon.analyse.report.happenings import MOTIONS
+from gripmon.analyse.report.track import SECOND_NS, Track, displacement
 from gripmon.model.records import Array
 
 _MEDIAN_FRAMES = 9  # a single frame's noise affects nothing

@@ -11,21 +11,25 @@ from numpy.typing import NDArray
 
 from gripmon import __version__
 from gripmon.analyse.report.affected import motion_ranges, verdict_ranges
-from gripmon.analyse.report.clock import straightened
-from gripmon.analyse.report.content import CommandEntry, Displacement, Event, RecordingReport, ReferenceEntry, Report
-from gripmon.analyse.report.envelope import curves_of
+from gripmon.analyse.report.content import (
+    CommandEntry,
+    Displacement,
+    Event,
+    RecordingReport,
+    ReferenceEntry,
+    Report,
+    main_text,
+)
 from gripmon.analyse.report.formats import count
-from gripmon.analyse.report.happenings import happenings_of, pauses_of, with_reference_changes
+from gripmon.analyse.report.happenings import MOTIONS, happenings_of, lives_of, pauses_of, with_reference_changes
 from gripmon.analyse.report.hindsight import look_back
-from gripmon.analyse.report.integrity import integrity_of
-from gripmon.analyse.report.limits import limits_of
-from gripmon.analyse.report.lives import MOTIONS, lives_of
+from gripmon.analyse.report.limits import integrity_of, limits_of
 from gripmon.analyse.report.motions import motions_of
 from gripmon.analyse.report.running import dropped_of, running_of
-from gripmon.analyse.report.source import Source, main_text
-from gripmon.analyse.report.track import Track, displacement, make_track
+from gripmon.analyse.report.track import Track, curves_of, displacement, make_track, straightened
 from gripmon.analyse.report.words import headline, paragraph
 from gripmon.model.records import AlertKind, ReferenceRecord, Verdict
+from gripmon.record.read import Recording
 
 _END_FRAMES = 15
 _NEIGHBOURS = 6
@@ -40,12 +44,12 @@ _SEEN = (
 class Told:
     """A recording and what is said of it."""
 
-    source: Source
+    source: Recording
     report: RecordingReport
 
 
 def build(
-    sources: Sequence[Source],
+    sources: Sequence[Recording],
     faults: Sequence[str] = (),
     affected_m: float | None = None,
     affected_rad: float | None = None,
@@ -60,7 +64,7 @@ def build(
     return Report(_summary(reports), __version__, reports, tuple(faults)), tuple(told)
 
 
-def _tell(source: Source, affected_m: float | None, affected_rad: float | None) -> Told:
+def _tell(source: Recording, affected_m: float | None, affected_rad: float | None) -> Told:
     table = source.frames
     clock, clock_faults = straightened(table.seq, table.stamp_ns)
     limits = limits_of(main_text(source), affected_m, affected_rad)
@@ -108,7 +112,7 @@ def _tell(source: Source, affected_m: float | None, affected_rad: float | None) 
     return Told(source, msgspec.structs.replace(report, summary=paragraph(report)))
 
 
-def _keys(source: Source) -> dict[tuple[str, int], int]:
+def _keys(source: Recording) -> dict[tuple[str, int], int]:
     """Id and revision of every reference that frames name, with the index of the first such frame, in order."""
     table = source.frames
     pairs = np.stack([table.reference.astype(np.int64), table.revision], axis=1)
@@ -122,7 +126,7 @@ def _ordered(references: Sequence[ReferenceRecord], in_force_ns: dict[tuple[str,
     return [known[key] for key in in_force_ns if key in known]
 
 
-def _references(source: Source, in_force_ns: dict[tuple[str, int], int]) -> list[ReferenceEntry]:
+def _references(source: Recording, in_force_ns: dict[tuple[str, int], int]) -> list[ReferenceEntry]:
     known = {(r.reference_id, r.revision): r for r in source.references}
     out: list[ReferenceEntry] = []
     before: ReferenceRecord | None = None
@@ -145,7 +149,7 @@ def _step(before: ReferenceRecord, after: ReferenceRecord) -> Displacement:
     return displacement(vector, np.sqrt(np.maximum(variances[0] + variances[1], 0.0)))
 
 
-def _numbered(events: Sequence[Event], source: Source, track: Track) -> tuple[Event, ...]:
+def _numbered(events: Sequence[Event], source: Recording, track: Track) -> tuple[Event, ...]:
     ordered = sorted(events, key=lambda e: (e.onset.stamp_ns, e.noticed_ns or 0))
     images = np.flatnonzero(np.isin(track.seq, np.asarray(source.image_seqs, np.int64)))
     return tuple(
@@ -154,7 +158,7 @@ def _numbered(events: Sequence[Event], source: Source, track: Track) -> tuple[Ev
     )
 
 
-def _pictures(event: Event, source: Source, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
+def _pictures(event: Event, source: Recording, track: Track, images: NDArray[np.intp]) -> dict[str, int]:
     """The last picture before it began, with the gripper seen if there is one; the first one in it; and the first
     believed one after it, if it is over.
     """
@@ -182,7 +186,7 @@ def _pictures(event: Event, source: Source, track: Track, images: NDArray[np.int
     return found
 
 
-def _with_overlay(source: Source, seqs: NDArray[np.int64]) -> int:
+def _with_overlay(source: Recording, seqs: NDArray[np.int64]) -> int:
     """The first of some frames with a picture that shows what was measured; of an alert's own pictures not all do."""
     for seq in seqs[:_NEIGHBOURS].tolist():
         picture = source.picture(seq)

@@ -1,4 +1,5 @@
-"""What a report says, as data: ``gripmon report --json`` writes it, and the page shows nothing else.
+"""What a report is made from, and what it says, as data: ``gripmon report --json`` writes it, and the page shows no
+more.
 
 SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.
 """
@@ -11,6 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.model.records import CauseWeight
+from gripmon.record.read import Recording
 
 Vector = tuple[float, float, float]
 
@@ -274,3 +276,15 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
     version: Annotated[str, Meta(description="of gripmon, which made the report")]
     recordings: tuple[RecordingReport, ...]
     faults: Annotated[tuple[str, ...], Meta(description="files that could not be used at all, a line each")]
+
+
+def main_text(source: Recording) -> str | None:
+    """The text of the recorded configuration's main file; None if there is none."""
+    configuration = source.configuration
+    file = None if configuration is None else configuration.files.get(configuration.main)
+    if file is None:
+        return None
+    try:
+        return file.data.decode("utf-8", "replace")
+    except ValueError:
+        return None

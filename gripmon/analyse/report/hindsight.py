@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.analyse.report.clock import SECOND_NS
 from gripmon.analyse.report.content import Displacement, Event, Limits, Moment, Onset
+from gripmon.analyse.report.happenings import MOTIONS
 from gripmon.analyse.report.limits import excess
-from gripmon.analyse.report.lives import MOTIONS
-from gripmon.analyse.report.source import Source
-from gripmon.analyse.report.track import Track, displacement
+from gripmon.analyse.report.track import SECOND_NS, Track, displacement
 from gripmon.analyse.smoother import LEAST_FRAMES, ChangePoint, correct
 from gripmon.model.records import AlertKind, Severity
+from gripmon.record.read import Recording
 
 _NEAR_NS = SECOND_NS // 4  # an onset in the frames and its change point are no farther apart
 _ALIKE = (0.5, 2.0)  # times as large
@@ -80,7 +79,7 @@ class Hindsight:
         return out
 
 
-def look_back(source: Source, track: Track, said_ns: Sequence[int], limits: Limits) -> Hindsight:
+def look_back(source: Recording, track: Track, said_ns: Sequence[int], limits: Limits) -> Hindsight:
     """The change points of a recording: of all of it, or, where it is long, of the minutes around what was said
     (``said_ns``) and around every place where the level changes by what matters.
     """

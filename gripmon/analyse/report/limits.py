@@ -1,15 +1,19 @@
-"""Limits, from the configuration that the recording holds."""
+"""Limits, from the configuration that the recording holds, and how large errors may have been beside them."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
+import numpy as np
 import yaml
 
-from gripmon.analyse.report.content import Limits
+from gripmon.analyse.report.content import Integrity, Limits
 from gripmon.judge.policy import PolicySettings
+
+if TYPE_CHECKING:
+    from gripmon.record.read import FrameTable
 
 
 def limits_of(main_text: str | None, affected_m: float | None, affected_rad: float | None) -> Limits:
@@ -49,3 +53,24 @@ def _policy(main_text: str | None) -> tuple[PolicySettings, str]:
         return msgspec.convert(said, PolicySettings), "the recording's configuration"
     except (yaml.YAMLError, msgspec.ValidationError, AttributeError, TypeError):
         return PolicySettings(), "gripmon's defaults: the recording's configuration can't be read"
+
+
+def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:
+    """Of one recording; None where no frame has bounds."""
+    known = np.isfinite(table.protection_m) & np.isfinite(table.protection_rad)
+    if not known.any() or limits.alert_limit_m is None or limits.alert_limit_rad is None:
+        return None
+    position_m, rotation_rad = table.protection_m[known], table.protection_rad[known]
+    within = (position_m <= limits.alert_limit_m) & (rotation_rad <= limits.alert_limit_rad)
+    median_m, p99_m = np.percentile(position_m, (50.0, 99.0)).tolist()
+    median_rad, p99_rad = np.percentile(rotation_rad, (50.0, 99.0)).tolist()
+    return Integrity(
+        frames=int(known.sum()),
+        valid=float(np.mean(table.verdict == table.VERDICTS.index("valid"))),
+        within=float(within.sum() / len(table)),
+        median_m=median_m,
+        p99_m=p99_m,
+        median_rad=median_rad,
+        p99_rad=p99_rad,
+        risk=float(np.median(table.integrity_risk[known])),
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from gripmon.analyse.report import formats
 from gripmon.analyse.report.build import Told
 from gripmon.analyse.report.content import AffectedRange, Event, Noise, RecordingReport, Report
-from gripmon.analyse.report.lives import MOTIONS
+from gripmon.analyse.report.happenings import MOTIONS
 from gripmon.analyse.report.pictures import Looked, Shown, together
 from gripmon.analyse.report.words import CAUSES, cause_words
 from gripmon.model.records import AlertKind, CauseWeight, Origin

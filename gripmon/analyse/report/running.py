@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.analyse.report.affected import runs_of_equal
-from gripmon.analyse.report.clock import SECOND_NS, Clock
 from gripmon.analyse.report.content import Noise, Running, Share, Slice, Stretch
-from gripmon.analyse.report.onsets import robust_sigma
-from gripmon.analyse.report.source import Source
-from gripmon.analyse.report.track import Track
+from gripmon.analyse.report.motions import robust_sigma
+from gripmon.analyse.report.track import SECOND_NS, Clock, Track
 from gripmon.model.records import Array, StateRecord
+from gripmon.record.read import Recording
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable
@@ -25,7 +24,7 @@ _MOST_STRETCHES = 2000  # of a history; shorter ones than a part of it are joine
 _NEIGHBOURS_NS = SECOND_NS // 2
 
 
-def dropped_of(source: Source) -> tuple[str, ...]:
+def dropped_of(source: Recording) -> tuple[str, ...]:
     """Those of the faults that tell of frames which the monitor or its recorder had no time for, or nothing is wrong
     with the files: these are no damage.
     """

@@ -1,4 +1,7 @@
-"""The motion of the TCP through a recording, against the reference in force and against the first one."""
+"""The motion of the TCP through a recording, against the reference in force and against the first one; its clock,
+which must not run backwards; and its curves: of a long series the median and the bounds per piece of time, so that no
+outlier is lost and pages stay small.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.report.content import Displacement
+from gripmon.analyse.report.content import Curve, Displacement
+from gripmon.analyse.report.formats import COVERAGE, clock_time
 from gripmon.model.records import Array, ReferenceRecord
 
 if TYPE_CHECKING:
     from gripmon.record.read import FrameTable
+
 
 _BASE_FRAMES = 20
 _ALLOWED_SIGMA = 4.0  # as the monitor's own baseline
@@ -130,3 +135,123 @@ def _own_error(first: ReferenceRecord | None, shifts: Array, known_error: Sequen
     allowed = _ALLOWED_SIGMA * np.sqrt(np.maximum(np.reshape(first.covariance, (6, 6)).diagonal(), 0.0))
     median = np.median(shifts[:_BASE_FRAMES], axis=0)
     return np.asarray(median) if (np.abs(median) <= allowed).all() else np.zeros(6)
+
+
+SECOND_NS = 1_000_000_000
+_LONGEST_NS = 7 * 86400 * SECOND_NS  # a pause within one run
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Frames' numbers ``seq`` (n,), ascending, and the times ``stamp_ns`` (n,) that the report gives them."""
+
+    seq: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+
+    def of(self, seq: int, stamp_ns: int) -> int:
+        """When something was that belongs to a frame, or else to no frame: then as it says itself, brought among the
+        frames if it lies far outside.
+        """
+        i = int(np.searchsorted(self.seq, seq))
+        if i < len(self.seq) and self.seq[i] == seq:
+            own = int(self.stamp_ns[i])
+            return own if abs(stamp_ns - own) > 3600 * SECOND_NS or stamp_ns < own else stamp_ns
+        if not len(self.seq):
+            return stamp_ns
+        first, last = int(self.stamp_ns[0]), int(self.stamp_ns[-1])
+        near = first - 3600 * SECOND_NS <= stamp_ns <= last + 3600 * SECOND_NS
+        return stamp_ns if near else int(np.clip(stamp_ns, first, last))
+
+
+def straightened(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> tuple[Clock, tuple[str, ...]]:
+    """Where the clock was set back, or ahead by more than a week, time goes on as before by one frame's length; what
+    was done, in words.
+    """
+    steps_ns = np.diff(stamp_ns.astype(np.float64))  # as integers those of absurd stamps would overflow
+    wrong = np.flatnonzero((steps_ns < 0.0) | (steps_ns > _LONGEST_NS))
+    absurd = bool(len(stamp_ns)) and not 0 <= int(stamp_ns[0]) < 2**62
+    if not wrong.size and not absurd:
+        return Clock(seq, stamp_ns), ()
+    sound = steps_ns[(steps_ns > 0.0) & (steps_ns <= _LONGEST_NS)]
+    steps = np.diff(stamp_ns)
+    steps[wrong] = int(np.median(sound)) if sound.size else SECOND_NS // 30
+    out = (0 if absurd else int(stamp_ns[0])) + np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
+    faults = ["the first frame's time is absurd; times are shown from 1970 on"] if absurd else []
+    if wrong.size:
+        faults.append(_told(seq, stamp_ns, wrong.tolist(), 1e-9 * (float(out[-1]) - float(stamp_ns[-1]))))
+    return Clock(seq, out), tuple(faults)
+
+
+def _told(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], wrong: Sequence[int], off_s: float) -> str:
+    i = wrong[0]
+    by_s = 1e-9 * (float(stamp_ns[i + 1]) - float(stamp_ns[i]))
+    how = f"runs backwards by {-by_s:.3f} s" if by_s < 0.0 else f"jumps ahead by {by_s:.0f} s"
+    more = f" and {len(wrong) - 1} more times" if len(wrong) > 1 else ""
+    late = f"{abs(off_s):.3f} s {'later' if off_s > 0.0 else 'earlier'} than stamped"
+    return (
+        f"time {how} at frame {int(seq[i + 1])} (after {clock_time(int(stamp_ns[i]))}){more}: from there on times are "
+        f"shown as if the clock had gone on, at the end {late}"
+    )
+
+
+_PIECES = 1200
+_DETAIL_NS = 2 * SECOND_NS  # on either side of a motion every frame is shown
+_MOST_DETAIL = 2400  # frames
+
+
+def curves_of(table: FrameTable, track: Track, moments_ns: Sequence[int]) -> tuple[Curve, ...]:
+    """The TCP's way from the calibration at the beginning and from the reference in force, and that one's parts; with
+    every frame around some moments; and the bounds on errors, where the recording has them.
+    """
+    if not len(track):
+        return ()
+    cuts = pieces(track.stamp_ns, moments_ns)
+    # Of a length the largest along any axis: its own direction changes from frame to frame.
+    position, turn = (
+        np.where(track.measured, track.sigma[:, part].max(axis=1), np.nan) for part in (slice(3), slice(3, 6))
+    )
+    shift = track.against_reference
+    series = [
+        ("tcp_from_beginning_m", np.linalg.norm(track.against_first[:, :3], axis=1), position),
+        ("tcp_from_reference_m", np.linalg.norm(shift[:, :3], axis=1), position),
+        *((f"{axis}_m", shift[:, i], track.sigma[:, i]) for i, axis in enumerate("xyz")),
+        ("rotation_rad", np.linalg.norm(shift[:, 3:], axis=1), turn),
+    ]
+    for name in ("protection_m", "protection_rad"):
+        bounds = getattr(table, name)
+        if np.isfinite(bounds).any():
+            series.append((name, bounds, np.zeros(len(bounds))))
+    return tuple(_curve(name, track, cuts, values, sigma) for name, values, sigma in series)
+
+
+def pieces(stamp_ns: NDArray[np.int64], moments_ns: Sequence[int]) -> NDArray[np.intp]:
+    """(k,) ascending indices where a new piece begins, the first 0: every frame, if there are few; else equal times,
+    with every frame around some moments, and a new piece after every pause.
+    """
+    n = len(stamp_ns)
+    if n <= 2 * _PIECES:
+        return np.arange(n)
+    edges = stamp_ns[0] + np.linspace(0, int(stamp_ns[-1] - stamp_ns[0]), _PIECES, endpoint=False).astype(np.int64)
+    cuts = [np.searchsorted(stamp_ns, edges), np.flatnonzero(np.diff(stamp_ns) > SECOND_NS) + 1]
+    room = _MOST_DETAIL
+    for moment_ns in moments_ns:
+        start, stop = np.searchsorted(stamp_ns, [moment_ns - _DETAIL_NS, moment_ns + _DETAIL_NS]).tolist()
+        if stop - start <= room:
+            cuts.append(np.arange(start, stop))
+            room -= stop - start
+    joined = np.unique(np.concatenate([[0], *cuts]))
+    return joined[joined < n]
+
+
+def _curve(name: str, track: Track, cuts: NDArray[np.intp], values: Array, sigma: Array) -> Curve:
+    low = np.fmin.reduceat(values - COVERAGE * sigma, cuts)
+    high = np.fmax.reduceat(values + COVERAGE * sigma, cuts)
+    stops = [*cuts[1:].tolist(), len(track)]
+    middle, stamps = [], []
+    for start, stop in zip(cuts.tolist(), stops, strict=True):
+        part = values[start:stop]
+        part = part[np.isfinite(part)]
+        middle.append(float(np.median(part)) if part.size else None)
+        stamps.append(int(track.stamp_ns[start] + track.stamp_ns[stop - 1]) // 2)
+    bounds = ([None if np.isnan(v) else v for v in some.tolist()] for some in (low, high))
+    return Curve(name, tuple(stamps), tuple(middle), *(tuple(some) for some in bounds))

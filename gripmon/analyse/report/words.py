@@ -17,8 +17,8 @@ from gripmon.analyse.report.formats import (
     size,
     span,
 )
+from gripmon.analyse.report.happenings import MOTIONS
 from gripmon.analyse.report.limits import excess
-from gripmon.analyse.report.lives import MOTIONS
 from gripmon.model.records import AlertKind, Cause
 
 CAUSES: dict[str, str] = {

@@ -11,11 +11,11 @@ from gripmon.calibrate.interchange.fault import (
     list_text,
     mapping_at,
     numbers_of,
+    read_mapping,
     shown,
     value_at,
     whole_number_of,
 )
-from gripmon.calibrate.interchange.yaml_text import read_mapping
 from gripmon.model.camera import LensSettings
 
 _RIGHT = "a camchain of Kalibr: cam0: {camera_model, intrinsics, distortion_model, …}"

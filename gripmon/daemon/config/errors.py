@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gripmon.model.errors import InputError
 
-class ConfigError(ValueError):
+
+class ConfigError(InputError):
     """A configuration that can't be used; ``str()`` is one line ``file: key: what is wrong; what would be right``."""
 
     def __init__(self, path: Path | str, key: str, wrong: str, right: str = ""):

@@ -3,32 +3,27 @@
 from __future__ import annotations
 
 import csv
-import errno
 import itertools
 import math
-import os
-import re
-import stat
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
 from gripmon.io.sources.base import SourceError
-from gripmon.model.records import Frame, Image
+from gripmon.model.images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
+from gripmon.model.images import natural_key as natural_key
+from gripmon.model.images import read_image as read_image
+from gripmon.model.images import regular_bytes
+from gripmon.model.records import Frame
 
 if TYPE_CHECKING:
     from _csv import Reader as _Lines
 
-_SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
-IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
 TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 _NS = 1_000_000_000
-
-LARGEST_BYTES = 1 << 30
-"""More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
 
 
 class FolderSettings(
@@ -107,62 +102,10 @@ class FolderSource:
         self._seq = len(self._names)
 
 
-_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
-_PNG_END_BYTES = 8
-"""The last chunk's name and checksum."""
-
-
-def natural_key(name: str) -> tuple[list[Any], str]:
-    """Order in which a person counts: digits as numbers, the rest as text; equal numbers by the name itself."""
-    parts = re.split(r"([0-9]+)", name)
-    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
-
-
-def read_image(path: Path) -> tuple[Image | None, str | None]:
-    """The image, or why there is none."""
-    import cv2
-    import numpy as np
-
-    try:
-        data = _regular_bytes(path)
-    except FileNotFoundError:
-        return None, "the file is missing"
-    except OSError as error:
-        return None, f"the file can't be read: {error.strerror}"
-    if not data:
-        return None, "the file is empty"
-    if data.startswith(_PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
-        return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
-    try:
-        # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error as error:
-        return None, f"not an image: {error.err}"
-    if image is None:
-        return None, "truncated, damaged or not an image"
-    if image.dtype == np.float64:
-        image = image.astype(np.float32)
-    if image.ndim == 3:
-        image = np.ascontiguousarray(image[:, :, 0] if image.shape[2] < 3 else image[:, :, :3])
-    return image, None
-
-
-def _regular_bytes(path: Path) -> bytes:
-    """A file's content.  OSError, too, for what is none: a pipe or a device might be waited for without end."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as file:
-        status = os.fstat(descriptor)
-        if not stat.S_ISREG(status.st_mode):
-            raise OSError(errno.EINVAL, "it is no regular file")
-        if status.st_size > LARGEST_BYTES:
-            raise OSError(errno.EFBIG, f"it is larger than {LARGEST_BYTES >> 20} MiB")
-        return file.read(LARGEST_BYTES)
-
-
 def read_table(path: Path) -> dict[str, TableRow]:
     """A table ``file,stamp_ns[,jaw_opening_m]`` by file name.  Raises :class:`SourceError`."""
     try:
-        text = _regular_bytes(path).decode("utf-8-sig")
+        text = regular_bytes(path).decode("utf-8-sig")
     except FileNotFoundError:
         raise SourceError(f"timestamps: there is no file {path}; a table {','.join(COLUMNS[:2])}") from None
     except (OSError, UnicodeDecodeError) as error:

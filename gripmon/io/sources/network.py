@@ -41,7 +41,7 @@ Format = Literal["auto", "raw", "jpeg", "png", "ros2_image", "ros2_compressed"]
 class NetworkSettings(
     msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="zenoh"
 ):
-    """A camera whose driver publishes its frames; ``docs/network_camera.md`` says what it has to send."""
+    """A camera whose driver publishes its frames; ``docs/howto/network_camera.md`` says what it has to send."""
 
     key: (
         Annotated[

@@ -9,11 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.judge.causes.baseline import Baseline
-from gripmon.judge.causes.models import JAW_UNREPORTED_SIGMA_M, Knowledge, Suspect, suspects
-from gripmon.judge.causes.pooling import Pooled
+from gripmon.judge.causes.models import JAW_UNREPORTED_SIGMA_M, Errors, Knowledge, Suspect, Weighed, suspects, weigh
+from gripmon.judge.causes.pooling import Baseline, Pooled
 from gripmon.judge.causes.state import EdgeView, State
-from gripmon.judge.causes.weighing import Errors, Weighed, weigh
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause

@@ -1,13 +1,23 @@
-"""The models of what may have moved, for one gripper: what each frees, and how probable each is beforehand."""
+"""Models of what may have moved: what each frees, its prior, and its marginal likelihood in Laplace's approximation.
+
+Every model has the same unknowns; what it doesn't free is held by what is known (the calibration's error, the error of
+the reported opening), and what it frees has a normal prior of a size that is itself unknown: an average over sizes
+from the smallest worth telling to the largest believed.  A model with more freedom spreads its prior over more that
+could have been seen, and so pays for what it doesn't need (MacKay 1992, "Bayesian interpolation").
+
+Pieces of edges, and whole edges, err with Student's distribution: one that was mistaken costs every model the same few
+nats, and must not be worth a motion that bends itself around it (Lange, Little and Taylor 1989).
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, finger_lever_m, finger_slice
-from gripmon.judge.causes.weighing import Model
+from gripmon.judge.causes.state import FINGERS, FOCAL, JAW, POSE, EdgeView, State, finger_lever_m, finger_slice
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Cause
 
@@ -87,3 +97,129 @@ def suspects(gripper: Gripper, distance_m: float, known: Knowledge, interrupted:
     every = freed((POSE, pose), (FOCAL, 5.0), *(bent(finger) for finger in range(fingers)))
     out.append(Suspect(Cause.UNKNOWN, None, _SEVERAL, Model(held, every, MOUNT_SIZES_M)))
     return out
+
+
+FREEDOM = 3.0
+"""Degrees of freedom of Student's distribution of the errors."""
+
+_COARSE_PX = 1.0
+_COARSE_ROUNDS, _FINE_ROUNDS = 3, 8
+_CONVERGED_PX = 2e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """``held`` (m,): standard deviations of the unknowns by what is known; ``freed`` (m,): of those that the model
+    frees, for a motion of size 1, zero for the others; ``sizes`` (n,): sizes that are equally probable.
+    """
+
+    held: Array
+    freed: Array
+    sizes: Array
+
+    def precision(self, size: float) -> Array:
+        """(m,) of the prior; infinite where an unknown doesn't move."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / (self.held**2 + (size * self.freed) ** 2))
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Of the pieces (s,) of edges: what they showed beyond the model when all was well, their scale ``sigma_px``, and
+    the scale ``spread_px`` of what a whole edge is off by; ``edge`` (s,) numbers the edges from 0 to k - 1.
+    """
+
+    bias_px: Array
+    sigma_px: Array
+    spread_px: Array
+    edge: NDArray[np.intp]
+
+    @property
+    def edges(self) -> int:
+        return int(self.edge.max(initial=-1)) + 1
+
+    @property
+    def of_edge_px(self) -> Array:
+        """(k,) the spread of each edge."""
+        out = np.zeros(self.edges)
+        out[self.edge] = self.spread_px
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Weighed:
+    """``log_evidence`` up to a constant that all models of a frame share; the state that fits best, how far it is
+    from the model's start (m,), and the residual (s,) in px that it leaves.
+    """
+
+    log_evidence: float
+    state: State
+    motion: Array
+    residual_px: Array
+
+
+def weigh(view: EdgeView, gripper: Gripper, model: Model, start: State, first: State, errors: Errors) -> Weighed:
+    """Evidence of a model whose prior is centred on the state ``start``; the fit begins at ``first``."""
+    largest = model.precision(float(model.sizes.max(initial=0.0)))
+    free = np.flatnonzero(np.isfinite(largest))
+    belongs = (errors.edge[:, None] == np.arange(errors.edges)).astype(float)
+    spread_px = errors.of_edge_px
+    state, off_px = first, np.zeros(errors.edges)
+    for round_ in range(_COARSE_ROUNDS + _FINE_ROUNDS):
+        residual, jacobian = view.residual(state)
+        residual, motion = residual - errors.bias_px, state.since(start)
+        coarse_px = _COARSE_PX if round_ < _COARSE_ROUNDS else 0.0
+        weight, spread_weight = _weights(residual, off_px, errors, spread_px, coarse_px)
+        design = np.hstack([jacobian[:, free], belongs])
+        at = np.concatenate([motion[free], off_px])
+        precision = np.concatenate([largest[free], spread_weight])
+        rest = residual - off_px[errors.edge]
+        normal = (design.T * weight) @ design
+        normal.flat[:: len(normal) + 1] += precision
+        step = np.linalg.solve(normal, design.T @ (weight * rest) - precision * at)
+        full = np.zeros(len(largest))
+        full[free] = step[: len(free)]
+        state, off_px = state.moved(full, gripper), off_px + step[len(free) :]
+        if round_ >= _COARSE_ROUNDS and float(np.abs(design @ step).max(initial=0.0)) < _CONVERGED_PX:
+            break
+    residual, jacobian = view.residual(state)
+    residual, motion = residual - errors.bias_px, state.since(start)
+    weight, spread_weight = _weights(residual, off_px, errors, spread_px, 0.0)
+    priors = np.array([model.precision(size)[free] for size in (model.sizes.tolist() or [0.0])])
+    design = np.hstack([jacobian[:, free], belongs])
+    fit = _student(residual - off_px[errors.edge], errors.sigma_px) + _student(off_px, spread_px)
+    log = fit + _volume(design, weight, spread_weight, motion[free], priors)
+    return Weighed(float(np.logaddexp.reduce(log)) - math.log(len(log)), state, motion, residual)
+
+
+def _weights(residual: Array, off_px: Array, errors: Errors, spread_px: Array, coarse_px: float) -> tuple[Array, Array]:
+    """What pieces (s,) and the edges' offsets (k,) count, 1/px²; ``coarse_px``: far from the solution all alike."""
+    rest = residual - off_px[errors.edge]
+    if coarse_px > 0.0:
+        return 1.0 / (errors.sigma_px**2 + coarse_px**2), np.asarray(1.0 / spread_px**2)
+    weight = (FREEDOM + 1.0) / (FREEDOM * errors.sigma_px**2 + rest**2)
+    return weight, (FREEDOM + 1.0) / (FREEDOM * spread_px**2 + off_px**2)
+
+
+def _student(error: Array, scale: Array) -> float:
+    """Log of the density over that of an error of zero."""
+    return -0.5 * (FREEDOM + 1.0) * float(np.log1p((error / scale) ** 2 / FREEDOM).sum())
+
+
+def _volume(design: Array, weight: Array, spread_weight: Array, motion: Array, priors: Array) -> Array:
+    """(n,) for priors (n, free): the height of each at the solution, moved to where it is best, and how much of its
+    volume agrees.
+    """
+    normal = (design.T * weight) @ design
+    normal.flat[:: len(normal) + 1] += np.concatenate([np.zeros(len(motion)), spread_weight])
+    # Less what the edges' own offsets take.
+    m = len(motion)
+    information = normal[:m, :m] - normal[:m, m:] @ np.linalg.solve(normal[m:, m:], normal[m:, :m])
+    full = information + priors[:, :, None] * np.eye(m)
+    pull = priors * motion
+    shorter = np.linalg.solve(full, pull[:, :, None])[:, :, 0]
+    height = (pull * motion).sum(axis=1) - (pull * shorter).sum(axis=1)
+    # det(N + P) / det(P) from the scaled matrix: P spans twenty orders of magnitude.
+    scale = 1.0 / np.sqrt(priors)
+    occam = np.linalg.slogdet(full * scale[:, :, None] * scale[:, None, :])[1]
+    return np.asarray(-0.5 * (height + occam))

@@ -1,9 +1,8 @@
 """Has the camera moved?  A sequential test on the drift with a stated rate of false alarms, and what kind of motion it
 was."""
 
-from gripmon.judge.drift.baseline import Baseline
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
-from gripmon.judge.drift.motion import MotionWatch
+from gripmon.judge.drift.motion import Baseline, MotionWatch
 from gripmon.judge.drift.sequential import Finding, SequentialTest
 from gripmon.judge.drift.settings import DriftSettings
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from gripmon.judge.drift.sequential import rarity
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.windows import LENGTHS
+from gripmon.judge.drift.statistics import LENGTHS
 from gripmon.model.records import Array
 
 CORRELATION_FRAMES = 20.0

@@ -1,13 +1,13 @@
-"""The sequential test: a generalised likelihood ratio over windows of 1 to 4096 frames.
+"""Has the camera moved?  A generalised likelihood ratio test over windows of 1 to 4096 frames.
 
 For every window length two hypotheses are tested against an unmoved camera: its mean lies off the reference (which
 finds creeps, and any shift in the end), and it differs from the mean of the window before (which finds steps soon, for
 errors that last cancel in the difference).  Unknown shifts are estimated, so that each statistic is Hotelling's T² with
-the covariances that the stream itself has shown.  Lai 1995 gives the scheme for independent frames; that frames err
-together enters through the covariances alone.
+the covariances that the stream itself has shown, of the part of the shift that lies beyond what is tolerated.  Lai 1995
+gives the scheme for independent frames; that frames err together enters through the covariances alone.
 
-How far out a statistic may lie by chance is assumed at first, from what errors before clutter are like, and for long
-windows for good.  As soon as the stream has shown enough extremes of its own, these tell it for short windows.
+At first the threshold comes from assumed errors before clutter, and for long windows it stays there.  Once the stream
+has shown enough extremes of its own, the thresholds of short windows are learnt from these.
 """
 
 from __future__ import annotations
@@ -17,12 +17,48 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from gripmon.judge.drift.extremes import BLOCK_FRAMES, Extremes
-from gripmon.judge.drift.scatter import Scatter
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.tolerance import square, square_beyond, times, whitening
-from gripmon.judge.drift.windows import LENGTHS, Windows
+from gripmon.judge.drift.statistics import BLOCK_FRAMES, LENGTHS, Extremes, Scatter, Windows
 from gripmon.model.records import Array
+
+SWEEPS = 8
+"""Rounds over the axes; each can only come closer, and after none of them the answer is too small."""
+
+
+def whitening(covariance: Array) -> Array:
+    """(..., 6, 6) W with ``W C W' = 1``."""
+    return np.linalg.inv(np.linalg.cholesky(covariance))
+
+
+def times(matrix: Array, values: Array) -> Array:
+    """(..., 6, 6) times (..., 6)."""
+    return np.asarray((matrix @ values[..., None])[..., 0])
+
+
+def square(whitening: Array, values: Array) -> Array:
+    """(...) normalised squares of values (..., 6)."""
+    white = times(whitening, values)
+    return np.asarray((white * white).sum(axis=-1))
+
+
+def square_beyond(whitening: Array, shift: Array, tolerated: Array) -> Array:
+    """(...) smallest normalised square of ``shift`` (..., 6) less a shift within ``tolerated`` (6,) on every axis.
+
+    ``whitening`` (..., 6, 6) is W with ``W C W' = 1``.  Errors of the axes belong together: what is tolerated on each
+    axis by itself must not be taken off by itself, or what is left would be a shift that C takes to be impossible.
+    Coordinate descent from both ends, nothing taken off and all of it; never more than the square of the shift itself.
+    """
+    precision = np.swapaxes(whitening, -1, -2) @ whitening
+    best = np.full(shift.shape[:-1], np.inf)
+    for start in (np.zeros_like(shift), np.clip(shift, -tolerated, tolerated)):
+        taken = start
+        for _ in range(SWEEPS):
+            for axis in range(6):
+                pull = (precision[..., axis, :] * (shift - taken)).sum(axis=-1) / precision[..., axis, axis]
+                taken[..., axis] = np.clip(taken[..., axis] + pull, -tolerated[axis], tolerated[axis])
+        best = np.minimum(best, square(whitening, shift - taken))
+    return best
+
 
 REFRESH_FRAMES, LEARNING_FRAMES = 16, 4
 """Frames after which covariances are inverted and thresholds reckoned anew, and after which scatter is learnt."""

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gripmon.judge.policy.alerts import AlertBook
-from gripmon.judge.policy.limits import time_left_s
-from gripmon.judge.policy.settings import PolicySettings
+from gripmon.judge.policy.settings import PolicySettings, time_left_s
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -1,12 +1,15 @@
-"""What a person may set about verdicts and alerts."""
+"""Limits of verdicts and alerts: what a person may set, and when a creep will reach them."""
 
 from __future__ import annotations
 
+import math
 import statistics
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
+
+from gripmon.model.records import Array
 
 
 class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -119,3 +122,24 @@ class PolicySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         if self.suspect_sigma_m is None:
             return self.alert_limit_m
         return statistics.NormalDist().inv_cdf(1.0 - 0.5 * self.integrity_risk) * self.suspect_sigma_m
+
+
+def time_left_s(shift: Array, velocity: Array, limit_m: float, limit_rad: float) -> float | None:
+    """Until the TCP's shift or the turn reaches its limit at this velocity (6,), both (6,); None if neither ever does.
+
+    Zero if it is past a limit already.
+    """
+    left = [
+        _time_to_radius(shift[part], velocity[part], limit)
+        for part, limit in ((slice(0, 3), limit_m), (slice(3, 6), limit_rad))
+    ]
+    finite = [t for t in left if t is not None]
+    return min(finite) if finite else None
+
+
+def _time_to_radius(position: Array, velocity: Array, radius: float) -> float | None:
+    """Smallest t >= 0 with ``|position + velocity t| = radius``, from inside; 0 from outside."""
+    a, b, c = float(velocity @ velocity), float(position @ velocity), float(position @ position) - radius**2
+    if c >= 0.0:
+        return 0.0
+    return None if a == 0.0 else (-b + math.sqrt(b * b - a * c)) / a

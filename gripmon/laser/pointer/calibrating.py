@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane
 from gripmon.laser.pointer.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups
-from gripmon.laser.pointer.held_lens import with_held_lens
 from gripmon.laser.pointer.misreading import SUSPECT_PX, check_reading
-from gripmon.laser.pointer.refinement import Refined, refine
+from gripmon.laser.pointer.refinement import Refined, refine, with_held_lens
 from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.model.camera import Camera

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.picture import disc, line, write
 from gripmon.laser.pointer.calibrating import LaserResult
-from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array, Image
@@ -18,32 +18,25 @@ _GOOD, _WRONG, _PLANE, _BEAM = (170, 110, 20), (40, 40, 220), (120, 180, 90), (9
 _SUBPIXEL_BITS = 4
 
 
-def draw(result: LaserResult, base_T_ee: Array, written: LaserCalibration) -> Image:
+def draw(result: LaserResult, base_T_ee: Array) -> Image:
     """Residuals on the left (arrows many times as long), the scene on the right; BGR."""
-    return np.concatenate([_residuals(result, written), _scene(result, base_T_ee)], axis=1)
+    return np.concatenate([_residuals(result), _scene(result, base_T_ee)], axis=1)
 
 
 def _canvas(title: str) -> NDArray[np.uint8]:
     out = np.full((_HEIGHT, _WIDTH, 3), _PAPER, np.uint8)
-    _write(out, title, (_MARGIN, 30), 0.55)
+    write(out, title, (_MARGIN, 30), 0.55)
     return out
 
 
-def _write(image: Image, text: str, at: tuple[int, int], size: float = 0.42) -> None:
-    cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, _INK, 1, cv2.LINE_AA)
-
-
-def _residuals(result: LaserResult, written: LaserCalibration) -> Image:
+def _residuals(result: LaserResult) -> Image:
     refined = result.refined
     used = refined.used
     largest = max(float(np.linalg.norm(refined.residuals_px[used], axis=1).max()), 1e-9)
     camera = refined.camera
     most = 0.06 * camera.width_px / largest
     stretch = max(step * 10.0 ** np.floor(np.log10(most / step)) for step in (1.0, 2.0, 5.0))
-    residuals = written.residuals
-    image = _canvas(
-        f"residuals x {stretch:g}: RMS {residuals.rms_px:.3f} px, {residuals.used} of {residuals.spots} spots used"
-    )
+    image = _canvas(f"residuals x {stretch:g}: RMS {refined.rms_px:.3f} px, {used.sum()} of {len(used)} spots used")
     scale = min((_WIDTH - 2 * _MARGIN) / camera.width_px, (_HEIGHT - 2 * _MARGIN - 20) / camera.height_px)
 
     def place(uv: Array) -> Array:
@@ -55,12 +48,12 @@ def _residuals(result: LaserResult, written: LaserCalibration) -> Image:
     for uv, residual, good in zip(result.uv_px, refined.residuals_px, used, strict=True):
         at = place(uv)
         if good:
-            _line(image, at, place(uv + stretch * residual), _GOOD)
-            _disc(image, at, 2.5, _GOOD)
+            line(image, at, place(uv + stretch * residual), _GOOD)
+            disc(image, at, 2.5, _GOOD)
             continue
         for turn in (1.0, -1.0):
-            _line(image, at - 4.0 * np.array([1.0, turn]), at + 4.0 * np.array([1.0, turn]), _WRONG)
-    _write(image, f"{camera.width_px} x {camera.height_px} px; crosses: left out", (_MARGIN, _HEIGHT - 14))
+            line(image, at - 4.0 * np.array([1.0, turn]), at + 4.0 * np.array([1.0, turn]), _WRONG)
+    write(image, f"{camera.width_px} x {camera.height_px} px; crosses: left out", (_MARGIN, _HEIGHT - 14))
     return image
 
 
@@ -86,13 +79,13 @@ def _scene(result: LaserResult, base_T_ee: Array) -> Image:
     cv2.polylines(image, [fill], True, _PLANE, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
     for spot, origin, good in zip(spots, origins, result.refined.used, strict=True):
         if np.isfinite(spot).all():
-            _line(image, place(origin), place(spot), _BEAM if good else _FAINT)
-            _disc(image, place(spot), 2.5, _GOOD if good else _WRONG)
+            line(image, place(origin), place(spot), _BEAM if good else _FAINT)
+            disc(image, place(spot), 2.5, _GOOD if good else _WRONG)
     for name, at, axes in (("base", np.zeros(3), np.eye(3)), ("camera", camera, to_base)):
         for axis, colour in zip(axes.T, ((40, 40, 220), (60, 160, 60), (220, 90, 40)), strict=True):
-            _line(image, place(at), place(at + 0.08 * float(np.ptp(everything, axis=0).max()) * axis), colour, 2)
+            line(image, place(at), place(at + 0.08 * float(np.ptp(everything, axis=0).max()) * axis), colour, 2)
         x, y = (round(v) for v in place(at).tolist())
-        _write(image, name, (x + 6, y - 6))
+        write(image, name, (x + 6, y - 6))
     return image
 
 
@@ -105,13 +98,3 @@ def _sheet(result: LaserResult, to_base: Array, centre: Array) -> Array:
     depth = setup.distance_m / (rays @ setup.normal_cam)
     rays, depth = rays[depth > 0.0], depth[depth > 0.0]
     return (rays * np.minimum(depth, 5.0 * setup.distance_m)[:, None]) @ to_base.T + centre
-
-
-def _line(image: Image, start: Array, end: Array, colour: tuple[int, int, int], width: int = 1) -> None:
-    first, last = (np.rint(point * 2**_SUBPIXEL_BITS).astype(int).tolist() for point in (start, end))
-    cv2.line(image, first, last, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _disc(image: Image, at: Array, radius: float, colour: tuple[int, int, int]) -> None:
-    x, y = (round(v * 2**_SUBPIXEL_BITS) for v in at.tolist())
-    cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

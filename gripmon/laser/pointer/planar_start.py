@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import basis
+from gripmon.model.least_squares import Equations, minimise, normal_equations
 from gripmon.model.records import Array
 
 WIDEST_TILT_RAD = np.radians(75.0)
@@ -228,25 +229,21 @@ def _consistent(groups: Sequence[_Group], normal: Array, good: Sequence[NDArray[
 
 
 def _descend(fits: _Fits, normal: Array) -> Array:
-    """Gauss-Newton in the normal's two angles."""
-    tangents = basis(normal)
-    here, slopes = fits.slopes(normal, tangents)
-    for _ in range(_STEPS):
-        change = -np.linalg.lstsq(slopes, here, rcond=None)[0]
-        for _ in range(12):
-            trial = normal + change[0] * tangents[0] + change[1] * tangents[1]
-            trial = trial / np.linalg.norm(trial)
-            other = basis(trial)
-            new, new_slopes = fits.slopes(trial, other)
-            if fits.carries(trial) and new @ new <= here @ here:
-                break
-            change = 0.5 * change
-        else:
-            return normal
-        normal, tangents, here, slopes = trial, other, new, new_slopes
-        if np.abs(change).max() < 1e-9:
-            break
-    return normal
+    """The best normal near one: least squares in its two angles."""
+
+    def cost(at: Array) -> float:
+        here, _ = fits.slopes(at, basis(at))
+        return float(here @ here) if fits.carries(at) else np.inf
+
+    def equations(at: Array) -> Equations:
+        here, slopes = fits.slopes(at, basis(at))
+        return normal_equations(slopes, -here)
+
+    def moved(at: Array, step: Array) -> Array:
+        out: Array = at + step @ basis(at)
+        return out / np.linalg.norm(out)
+
+    return minimise(normal, cost, equations, moved, iterations=_STEPS, damping=1e-9).state
 
 
 def _half_sphere() -> Array:

@@ -1,6 +1,6 @@
 """All parameters of a laser set-up at once: the least distance between measured and predicted spots in the image.
 
-Equation (35) of the laser-pointer method, by Levenberg-Marquardt with an analytic Jacobian.  Wrong spots (speckle,
+Equation (35) of the laser-pointer method, with an analytic Jacobian.  Wrong spots (speckle,
 reflections) get no weight where they contradict the rest: Tukey's biweight on a robust scale that shrinks with the
 residuals; at the end those beyond what noise explains are left out, and the rest counts in full.  (The print keeps the
 50 nearest of 90, however many are wrong.)
@@ -8,8 +8,7 @@ residuals; at the end those beyond what noise explains are left out, and the res
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +17,20 @@ from scipy.stats import f as fisher_f
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup
-from gripmon.laser.pointer.spot_problem import SpotProblem, State
+from gripmon.laser.pointer.spot_problem import LensPrior, SpotProblem, State
 from gripmon.model.camera import LensSettings
+from gripmon.model.least_squares import (
+    TUKEY,
+    Equations,
+    covariance_of,
+    minimise,
+    normal_equations,
+    robust_scale,
+    tukey_cost,
+    tukey_weights,
+)
 from gripmon.model.records import Array
 
-BIWEIGHT = 4.685
-"""Tukey's constant: 95 % efficiency for normal errors."""
 FALSE_OUTLIERS = 0.02
 """How many good spots of a whole data set may be left out, on average.  At 0.1 the smaller scale of what is left takes
 up to 3 % of the coverage of the 95 % region away; wrong spots are farther off than either limit.
@@ -66,15 +73,32 @@ class Refined:
 
 
 @dataclass(frozen=True, slots=True)
-class _Loss:
-    """What a spot's whitened residual costs, and what weight it has; ``scale`` one coordinate's standard deviation, by
-    which what is known beforehand is weighed against the spots.
+class _Tukey:
+    """What whitened residuals cost, and their weights; ``scale`` is one coordinate's standard deviation, by which prior
+    knowledge is weighed against the spots.
     """
 
-    of: Callable[[Array], float]
-    weights: Callable[[Array], Array]
     scale: float
-    prior_factor: float
+
+    def cost(self, sizes: Array) -> float:
+        return tukey_cost(sizes, TUKEY * self.scale)
+
+    def weights(self, sizes: Array) -> Array:
+        return tukey_weights(sizes, TUKEY * self.scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Squares:
+    """As :class:`_Tukey`: the ``used`` spots (n,) count in full, the others not at all."""
+
+    scale: float
+    used: NDArray[np.bool_]
+
+    def cost(self, sizes: Array) -> float:
+        return float(np.square(sizes[self.used]).sum())
+
+    def weights(self, _sizes: Array) -> Array:
+        return self.used.astype(float)
 
 
 def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
@@ -82,19 +106,19 @@ def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
     state = problem.start(start)
     scale = _scale(problem, state)
     for _ in range(_ROUNDS):
-        state = _minimise(problem, state, _biweight(scale), _ITERATIONS_A_ROUND)
+        state = _minimise(problem, state, _Tukey(scale), _ITERATIONS_A_ROUND)
         newest = _scale(problem, state)
         if newest > 0.999 * scale:
             break
         scale = newest
     problem = problem.with_pose_noise(state)
     scale = _scale(problem, state)
-    state = _minimise(problem, state, _biweight(scale), _ITERATIONS)
+    state = _minimise(problem, state, _Tukey(scale), _ITERATIONS)
     scale = _scale(problem, state)
     used = problem.sizes(state) <= float(np.sqrt(chi2.isf(FALSE_OUTLIERS / len(problem), 2))) * scale
     for _ in range(_SELECTIONS):
         _check_enough(problem, used)
-        state = _minimise(problem, state, _squares(scale, used), _ITERATIONS)
+        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
         scale = _scale_of(problem, state, used)
         again = _consistent(problem, state, used, scale)
         if (again == used).all():
@@ -102,7 +126,7 @@ def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
         used = again
     else:  # two sets that ask for each other: what the last fit rests on
         _check_enough(problem, used)
-        state = _minimise(problem, state, _squares(scale, used), _ITERATIONS)
+        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
     return _conclude(problem, state, used)
 
 
@@ -118,9 +142,9 @@ def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], sca
     out twice as many good ones as it says, and make the rest look better than it is.
     """
     rows, values = problem.linearised(state)
-    a, _ = _weighted(problem, state, used.astype(float), scale)
-    size = np.maximum(np.linalg.norm(a, axis=0), 1e-300)
-    leverage = np.linalg.pinv((a / size).T @ (a / size), hermitian=True)
+    normal, _ = _equations(problem, state, _Squares(scale, used))
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    leverage = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
     pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
     spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
     # A spot that determines a parameter alone fits, however wrong it is: nothing speaks against it.
@@ -150,74 +174,34 @@ def _check_enough(problem: SpotProblem, used: NDArray[np.bool_]) -> None:
         )
 
 
-def _biweight(scale: float) -> _Loss:
-    reach = BIWEIGHT * scale
+def _minimise(problem: SpotProblem, state: State, loss: _Tukey | _Squares, iterations: int) -> State:
+    def cost(at: State) -> float:
+        return loss.cost(problem.sizes(at)) + loss.scale**2 * float(np.square(problem.prior(at)[1]).sum())
 
-    def of(sizes: Array) -> float:
-        share = np.minimum(sizes / reach, 1.0)
-        return float((1.0 - (1.0 - share * share) ** 3).sum())
+    def equations(at: State) -> Equations:
+        return _equations(problem, at, loss)
 
-    def weights(sizes: Array) -> Array:
-        out: Array = np.square(1.0 - np.square(np.minimum(sizes / reach, 1.0)))
-        return out
-
-    return _Loss(of, weights, scale, 3.0 / reach**2)
+    return minimise(state, cost, equations, State.moved, iterations=iterations).state
 
 
-def _squares(scale: float, used: NDArray[np.bool_]) -> _Loss:
-    return _Loss(lambda sizes: float(np.square(sizes[used]).sum()), lambda _: used.astype(float), scale, 1.0)
-
-
-def _minimise(problem: SpotProblem, state: State, loss: _Loss, iterations: int) -> State:
-    """Levenberg-Marquardt (Marquardt, 1963), columns scaled."""
-
-    def cost_of(trial: State, sizes: Array) -> float:
-        _, prior = problem.prior(trial)
-        return loss.of(sizes) + loss.prior_factor * loss.scale**2 * float(prior @ prior)
-
-    sizes = problem.sizes(state)
-    cost, damping = cost_of(state, sizes), 1e-4
-    for _ in range(iterations):
-        a, b = _weighted(problem, state, loss.weights(sizes), loss.scale)
-        size = np.maximum(np.linalg.norm(a, axis=0), 1e-12)
-        a = a / size
-        normal, side = a.T @ a, a.T @ b
-        while damping < 1e10:
-            trial = state.moved(np.linalg.solve(normal + damping * np.eye(len(size)), side) / size)
-            new_sizes = problem.sizes(trial)
-            new = cost_of(trial, new_sizes)
-            if new < cost:
-                break
-            damping *= 10.0
-        else:
-            return state
-        gain = cost - new
-        state, sizes, cost, damping = trial, new_sizes, new, max(0.1 * damping, 1e-12)
-        if gain <= 1e-10 * cost:
-            break
-    return state
-
-
-def _weighted(problem: SpotProblem, state: State, weights: Array, scale: float) -> tuple[Array, Array]:
-    """Rows and residuals of spots and of what is known beforehand, in the spots' unit."""
+def _equations(problem: SpotProblem, state: State, loss: _Tukey | _Squares) -> Equations:
+    """Of spots and of what is known beforehand, in the spots' unit."""
     rows, values = problem.linearised(state)
-    root = np.sqrt(weights)[:, None]
-    prior_rows, prior_values = problem.prior(state)
-    a = np.concatenate([(rows * root[:, :, None]).reshape(-1, problem.unknowns), scale * prior_rows])
-    return a, np.concatenate([(values * root).ravel(), scale * prior_values])
+    spots = normal_equations(rows, values, loss.weights(np.linalg.norm(values, axis=1)))
+    prior = normal_equations(*problem.prior(state))
+    return spots[0] + loss.scale**2 * prior[0], spots[1] + loss.scale**2 * prior[1]
 
 
 def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Refined:
     freedom = 2 * int(used.sum()) - len(PARAMETERS)
     scale = _scale_of(problem, state, used)
-    a, _ = _weighted(problem, state, used.astype(float), scale)
-    size = np.linalg.norm(a, axis=0)
-    singular = np.linalg.svd(a / np.maximum(size, 1e-300), compute_uv=False)
-    if not size.all() or singular[-1] < 1e-8 * singular[0]:
+    normal, _ = _equations(problem, state, _Squares(scale, used))
+    try:
+        covariance = covariance_of(normal, scale**2)
+    except np.linalg.LinAlgError:
         raise CalibrationError(
             "the spots don't tell all of camera, plane and laser; more orientations, turned about two axes or more"
-        )
-    covariance = scale**2 * np.linalg.inv((a / size).T @ (a / size)) / np.outer(size, size)
+        ) from None
     k = len(PARAMETERS)
     return Refined(
         state.setup, covariance[:k, :k], problem.residuals_px(state), used, scale, freedom,
@@ -226,11 +210,28 @@ def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Re
 
 
 def _scale(problem: SpotProblem, state: State) -> float:
-    """Standard deviation of one coordinate, from lengths of pairs: their median is 1.1774 of it, less what the
-    parameters take of the noise.
-    """
-    middle = float(np.median(problem.sizes(state)))
-    if not np.isfinite(middle):
+    """Standard deviation of one coordinate, less what the parameters take of the noise."""
+    scale = robust_scale(problem.sizes(state), 2)
+    if not np.isfinite(scale):
         raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
     left = max(1.0 - len(PARAMETERS) / (2.0 * len(problem)), 0.25)
-    return max(middle / (1.1774 * float(np.sqrt(left))), _LEAST)
+    return max(scale / float(np.sqrt(left)), _LEAST)
+
+
+def with_held_lens(refined: Refined, problem: SpotProblem, lens: LensPrior) -> Refined:
+    """``refined``, which held the lens that is its ``problem``'s prior: its ``covariance`` grows by what an error of
+    the lens does to the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up stays as it is.
+    """
+    by_lens = _by_lens(refined, problem)
+    return replace(refined, covariance=refined.covariance + by_lens @ lens.covariance @ by_lens.T)
+
+
+def _by_lens(refined: Refined, problem: SpotProblem) -> Array:
+    """(13, p): least squares' answer to a change of the lens's free parameters."""
+    state = problem.start(refined.setup)
+    rows, _ = problem.with_pose_noise(state).linearised(state)
+    rows = rows[refined.used].reshape(-1, problem.unknowns)
+    own, lens = rows[:, : len(PARAMETERS)], rows[:, len(PARAMETERS) :]
+    size = np.linalg.norm(own, axis=0)
+    out: Array = -np.linalg.lstsq(own / size, lens, rcond=None)[0] / size[:, None]
+    return out

@@ -10,6 +10,7 @@ from gripmon.calibrate.lens_models import LensModel
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
 from gripmon.model.camera import Camera
+from gripmon.model.least_squares import whitening
 from gripmon.model.records import Array
 
 _FX, _FY = 0, 1  # the first two parameters of every lens model
@@ -30,10 +31,9 @@ class LensPrior:
     def root(self) -> Array:
         """(p, p), makes changes of the free parameters normal with unit variance.  Raises :class:`CalibrationError`."""
         try:
-            out: Array = np.linalg.inv(np.linalg.cholesky(self.covariance))
+            return whitening(self.covariance)
         except np.linalg.LinAlgError:
             raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
-        return out
 
     @property
     def slopes(self) -> Array:
@@ -87,7 +87,7 @@ class SpotProblem:
         self.base_T_ee, self.uv_px = base_T_ee, uv_px
         self._camera, self._lens, self._pose_noise = camera, lens, pose_noise
         self._spots_px2 = np.tile(np.eye(2), (len(uv_px), 1, 1)) if covariance_px is None else covariance_px
-        self._whiten = np.linalg.inv(np.linalg.cholesky(self._spots_px2))
+        self._whiten = whitening(self._spots_px2)
         self._root = np.empty((0, 0)) if lens is None else lens.root
 
     def __len__(self) -> int:

@@ -46,6 +46,11 @@ class Spot:
     saturated: float
 
 
+def plain_spot(uv_px: Array) -> Spot:
+    """A spot that nothing but its place (2,) is known of: the calibration's own residuals tell how exact it is."""
+    return Spot(np.asarray(uv_px, dtype=float), np.zeros((2, 2)), 0.0, 0.0, 0, 0.0)
+
+
 def find_spots(image: Image, laser_off: Image | None = None) -> list[Spot] | NotFound:
     """Candidates, the brightest (by flux) first.  ``laser_off`` is the same view without the laser: ambient light and
     reflections that don't come from it vanish.

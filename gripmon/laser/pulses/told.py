@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from gripmon.laser.pointer.samples import Row, check_scale, pose_of
+from gripmon.calibrate.tables import Row, check_scale, pose_of
 from gripmon.model.records import Array, LaserPulse
 
 LONGEST_S = 60.0

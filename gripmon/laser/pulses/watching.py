@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -115,6 +115,15 @@ class PulsedWatch:
     def load(self, table: Sequence[Told]) -> None:
         """All pulses of recorded frames, before any frame."""
         self._matcher.load(table)
+
+    def replayed(self, frames: Iterable[Frame], table: Sequence[Told]) -> Iterator[SpotRecord]:
+        """The records of a table's pulses, judged on recorded frames; the same input gives the same ones."""
+        self.load(table)
+        for frame in frames:
+            for shown in self.frame(frame)[0]:
+                yield self.judge(shown).record
+        for shown in self.finish():
+            yield self.judge(shown).record
 
     def tell(self, told: Told, now_s: float) -> list[Shown]:
         """A pulse was told; those that are to be judged now.  ``now_s``: by any clock, as in :meth:`tick`."""

@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.watch.motion import UNIT
 from gripmon.laser.watch.motions import KINDS, SCALES, assumed
-from gripmon.laser.watch.moving import on_plane
+from gripmon.laser.watch.moving import UNIT, on_plane
 from gripmon.laser.watch.sequential import LEAST_PULSES
 from gripmon.laser.watch.settings import SpotWatchSettings
 from gripmon.laser.watch.single import spread_px, visible

@@ -33,11 +33,6 @@ class SpotSeen:
     candidates: Sequence[Spot] | NotFound
 
 
-def plain_spot(uv_px: Array) -> Spot:
-    """A spot that nothing but its place (2,) is known of: the calibration's own residuals tell how exact it is."""
-    return Spot(np.asarray(uv_px, dtype=float), np.zeros((2, 2)), 0.0, 0.0, 0, 0.0)
-
-
 @dataclass(frozen=True, slots=True)
 class Disagreement:
     """Two of the three ways to a spot, how far apart they put it (m), the standard deviation of that distance along the

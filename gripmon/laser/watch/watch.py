@@ -12,11 +12,9 @@ from gripmon.judge.policy import AlertBook
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.laser.pointer.spots import Spot
 from gripmon.laser.watch import words
-from gripmon.laser.watch.beliefs import Pulse
+from gripmon.laser.watch.beliefs import Places, Pulse
 from gripmon.laser.watch.judgement import SpotFault, SpotJudgement, SpotSeen
-from gripmon.laser.watch.motion import UNIT
-from gripmon.laser.watch.moving import Moved, alert_of, how
-from gripmon.laser.watch.places import Places
+from gripmon.laser.watch.moving import UNIT, Moved, alert_of, how
 from gripmon.laser.watch.sequential import MotionTest
 from gripmon.laser.watch.settings import SpotWatchSettings
 from gripmon.laser.watch.single import Single, alone, visible

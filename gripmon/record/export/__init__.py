@@ -7,7 +7,7 @@ it: each has a file of its own.
 
 from __future__ import annotations
 
-from gripmon.record.export.export import Exporter
+from gripmon.record.export.exporter import Exported, Exporter, export
 from gripmon.record.export.schemas import SCHEMAS
 
-__all__ = ["SCHEMAS", "Exporter"]
+__all__ = ["SCHEMAS", "Exported", "Exporter", "export"]

@@ -7,19 +7,27 @@ used.  No file is ever changed, and images stay in the files until they are aske
 
 from __future__ import annotations
 
-from gripmon.record.read.opening import Collection, open_recordings, recordings_below
+from gripmon.record.read.opening import (
+    Collection,
+    is_rrd,
+    needed_recordings,
+    open_recordings,
+    recording_files,
+    recordings_below,
+)
 from gripmon.record.read.recordings import Picture, Recording, Shot, decode_image
-from gripmon.record.read.run import RecordedRun
 from gripmon.record.read.table import FrameTable
 
 __all__ = [
     "Collection",
     "FrameTable",
     "Picture",
-    "RecordedRun",
     "Recording",
     "Shot",
     "decode_image",
+    "is_rrd",
+    "needed_recordings",
     "open_recordings",
+    "recording_files",
     "recordings_below",
 ]

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gripmon.record.read import entities, protobuf
+from gripmon.record.read import entities
 from gripmon.record.read.table import IntArray
 from gripmon.record.rerun_private import RerunChangedError, chunk_index
 
@@ -283,8 +283,8 @@ def _chunk(body: bytes, store: StoreName, content: Sequence[str] | None) -> Chun
     """The chunk in a message, None for another store's or entity's.  Raises where anything about it is wrong."""
     import pyarrow as pa
 
-    fields = protobuf.fields(body)
-    if protobuf.store_name(fields[1]) != store.recording_id:
+    fields = _fields(body)
+    if _store_name(fields[1]) != store.recording_id:
         return None
     payload = fields[5]
     if fields.get(2, _PLAIN) == _LZ4:
@@ -303,9 +303,9 @@ def _chunk(body: bytes, store: StoreName, content: Sequence[str] | None) -> Chun
 def _introduced(body: bytes) -> StoreName | None:
     """The recording that a message introduces; None for a layout or a damaged message."""
     try:
-        store = protobuf.fields(protobuf.fields(body)[2])[2]
-        recording_id = protobuf.store_name(store)
-        application = protobuf.fields(protobuf.fields(store)[3])[1].decode()
+        store = _fields(_fields(body)[2])[2]
+        recording_id = _store_name(store)
+        application = _fields(_fields(store)[3])[1].decode()
     except (ValueError, KeyError, TypeError, AttributeError):
         return None
     return None if recording_id is None else StoreName(application, recording_id)
@@ -332,3 +332,51 @@ def _rerun_version() -> tuple[int, ...]:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split()) or type(error).__name__
+
+
+_RECORDING = 1  # of the kinds of stores; 2 is a layout
+
+
+def _fields(message: bytes) -> dict[int, Any]:
+    """As much of protobuf (developers.google.com, Encoding) as a few fields take: number -> int or bytes, of a repeated
+    field the first.  Raises ValueError for what is no message.
+    """
+    found: dict[int, Any] = {}
+    offset = 0
+    while offset < len(message):
+        tag, offset = _varint(message, offset)
+        number, kind = tag >> 3, tag & 7
+        value: int | bytes
+        if kind == 0:
+            value, offset = _varint(message, offset)
+        else:
+            if kind == 2:
+                size, offset = _varint(message, offset)
+            elif kind in (1, 5):
+                size = 8 if kind == 1 else 4
+            else:
+                raise ValueError(f"a field of unknown kind {kind}")
+            if offset + size > len(message):
+                raise ValueError("a field that is longer than its message")
+            value, offset = message[offset : offset + size], offset + size
+        found.setdefault(number, value)
+    return found
+
+
+def _store_name(store: bytes) -> str | None:
+    """The recording id in a ``StoreId``; None for a layout's."""
+    found = _fields(store)
+    name = found[2].decode()
+    return name if found.get(1) == _RECORDING else None
+
+
+def _varint(message: bytes, offset: int) -> tuple[int, int]:
+    value = shift = 0
+    while offset < len(message) and shift < 70:
+        byte = message[offset]
+        offset += 1
+        value |= (byte & 127) << shift
+        shift += 7
+        if byte < 128:
+            return value, offset
+    raise ValueError("a number that doesn't end")

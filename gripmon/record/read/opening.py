@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gripmon.model.errors import InputError, NoResultError
 from gripmon.record.read.container import MAGIC, RrdFile, UnreadableFileError
 from gripmon.record.read.contents import Contents, read_contents
 from gripmon.record.read.lines import LineFile, read_lines
@@ -50,6 +51,44 @@ def open_recordings(paths: Sequence[Path], progress: Progress | None = None) -> 
     recordings = [Recording(run) for run in runs.values()]
     recordings.sort(key=lambda r: (int(r.frames.stamp_ns[0]) if len(r.frames) else 0, r.robot, r.camera))
     return Collection(tuple(recordings), tuple(faults))
+
+
+def needed_recordings(paths: Sequence[Path], progress: Progress | None = None) -> Collection:
+    """As :func:`open_recordings`, for those who can do nothing without one.
+
+    Raises :class:`~gripmon.model.errors.InputError` for a file that is not there, or where none of them is a recording;
+    :class:`~gripmon.model.errors.NoResultError` where recordings can't be read: that isn't the user's mistake.
+    """
+    for path in paths:
+        if not path.exists():
+            right = "a recording (.rrd), a folder of them, or estimates.jsonl"
+            raise InputError(f"{path}: there is no such file; {right}")
+    found = open_recordings(paths, progress)
+    if not found.recordings:
+        named = any(path.suffix.lower() in (_SUFFIX, _LINES_SUFFIX) for path in paths)
+        raise (NoResultError if named else InputError)("; ".join(found.faults) or "no recording (.rrd) there")
+    return found
+
+
+def recording_files(paths: Sequence[Path]) -> list[Path]:
+    """The files that are meant, each once; a folder stands for the recordings in it and below.
+
+    Raises :class:`~gripmon.model.errors.InputError` for what isn't there, and for a folder without any.
+    """
+    files: list[Path] = []
+    for path in paths:
+        found = recordings_below(path) if path.is_dir() else [path] * path.is_file()
+        if not found:
+            wrong = f"no {_SUFFIX} file in it" if path.is_dir() else "there is no such file"
+            raise InputError(f"{path}: {wrong}; recordings of gripmon run, or their folder")
+        files += found
+    return list({file.resolve(): file for file in files}.values())
+
+
+def is_rrd(path: Path) -> bool:
+    """Whether a file begins as rerun's do.  OSError where it can't be read."""
+    with path.open("rb") as file:
+        return os.read(file.fileno(), len(MAGIC)) == MAGIC
 
 
 def recordings_below(folder: Path) -> list[Path]:
@@ -106,7 +145,7 @@ def _size(path: Path) -> int:
 def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Contents]:
     """What a file holds of each recording; what it doesn't goes to ``faults``."""
     try:
-        if path.suffix.lower() == _LINES_SUFFIX and not _is_rrd(path):
+        if path.suffix.lower() == _LINES_SUFFIX and not is_rrd(path):
             return [read_lines(LineFile(path), step)]
         file = RrdFile(path)
         found = [read_contents(file, store, step) for store in file.stores]
@@ -128,8 +167,3 @@ def _read(path: Path, faults: list[str], step: Callable[[int], None]) -> list[Co
         what = f"is a recording of the application {applications} that holds no frames of a monitor's"
         faults.append("; ".join([f"{path}: {what}", *file.faults, "not used"]))
     return ours
-
-
-def _is_rrd(path: Path) -> bool:
-    with path.open("rb") as file:
-        return os.read(file.fileno(), len(MAGIC)) == MAGIC

@@ -5,10 +5,14 @@ An .rrd file is a header of 12 bytes, then messages, each after its kind and its
 
 from __future__ import annotations
 
+import contextlib
 import os
+import shutil
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
+from gripmon.model.errors import NoResultError
 from gripmon.record.write.budget import claim
 
 _FILE_HEADER_BYTES = 12
@@ -59,3 +63,30 @@ def repair(path: Path) -> int:
         return size - whole
     finally:
         os.close(lock)
+
+
+def keep_whole(written: Sequence[Path], path: Path, failure: str | None, *, whole: bool = True) -> None:
+    """Give a finished recording its name ``path``; what stood there before stays until then.
+
+    One that isn't ``whole``, lacks its footer, or went into several files because writing failed in between, is
+    removed: :class:`~gripmon.model.errors.NoResultError`.  ``failure`` is what the recorder reports.
+    """
+    reason = failure
+    try:
+        if whole and len(written) == 1 and is_complete(written[0]):
+            written[0].replace(path)
+            return
+    except OSError as error:
+        reason = error.strerror
+    # rerun only says that its thread has ended: the room there is explains the rest.
+    with contextlib.suppress(OSError):
+        reason = f"{_cause(reason)}; its disk has {1e-6 * shutil.disk_usage(path.parent).free:.1f} MB free"
+    for part in written:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+    raise NoResultError(f"--recording {path}: writing failed ({_cause(reason)})")
+
+
+def _cause(failure: str | None) -> str:
+    """The last part: before it stands a path that the user has not named."""
+    return " ".join((failure or "it was not finished").rpartition(": ")[2].split())

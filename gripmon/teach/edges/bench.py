@@ -1,4 +1,6 @@
-"""One gripper before one camera, while a person teaches it: images, corners put by hand, and what follows from them."""
+"""One gripper before one camera, while a person teaches it: images, corners put by hand, and what follows from them,
+down to the accuracy to expect.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +12,19 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from gripmon.judge.drift import foresee
+from gripmon.judge.recalibrate import refusal
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, ReferenceRecord
-from gripmon.monitor import MonitorSettings
+from gripmon.monitor import CORNER_COUNTS, MonitorSettings
 from gripmon.teach.edges.corner_pose import CameraError, CornerPose, PoseRefused, pose_from_corners
 from gripmon.teach.edges.measure import Taught, teach
 from gripmon.teach.edges.placing import Prior, place, prior_of, usual_view
-from gripmon.teach.edges.prospects import Prospects, prospects
 from gripmon.teach.edges.snapping import Snapped, Snapper
 from gripmon.teach.edges.views import TeachingImage, TeachingRefused
+from gripmon.teach.forecast import FEWEST_EDGES, Promise, expect, promise
 from gripmon.track.edges import TaughtEdges
 
 LARGEST_OFF_PX = 100_000.0
@@ -130,3 +134,51 @@ def rough_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tup
         if not all(np.isfinite(v) and abs(v) <= LARGEST_OFF_PX for v in uv_px):
             return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
     return None
+
+
+@dataclass(frozen=True, slots=True)
+class Prospects:
+    """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
+    ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
+    drift test notices; ``promise``: bounds on its error, beside the alert limits.  ``delay_frames``: after how many
+    frames it notices a step of the TCP by 0.1 mm along x, y and z, None for never.  ``recalibration``: why the corners
+    in view give no new pose, None if they do.
+    """
+
+    edges: int
+    sigma: Array
+    weakest: Array
+    smallest: Array
+    promise: Promise
+    delay_frames: tuple[int | None, ...]
+    recalibration: str | None
+
+
+STEP_M = 1e-4
+"""Step of the TCP for which the delay is told."""
+
+
+def prospects(
+    camera: Camera,
+    gripper: Gripper,
+    settings: MonitorSettings,
+    reference: ReferenceRecord,
+    jaw_opening_m: float | None,
+    taught: TaughtEdges | None = None,
+) -> Prospects | None:
+    """The numbers that ``gripmon check`` prints; None where too few edges are in view to measure anything."""
+    outlook = expect(camera, gripper, settings, reference, jaw_opening_m, taught)
+    if outlook.edges < FEWEST_EDGES:
+        return None
+    foresight = foresee(outlook.covariance, settings.drift)
+    taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[settings.recalibrate_corners])
+    points_grip_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]
+    return Prospects(
+        outlook.edges,
+        outlook.sigma,
+        outlook.weakest,
+        foresight.smallest,
+        promise(outlook.protection, settings.policy),
+        tuple(foresight.delay_frames(STEP_M, axis) for axis in range(3)),
+        refusal(points_grip_m),
+    )

@@ -8,14 +8,11 @@ import numpy as np
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
+from gripmon.teach.canvas import Canvas, Colour, enlargement, text_size, write
 from gripmon.teach.edges.views import TeachingImage
-from gripmon.track.edges.profiles import full_scale
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 
-Picture = Image
-
 _ENLARGED_TO_PX = 12.0  # the largest offset is drawn at most so long
-_ENLARGEMENTS = (1, 2, 5, 10, 20, 50, 100)
 _SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR, _TEXT_BGR = (
     (235, 150, 60),
     (60, 170, 255),
@@ -27,46 +24,37 @@ _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
 _MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
 _ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # lines above and below its place that a label may stand in
 _SMALLEST_PX = 1200  # pictures are enlarged to at least this width
-_SHIFT = 4  # binary digits of a pixel in OpenCV's drawing
 
 
 def draw(
     camera: Camera, gripper: Gripper, cam_T_grip: Array, image: TeachingImage, taught: TaughtEdges, model: TaughtModel
-) -> Picture:
+) -> Image:
     """The teaching image, BGR, with the sharp model's edges, the taught ones, and the taught corners by name."""
     zoom = max(1, -(-_SMALLEST_PX // camera.width_px))
-    canvas = cv2.resize(_grey(image.image), None, fx=zoom, fy=zoom, interpolation=cv2.INTER_LINEAR)
-    picture = cv2.cvtColor(canvas, cv2.COLOR_GRAY2BGR)
+    canvas = Canvas(image.image, zoom)
     points_grip_m = gripper.points_grip_m(image.jaw_opening_m if gripper.has_jaw else None)
     known = np.flatnonzero(taught.known).tolist()
     lines = {edge: _line(camera, gripper, cam_T_grip, points_grip_m, taught, edge) for edge in known}
     largest_px = max((float(np.nanmax(np.abs(shift))) for _, shift in lines.values()), default=0.0)
-    enlarged = max((k for k in _ENLARGEMENTS if k * largest_px <= _ENLARGED_TO_PX), default=1)
+    enlarged = enlargement(largest_px, _ENLARGED_TO_PX)
     for edge, (uv_px, shift_px) in lines.items():
         colour = _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR
-        _polyline(picture, uv_px, zoom, _SHARP_BGR)
-        _polyline(picture, uv_px + enlarged * shift_px, zoom, colour)
+        canvas.line(uv_px, _SHARP_BGR)
+        canvas.line(uv_px + enlarged * shift_px, colour)
         middle, shift = uv_px[len(uv_px) // 2], shift_px[len(uv_px) // 2]
-        _arrow(picture, middle, middle + enlarged * shift, zoom, colour)
-    labels = Labels(picture)
+        canvas.line(np.array([middle, middle + enlarged * shift]), colour)
+    labels = Labels(canvas.picture)
     labels.title(
         f"{gripper.name}: sharp model (blue), taught outlines (orange), creases (green)",
         f"offsets in px, drawn {enlarged} times as large",
     )
     for name, corner in model.corners.items():
-        u, v = (_fixed(x, zoom) for x in corner.uv_px)
-        cv2.circle(picture, (u, v), 5 << _SHIFT, _CORNER_BGR, 1, cv2.LINE_AA, _SHIFT)
-        labels.put(name, _pixel(corner.uv_px, zoom), _CORNER_BGR)
+        canvas.circle(np.array(corner.uv_px), 5.0, _CORNER_BGR)
+        labels.put(name, canvas.pixel(np.array(corner.uv_px)), _CORNER_BGR)
     for edge, (uv_px, shift_px) in lines.items():
         text = f"{gripper.edge_ids[edge]} {np.linalg.norm(shift_px[len(uv_px) // 2]):.2f}"
-        labels.put(text, _pixel(uv_px[len(uv_px) // 2], zoom), _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR)
-    return picture
-
-
-def _grey(image: Image) -> Picture:
-    scaled = image.astype(np.float32) * (255.0 / full_scale(image))
-    grey = cv2.cvtColor(scaled, cv2.COLOR_BGR2GRAY) if scaled.ndim == 3 else scaled
-    return np.asarray(np.clip(grey, 0.0, 255.0), dtype=np.uint8)
+        labels.put(text, canvas.pixel(uv_px[len(uv_px) // 2]), _CREASE_BGR if taught.crease[edge] else _OUTLINE_BGR)
+    return canvas.picture
 
 
 def _line(
@@ -85,29 +73,10 @@ def _line(
     return uv_px, shift_px - np.einsum("ni,ni->n", shift_px, along)[:, None] * along
 
 
-def _fixed(value: float, zoom: int) -> int:
-    """A coordinate of the image in OpenCV's fixed-point coordinates of the enlarged picture."""
-    return round(((value + 0.5) * zoom - 0.5) * (1 << _SHIFT))
-
-
-def _polyline(picture: Picture, uv_px: Array, zoom: int, colour: tuple[int, int, int]) -> None:
-    points = np.array([[_fixed(u, zoom), _fixed(v, zoom)] for u, v in uv_px.tolist()], np.int32)
-    cv2.polylines(picture, [points], False, colour, 1, cv2.LINE_AA, _SHIFT)
-
-
-def _arrow(picture: Picture, start: Array, end: Array, zoom: int, colour: tuple[int, int, int]) -> None:
-    _polyline(picture, np.array([start, end]), zoom, colour)
-
-
-def _pixel(uv_px: Array | tuple[float, float], zoom: int) -> tuple[int, int]:
-    u, v = (round((x + 0.5) * zoom - 0.5) for x in uv_px)
-    return u, v
-
-
 class Labels:
     """Texts in a picture, none over another and all of them inside; one that had to give way is tied to its place."""
 
-    def __init__(self, picture: Picture) -> None:
+    def __init__(self, picture: Image) -> None:
         self._picture = picture
         self.boxes: list[tuple[int, int, int, int]] = []
 
@@ -115,15 +84,15 @@ class Labels:
         """At the top, as large as fits."""
         width, top = self._picture.shape[1] - 2 * _MARGIN_PX, _MARGIN_PX
         for line in lines:
-            scale = min(_TITLE, _TITLE * width / _size(line, _TITLE)[0])
-            across, up = _size(line, scale)
-            self._write(line, (_MARGIN_PX, top + up), _TEXT_BGR, scale)
+            scale = min(_TITLE, _TITLE * width / text_size(line, _TITLE)[0])
+            across, up = text_size(line, scale)
+            write(self._picture, line, (_MARGIN_PX, top + up), _TEXT_BGR, scale)
             self.boxes.append((_MARGIN_PX, top, _MARGIN_PX + across, top + up + _GAP_PX))
             top += up + 2 * _GAP_PX
 
-    def put(self, text: str, at: tuple[int, int], colour: tuple[int, int, int]) -> None:
+    def put(self, text: str, at: tuple[int, int], colour: Colour) -> None:
         """Beside a place (x, y), as near as there is room; nowhere free: right of it."""
-        across, up = _size(text, _LABEL)
+        across, up = text_size(text, _LABEL)
         height, width = self._picture.shape[:2]
         step = up + _GAP_PX
         beside = ((at[0] + _ASIDE_PX, at[1] - _GAP_PX + k * step) for k in _ROWS)
@@ -141,20 +110,7 @@ class Labels:
         if abs(y - at[1]) > step:
             end = x if x > at[0] else x + across
             cv2.line(self._picture, at, (end, y - up // 2), colour, 1, cv2.LINE_AA)
-        self._write(text, (x, y), colour, _LABEL)
-
-    def _write(self, text: str, at: tuple[int, int], colour: tuple[int, int, int], scale: float) -> None:
-        """With a shadow; OpenCV's font knows ASCII only."""
-        plain = text.encode("ascii", "replace").decode()
-        for paint, shift in (((0, 0, 0), 1), (colour, 0)):
-            place = at[0] + shift, at[1] + shift
-            cv2.putText(self._picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, scale, paint, 1, cv2.LINE_AA)
-
-
-def _size(text: str, scale: float) -> tuple[int, int]:
-    """Width and height, px."""
-    (across, up), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    return int(across), int(up)
+        write(self._picture, text, (x, y), colour, _LABEL)
 
 
 def _overlap(a: tuple[int, int, int, int], b: tuple[int, int, int, int]) -> bool:

@@ -1,6 +1,6 @@
 """A sweep of camera mounts as one picture: heat maps over distance and tilt, and what the camera would see.
 
-Drawn with OpenCV and Pillow, which are there anyway: coloured cells with numbers need no plotting library.
+Drawn with OpenCV and Pillow: plotly, which draws the report's plots, can write a PNG or JPEG only with a browser.
 """
 
 from __future__ import annotations

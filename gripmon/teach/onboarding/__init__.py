@@ -2,8 +2,7 @@
 
 from gripmon.teach.onboarding.measuring import measure_known, measure_outlines
 from gripmon.teach.onboarding.onplate import KnownGripper, Look, UnknownGripper
-from gripmon.teach.onboarding.outlines import Outline, outlines_of
-from gripmon.teach.onboarding.rough import RoughCorners
+from gripmon.teach.onboarding.outlines import Outline, RoughCorners, outlines_of
 
 __all__ = [
     "KnownGripper",

@@ -7,16 +7,15 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import block_diag
 
-from gripmon.calibrate.free_pose import FreePose
 from gripmon.calibrate.plane import FingerCorners
-from gripmon.calibrate.plane_equations import FEWEST_CORNERS, stand
+from gripmon.calibrate.plane_equations import FEWEST_CORNERS, FreePose, stand
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image
+from gripmon.teach.onboarding.outline_edges import FoundOutline, find_outline
 from gripmon.teach.onboarding.outlines import Outline
 from gripmon.teach.onboarding.plate_print import PlatePrint
-from gripmon.teach.onboarding.snapping import Snapped, snap
 from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 
 JAW_SIGMA_M = 2e-4
@@ -28,11 +27,11 @@ _ROUGH_PX = 3.0
 
 def measure_outlines(
     camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
-) -> tuple[FingerCorners, Snapped]:
+) -> tuple[FingerCorners, FoundOutline]:
     """Corners of fingertips that aren't known, from their rough outlines; ``printed``: see :func:`snap`.  Raises
     :class:`CalibrationError`.
     """
-    snapped = snap(camera, image, outline, printed)
+    snapped = find_outline(camera, image, outline, printed)
     corners = list(outline.corners)
     names = tuple(outline.names[k] for k in corners)
     return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped

@@ -11,11 +11,11 @@ from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
 from gripmon.calibrate.plane_average import PlaneCalibration, against
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.calibrate.targets import Target
 from gripmon.model.camera import make_camera
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import Target
 from gripmon.teach.onboarding.measuring import (
     check_rough,
     contact_height_m,

@@ -19,8 +19,11 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
@@ -153,3 +156,12 @@ def _edge_name(outline: Outline, a: int, b: int) -> str:
     if "inner" in (kind_a, kind_b) and "rise" not in (kind_a, kind_b):
         return f"{finger}_{side_a}"
     return f"{finger}_{kind_a if POINTS.index(kind_a) > POINTS.index(kind_b) else kind_b}_{side_a}"
+
+
+Pixel = tuple[float, float]
+
+
+class RoughCorners(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``corners``: u right, v down in pixels, the centre of the first one at (0, 0); several pixels off is fine."""
+
+    corners: Annotated[dict[str, Pixel], Meta(min_length=1, description="name: [u, v] (px)")]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibrate.sighting import Sighting
-from gripmon.calibrate.targets import Charuco, Chequerboard, Target
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
+from gripmon.model.targets import Charuco, Chequerboard, Target
 from gripmon.track.edges.profiles import read_profiles
 
 _BESIDE = 0.1

@@ -22,6 +22,7 @@ from gripmon.model.geometry import from_record, rotation_angle
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image
 from gripmon.teach.edges.bench import Bench, Found, rough_fault
+from gripmon.teach.edges.files import Picture
 from gripmon.teach.edges.snapping import FEWEST_PUT, SnappedCorner
 from gripmon.teach.page.messages import (
     CornerReply,
@@ -46,16 +47,6 @@ class BadRequest(ValueError):
 
 class SavingRefused(Exception):
     """Nothing was written; one line says why."""
-
-
-@dataclass(frozen=True)
-class Picture:
-    """An image to teach from; ``jaw_opening_m`` None where nobody reported it.  ``path`` None: taken here, no file."""
-
-    name: str
-    image: Image
-    jaw_opening_m: float | None
-    path: str | None
 
 
 class Saving(Protocol):

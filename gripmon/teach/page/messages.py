@@ -87,7 +87,7 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """As :class:`gripmon.teach.edges.prospects.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
+    """As :class:`gripmon.teach.edges.bench.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
 
     edges: int
     sigma: tuple[float, ...]

@@ -12,8 +12,9 @@ from pathlib import Path
 from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
+from gripmon.teach.edges.files import Picture
 from gripmon.teach.onboarding.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
-from gripmon.teach.page.desk import BadRequest, Picture, encoded
+from gripmon.teach.page.desk import BadRequest, encoded
 from gripmon.teach.page.messages import PictureInfo, Place, Put, Reply, Saved, SaveOrder, State
 
 _NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)

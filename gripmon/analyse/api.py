@@ -1,0 +1,213 @@
+"""What programs call after the fact: :func:`correct` and :func:`report`; ``gripmon correct`` and ``gripmon report`` are
+these.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from gripmon.analyse.report.build import Told, build
+from gripmon.analyse.report.content import Report
+from gripmon.analyse.smoother import STAGES
+from gripmon.analyse.smoother.corrected import CorrectedRun, correct_table, name_of, write
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.records import to_json
+from gripmon.record.read import Collection, needed_recordings
+
+__all__ = ["Corrected", "CorrectedRun", "Reported", "correct", "report"]
+
+Paths = Sequence[str | PathLike[str]]
+Bar = Callable[[int, str], AbstractContextManager[Callable[[], None]]]
+"""Steps to come and their unit -> a context with the function to call after each."""
+
+_SUFFIXES = (".jsonl", ".parquet", ".rrd")
+
+
+@dataclass(frozen=True)
+class Reported:
+    """What happened in recordings: as data (SI units), and each recording with what is said of it."""
+
+    report: Report
+    told: tuple[Told, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What could not be used, one line each."""
+        return (*self.report.faults, *(fault for each in self.told for fault in each.report.faults))
+
+    def json(self) -> bytes:
+        """The report as data."""
+        return to_json(self.report)
+
+    def html(self, step: Callable[[], None] = lambda: None) -> bytes:
+        """The report as one page that needs no network; ``step`` is called after each recording."""
+        from gripmon.analyse.report.page import page
+
+        return page(self.report, self.told, step)
+
+
+def report(
+    recordings: Paths,
+    *,
+    limit_m: float | None = None,
+    limit_rad: float | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Reported:
+    """When did the cameras move, how far, why, and which times are affected?
+
+    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them.  A calibration that is off at the TCP by
+    more than the limits counts as affected; None: what the recorded configuration calls worth a warning.  ``progress``
+    is called with bytes read and bytes in all.
+
+    Raises :class:`~gripmon.model.errors.InputError` where there is no recording,
+    :class:`~gripmon.model.errors.NoResultError` where no frame of any can be read.
+    """
+    found = needed_recordings([Path(path) for path in recordings], progress)
+    if not any(len(each.frames) for each in found.recordings):
+        faults = [*found.faults, *(fault for each in found.recordings for fault in each.faults)]
+        raise NoResultError(f"no frame could be read: {'; '.join(faults) or 'the recordings are empty'}")
+    return Reported(*build(found.recordings, found.faults, limit_m, limit_rad))
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Runs with their corrections; ``faults`` is what could not be used, one line each; ``written`` which files."""
+
+    runs: tuple[CorrectedRun, ...]
+    faults: tuple[str, ...]
+    written: tuple[Path, ...] = ()
+
+
+def correct(
+    recordings: Paths,
+    out: str | PathLike[str] | None = None,
+    *,
+    stamps: str | PathLike[str] | None = None,
+    progress: Bar = lambda _steps, _unit: nullcontext(lambda: None),
+) -> Corrected:
+    """The best ``cam_T_grip`` for every frame of recordings, from all frames before and after it.
+
+    ``recordings``: files (.rrd, or ``estimates.jsonl``) and folders of them; each run is corrected by itself, since
+    between two anything may have happened.  ``out``: a file to write, .jsonl, .parquet or .rrd (of several runs then
+    one each, ``out-1.rrd`` and on).  ``stamps``: a CSV file whose column ``stamp_ns`` holds the capture times (Unix ns)
+    to write instead of the frames'.
+
+    Raises :class:`~gripmon.model.errors.InputError` before any work where files are missing or would be replaced,
+    :class:`~gripmon.model.errors.NoResultError` where nothing was measured or writing fails.
+    """
+    paths = [Path(path) for path in recordings]
+    target = None if out is None else Path(out)
+    if target is not None:
+        _check_target(target, paths)
+    wanted_ns = None if stamps is None else _stamps(Path(stamps))
+    found = needed_recordings(paths)
+    if target is not None:
+        _targets(target, len(found.recordings))
+    runs, faults = _corrected(found, progress)
+    if wanted_ns is not None:
+        runs, more = _distributed(runs, wanted_ns)
+        faults += more
+    targets = [] if target is None else _targets(target, len(runs))
+    inputs = _inputs(found) if targets else []
+    for number, path in enumerate(targets):
+        write(path, runs, inputs, number)
+    return Corrected(tuple(runs), tuple(faults), tuple(targets))
+
+
+def _check_target(out: Path, recordings: Sequence[Path]) -> None:
+    if out.suffix.lower() not in _SUFFIXES:
+        raise InputError(f"{out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}")
+    if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
+        raise InputError(f"{out}: is a recording to correct; another file")
+
+
+def _targets(out: Path, runs: int) -> list[Path]:
+    """The files to write: one, but a track for each run where there are several, and none of those is replaced."""
+    if out.suffix.lower() != ".rrd" or runs < 2:
+        return [out]
+    targets = [out.with_name(f"{out.stem}-{number}{out.suffix}") for number in range(1, runs + 1)]
+    there = next((target for target in targets if target.exists()), None)
+    if there is not None:
+        raise InputError(
+            f"{out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
+        )
+    return targets
+
+
+def _stamps(path: Path) -> NDArray[np.int64]:
+    """The column ``stamp_ns`` of a CSV file."""
+    options = csv.ConvertOptions(include_columns=["stamp_ns"], column_types={"stamp_ns": pa.string()})
+    try:
+        texts = csv.read_csv(path, convert_options=options)["stamp_ns"].to_pylist()
+    except KeyError:
+        right = "a first line with the columns' names, capture times in Unix ns"
+        raise InputError(f"{path}: has no column stamp_ns; {right}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
+    stamps = []
+    for number, text in enumerate(texts, 2):
+        try:
+            stamps.append(np.int64(int(text)))
+        except (ValueError, OverflowError):
+            wrong = f"line {number}: '{text}' is not a capture time; a whole number, Unix ns"
+            raise InputError(f"{path}: {wrong}") from None
+    if not stamps:
+        raise InputError(f"{path}: holds no capture times")
+    return np.array(stamps, np.int64)
+
+
+def _corrected(found: Collection, progress: Bar) -> tuple[list[CorrectedRun], list[str]]:
+    runs: list[CorrectedRun] = []
+    faults = list(found.faults)
+    with progress(STAGES * len(found.recordings), "stage") as step:
+        for recording in found.recordings:
+            faults += recording.faults
+            name = name_of(recording)
+            try:
+                runs.append(CorrectedRun(recording, correct_table(recording.frames, step)))
+            except ValueError as error:
+                faults.append(f"{name}: {error}; left out")
+                continue
+            faults += [f"{name}: {fault}" for fault in runs[-1].correction.faults]
+    if not runs:
+        raise NoResultError(f"nothing was measured in the recordings: {'; '.join(faults)}")
+    return runs, faults
+
+
+def _distributed(runs: Sequence[CorrectedRun], wanted_ns: NDArray[np.int64]) -> tuple[list[CorrectedRun], list[str]]:
+    """Each instant to the runs that it lies in; those in none are counted."""
+    out, faults, known = [], [], np.zeros(len(wanted_ns), bool)
+    for each in runs:
+        stamps = each.correction.stamp_ns
+        if (np.diff(stamps) < 0).any():
+            faults.append(f"{each.name}: time runs backwards: no instants of it")
+            continue
+        inside = (wanted_ns >= stamps[0]) & (wanted_ns <= stamps[-1])
+        known |= inside
+        out.append(dataclasses.replace(each, wanted_ns=wanted_ns[inside]))
+    if not known.any():
+        raise NoResultError("none of the capture times lies in the recordings")
+    if not known.all():
+        faults.append(f"{(~known).sum()} of {len(known)} capture times lie in no recording")
+    return out, faults
+
+
+def _inputs(found: Collection) -> list[tuple[str, str]]:
+    """Names and SHA-256 of all files that were used."""
+    files = sorted({path for recording in found.recordings for path in recording.files})
+    out = []
+    for path in files:
+        with path.open("rb") as file:
+            out.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
+    return out

@@ -1,0 +1,210 @@
+"""Calibrations from images and poses, for programs and notebooks; ``gripmon calibrate`` calls the same functions.
+
+Images are arrays (as OpenCV reads them) or paths.  What is wrong with the input is an
+:class:`~gripmon.model.errors.InputError`, input from which nothing can be calibrated a
+:class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from gripmon.calibrate import intrinsics, robot_world
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
+from gripmon.calibrate.intrinsics_result import IntrinsicsResult
+from gripmon.calibrate.lens_models import MODELS, ModelName, parameter_names
+from gripmon.calibrate.robot_world import RobotWorld
+from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
+from gripmon.calibrate.verify import verify
+from gripmon.model.camera import LensSettings
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import invert
+from gripmon.model.images import images_of_one_camera
+from gripmon.model.progress import Progress, quiet
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Image
+from gripmon.model.targets import Charuco, Target, TargetError, name_of, parse_target
+
+__all__ = ["CameraFromViews", "calibrate_intrinsics", "calibrate_robot_world", "verify"]
+
+_FOLDS = 5
+Wanted = ModelName | Literal["auto"] | None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraFromViews:
+    """A camera calibrated from ``sightings`` of the ``target``; ``not_found``: images without it, and why."""
+
+    fit: IntrinsicsResult
+    target: Target
+    sightings: tuple[Sighting, ...]
+    not_found: Mapping[str, str]
+
+    @property
+    def camera(self) -> LensSettings:
+        """Focal lengths, principal point and lens."""
+        return self.fit.camera
+
+    @property
+    def sigmas(self) -> dict[str, float | None]:
+        """Standard deviations of all parameters by name; None of one that was held or is tied to another."""
+        found = dict(zip(self.fit.parameters, self.fit.covariance.diagonal() ** 0.5, strict=True))
+        return {name: float(found[name]) if name in found else None for name in self.fit.values}
+
+    @property
+    def points(self) -> int:
+        """In all views together."""
+        return sum(len(sighting) for sighting in self.sightings)
+
+    @property
+    def outliers(self) -> int:
+        """Points that were left out."""
+        return sum(int((~used).sum()) for used in self.fit.used)
+
+    def document(self, provenance: Provenance) -> CameraCalibration:
+        """What a file holds of it."""
+        return CameraCalibration(
+            camera=self.camera,
+            parameters=self.fit.parameters,
+            covariance=tuple(self.fit.covariance.ravel().tolist()),
+            residuals=CameraResiduals(
+                rms_px=self.fit.rms_px,
+                views=len(self.sightings),
+                points=self.points - self.outliers,
+                outliers=self.outliers,
+                cross_validated_rms_px=self.fit.cross_validated_rms_px,
+            ),
+            target=name_of(self.target),
+            warnings=self.fit.warnings,
+            provenance=provenance,
+        )
+
+
+def calibrate_intrinsics(
+    images: Sequence[str | Path | Image],
+    target: Target | str,
+    *,
+    model: Wanted = None,
+    fixed: Mapping[str, float | None] = MappingProxyType({}),
+    progress: Progress = quiet,
+) -> CameraFromViews:
+    """A camera from images of a flat ``target`` (or its description, "chequerboard:9x6:0.025"), each of which may show
+    a part of it.
+
+    ``model``: of the lens; "auto" is the one with the smallest information criterion, None brown_conrady, of a single
+    image paper.  ``fixed``: parameters to hold, at a value or (None) where they start, see
+    :func:`gripmon.calibrate.intrinsics.calibrate`.
+    """
+    target = parse_target(target) if isinstance(target, str) else target
+    check_fixed(fixed, model)
+    sightings, not_found = _views(images, target, progress)
+    found = _fitted(sightings, model, fixed, progress)
+    found = replace(found, warnings=(*found.warnings, *_about_target(sightings, target)))
+    return CameraFromViews(found, target, tuple(sightings), MappingProxyType(not_found))
+
+
+def check_fixed(fixed: Mapping[str, float | None], model: Wanted) -> None:
+    """:class:`~gripmon.model.errors.InputError` for parameters that can't be held so."""
+    models = [m for m in MODELS if model in (m, "auto") or (model is None and m != "fisheye")]
+    known = list(dict.fromkeys(name for one in models for name in parameter_names(one)))
+    for name, value in fixed.items():
+        fault = None
+        if name not in (*known, "aspect"):
+            fault = f"is no parameter of the model; {', '.join(known)} or aspect"
+        elif name == "aspect" and value is not None:
+            fault = "takes no value: pixels are square"
+        elif value is not None and not math.isfinite(value):
+            fault = f"is no number; {name}=VALUE"
+        elif name in ("fx_px", "fy_px") and (value is None or value <= 0.0):
+            fault = f"at what isn't said; {name}=VALUE (px), above 0"
+        if fault is not None:
+            raise InputError(f"{name}: {fault}")
+    if "aspect" in fixed and "fy_px" in fixed:
+        raise InputError("fy_px: is fx_px with aspect; one of them")
+
+
+def _views(
+    images: Sequence[str | Path | Image], target: Target, progress: Progress
+) -> tuple[list[Sighting], dict[str, str]]:
+    """The target in all images, and why it isn't found in others."""
+    sightings: list[Sighting] = []
+    not_found: dict[str, str] = {}
+    larger: list[str] = []
+    with progress(len(images), "image") as step:
+        for name, image in images_of_one_camera(images):
+            sight = detect(image, target, name)
+            if isinstance(sight, NotFound):
+                not_found[name] = sight.reason
+                larger += [f"{name}: {sight.reason}"] if sight.larger else []
+            else:
+                sightings.append(sight)
+            step()
+    if not sightings:
+        (reason, times), *_ = Counter(not_found.values()).most_common(1)
+        why = reason if times == len(images) else f"{times} of them: {reason}"
+        count = "the image doesn't show" if len(images) == 1 else f"none of {len(images)} images shows"
+        # Of images that all have the same fault the one line says enough.
+        details = [f"{name}: {why}" for name, why in not_found.items()] if len(set(not_found.values())) > 1 else []
+        raise CalibrationError(f"{count} the target ({why})", details)
+    if larger:
+        # Where the rest of it is hidden or out of view, the smaller one fits as well: those images prove nothing.
+        raise TargetError(f"{len(larger)} of {len(images)} images show a larger one ({larger[0]}); its full size")
+    return sightings, not_found
+
+
+def _fitted(
+    sightings: list[Sighting], wanted: Wanted, fixed: Mapping[str, float | None], progress: Progress
+) -> IntrinsicsResult:
+    single = len(sightings) == 1
+    model: ModelName = "paper" if single else "brown_conrady"
+    if wanted is not None and wanted != "auto":
+        model = wanted
+    if single:
+        return intrinsics.calibrate_single_view(sightings[0], model, fixed=fixed)
+    steps = (len(MODELS) if wanted == "auto" else 1) + min(_FOLDS, len(sightings)) * (len(sightings) > 3)
+    with progress(steps, "fit") as step:
+        if wanted == "auto":
+            result = intrinsics.calibrate_best(sightings, MODELS, fixed=fixed, step=step)
+        else:
+            result = intrinsics.calibrate(sightings, model, fixed=fixed)
+            step()
+        crossed = intrinsics.cross_validate(sightings, result.model, fixed=fixed, folds=_FOLDS, step=step)
+    return replace(result, cross_validated_rms_px=crossed)
+
+
+def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
+    """Whether it may have been described as larger than it is: on a lattice without marks nothing else tells."""
+    if isinstance(target, Charuco):
+        return []
+    step_m = getattr(target, "square_m", None) or getattr(target, "spacing_m", 1.0)
+    spans = [sorted(np.ptp(s.plate_m[:, :2], axis=0).tolist(), reverse=True) for s in sightings]
+    seen = [round(max(span[k] for span in spans) / step_m) + 1 for k in (0, 1)]
+    if seen[0] >= max(target.columns, target.rows) or len(sightings) == 1:
+        return []
+    whole = f"{target.columns} x {target.rows}"
+    return [f"no image shows more than {seen[0]} x {seen[1]} of the target's {whole} points: is it described rightly?"]
+
+
+def calibrate_robot_world(
+    base_T_ee: Array, cam_T_target: Array, covariance: Array | None = None, *, eye_in_hand: bool = False
+) -> RobotWorld:
+    """Both unknown transforms of ``cam_T_target = cam_T_base base_T_ee ee_T_target`` from poses (n, 4, 4) each, with
+    the ``covariance`` (n, 6, 6) of the targets' poses if it is known.
+
+    ``eye_in_hand``: the camera is on the hand and the target stands; the result's ``cam_T_base`` is ``cam_T_ee`` then,
+    and its ``ee_T_target`` is ``base_T_target``.
+    """
+    arm = np.stack([invert(T) for T in base_T_ee]) if eye_in_hand else base_T_ee
+    start = robot_world.solve(cam_T_target, arm)
+    found = robot_world.refine(cam_T_target, arm, start, covariance, inexact_arm=True)
+    robot_world.check_reading(found, cam_T_target, arm)
+    return found

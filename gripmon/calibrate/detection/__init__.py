@@ -1,0 +1,6 @@
+"""Calibration targets found in images: which points are seen, to some hundredths of a pixel, and their covariances."""
+
+from gripmon.calibrate.detection.boards import upright
+from gripmon.calibrate.detection.target import detect
+
+__all__ = ["detect", "upright"]

@@ -1,0 +1,200 @@
+"""Tables with a row for each pose of an arm: CSV, YAML or JSON, and the ways in which a pose may be written."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gripmon.calibrate.interchange.fault import read_mapping
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
+from gripmon.model.records import Array
+
+Row = Mapping[str, Any]
+
+POSITION = ("tx_m", "ty_m", "tz_m")
+QUATERNION = ("qx", "qy", "qz", "qw")
+ROTATION_VECTOR = ("rx_rad", "ry_rad", "rz_rad")
+MATRIX = tuple(f"m{row}{column}" for row in range(4) for column in range(4))
+POSE_COLUMNS = (
+    f"{', '.join(POSITION)} with {', '.join(QUATERNION)} (quaternion) or {', '.join(ROTATION_VECTOR)} (rotation "
+    "vector), or m00 … m33 (4 x 4, row by row)"
+)
+_UNIT = 1e-2
+_ORTHONORMAL = 1e-3
+_FARTHEST_M = 20.0
+"""No arm reaches farther from its base: such numbers are millimetres."""
+_TABLE = "a table of samples"
+_SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
+
+
+def rows_of(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """A table's rows, and where each stands.  :class:`~gripmon.model.errors.InputError` for what is none."""
+    suffix = path.suffix.lower()
+    if suffix not in (".csv", ".yaml", ".yml", ".json"):
+        raise InputError(f"{path}: is no table; a .csv, .yaml or .json file")
+    if suffix == ".csv":
+        return _csv_rows(path)
+    if suffix == ".json":
+        try:
+            values = json.loads(_text(path))
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"{path}: not JSON: {error}; a JSON file") from None
+    else:
+        values = read_mapping(str(path), _text(path).encode(), _SAMPLES)
+    samples = values.get("samples") if isinstance(values, dict) else values
+    if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
+        raise InputError(f"{path}: samples is no list of samples; {_SAMPLES}")
+    return samples, [f"sample {k + 1}" for k in range(len(samples))]
+
+
+def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
+    rows: list[dict[str, Any]] = []
+    places = []
+    try:
+        header = reader.fieldnames or []
+        separator = next((sign for sign in ";\t" if len(header) == 1 and sign in header[0]), None)
+        if separator is not None:
+            shown = {";": "semicolons", "\t": "tabs"}[separator]
+            raise InputError(f"{path}: columns are separated by {shown}; commas, and points in numbers")
+        for row in reader:
+            if None in row or None in row.values():
+                raise InputError(
+                    f"{path}: line {reader.line_num} has another number of fields than the header; {len(header)}"
+                )
+            rows.append({str(key).strip(): value.strip() for key, value in row.items()})
+            places.append(f"line {reader.line_num}")
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {_TABLE}") from None
+    if not rows:
+        raise InputError(f"{path}: holds no sample; a header line, then a line for each spot")
+    return rows, places
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; {_TABLE}") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: is not text; {_TABLE}") from None
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror}); {_TABLE}") from None
+
+
+def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:
+    """Finite numbers in a row's columns.  ValueError: what is wrong, and what would be right."""
+    out = []
+    for key in keys:
+        value = row.get(key)
+        if value in (None, ""):
+            raise ValueError(f"{place}: has no {key}; a number")
+        try:
+            number = float(value) if not isinstance(value, bool) else math.nan
+        except (TypeError, ValueError):
+            number = math.nan
+        if not math.isfinite(number):
+            raise ValueError(f"{place}: {key} is {value!r}; a number")
+        out.append(number)
+    return out
+
+
+def pose_of(row: Row, place: str) -> Array:
+    """``base_T_ee`` (4, 4) of a row.  ValueError: what is wrong, and what would be right."""
+    if row.get("base_T_ee") is not None:
+        return _nested(row["base_T_ee"], place)
+    if any(key in row for key in MATRIX):
+        return checked_transform(np.array(numbers_of(row, MATRIX, place)).reshape(4, 4), place)
+    missing = [key for key in POSITION if key not in row]
+    if missing:
+        other = next((key for key in row if key and key.lower() in ("tx", "x", "x_mm", "tx_mm", "x_m")), None)
+        found = f" (there is {other}: which unit?)" if other else ""
+        raise ValueError(f"{place}: has no column {missing[0]}{found}; {POSE_COLUMNS}")
+    position = np.array(numbers_of(row, POSITION, place))
+    if any(key in row for key in QUATERNION):
+        return make_transform(_from_quaternion(numbers_of(row, QUATERNION, place), place), position)
+    if any(key in row for key in ROTATION_VECTOR):
+        return make_transform(_from_vector(numbers_of(row, ROTATION_VECTOR, place), place), position)
+    raise ValueError(f"{place}: has no rotation; {POSE_COLUMNS}")
+
+
+def _nested(value: Any, place: str) -> Array:
+    """``{translation_m, rotation_xyzw}`` or a list of four lists of four."""
+    if isinstance(value, Mapping):
+        unknown = set(value) - {"translation_m", "rotation_xyzw"}
+        if unknown or len(value) != 2:
+            raise ValueError(
+                f"{place}: base_T_ee has the keys {', '.join(map(str, value))}; translation_m and rotation_xyzw"
+            )
+        position = _list(value["translation_m"], 3, f"{place}: base_T_ee.translation_m")
+        rotation = _list(value["rotation_xyzw"], 4, f"{place}: base_T_ee.rotation_xyzw")
+        return make_transform(_from_quaternion(rotation, place), np.array(position))
+    if not isinstance(value, list) or len(value) != 4:
+        raise ValueError(f"{place}: base_T_ee is no transform; translation_m and rotation_xyzw, or 4 x 4 numbers")
+    lines = [_list(line, 4, f"{place}: a row of base_T_ee") for line in value]
+    return checked_transform(np.array(lines), place)
+
+
+def _list(value: Any, count: int, what: str) -> list[float]:
+    good = isinstance(value, list) and len(value) == count
+    if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value):
+        raise ValueError(f"{what} is {value!r}; {count} numbers")
+    return [float(v) for v in value]
+
+
+def _from_quaternion(quaternion: Sequence[float], place: str) -> Array:
+    length = math.sqrt(sum(q * q for q in quaternion))
+    if abs(length - 1.0) > _UNIT:
+        hint = " (degrees?)" if max(abs(q) for q in quaternion) > 1.5 else ""
+        raise ValueError(
+            f"{place}: the quaternion {_shown(quaternion)} has the length {length:.4g}{hint}; a unit quaternion x y z w"
+        )
+    x, y, z, w = quaternion
+    return rotation_from_xyzw((x, y, z, w))
+
+
+def _from_vector(vector: Sequence[float], place: str) -> Array:
+    angle = math.sqrt(sum(v * v for v in vector))
+    if angle > 2.0 * math.pi * 1.01:
+        raise ValueError(
+            f"{place}: the rotation vector {_shown(vector)} turns by {angle:.4g} rad, more than once around: degrees? "
+            "radians"
+        )
+    return exp_rotation(np.array(vector))
+
+
+def checked_transform(matrix: Array, place: str) -> Array:
+    """A matrix (4, 4) that is a rigid motion; ValueError for one that isn't."""
+    if np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > 1e-6:
+        raise ValueError(f"{place}: the last row of the 4 x 4 is {_shown(matrix[3])}; 0 0 0 1 (is it transposed?)")
+    rotation = matrix[:3, :3]
+    fault = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+    if fault > _ORTHONORMAL:
+        raise ValueError(
+            f"{place}: the rotation is not orthonormal (off by {fault:.2g}); a rotation matrix, columns of length 1 "
+            "that stand on each other"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise ValueError(f"{place}: the rotation is left-handed (determinant -1); a right-handed frame")
+    left, _, right = np.linalg.svd(rotation)
+    return make_transform(left @ right, matrix[:3, 3])
+
+
+def check_scale(base_T_ee: Array) -> None:
+    """ValueError for poses (n, 4, 4) that no arm reaches."""
+    far = float(np.median(np.linalg.norm(base_T_ee[:, :3, 3], axis=1)))
+    if far > _FARTHEST_M:
+        raise ValueError(
+            f"the end-effector is {far:.4g} m from the base (median), which no arm reaches: millimetres? metres"
+        )
+
+
+def _shown(values: Any) -> str:
+    return " ".join(f"{float(v):.4g}" for v in values)

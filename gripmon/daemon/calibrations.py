@@ -1,0 +1,306 @@
+"""Calibrations as files: of ``gripmon calibrate``, or what a configuration, a monitor's state or its estimates say."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.verify import Calibrated
+from gripmon.daemon.config import Config, load_config
+from gripmon.daemon.config.calibrated import read_camera, read_hand_eye
+from gripmon.daemon.config.typed import SettingsError, to_settings
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.judge.statefile import unpack
+from gripmon.model.atomic import write_atomically
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record, to_record
+from gripmon.model.gripper import Gripper
+from gripmon.model.images import image_paths
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import FrameRecord
+from gripmon.model.targets import Target, TargetError, checked, parse_target
+from gripmon.teach.hand_eye import calibrate_plane, measure_tracked
+from gripmon.teach.onboarding import RoughCorners, outlines_of
+from gripmon.teach.onboarding.measuring import check_rough
+from gripmon.track.edges.taught import gripper_digest
+
+_RIGHT = "a file of gripmon calibrate, a configuration, a monitor's state or its estimates (JSON lines)"
+_LARGEST_BYTES = 1 << 30
+
+
+def read_calibrated(path: Path) -> Calibrated:
+    """What a file says; :class:`~gripmon.model.errors.InputError` if nothing."""
+    data = read_bytes(path)
+    head = data[:4096].lstrip()
+    if head.startswith(b'{"sha256"'):
+        return _state(path, data)
+    if head.startswith(b"{") and path.suffix != ".yaml":
+        return _estimates(path, data)
+    return _of_yaml(path, read_yaml(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's content; :class:`~gripmon.model.errors.InputError` if it can't be read."""
+    try:
+        if path.is_file() and path.stat().st_size > _LARGEST_BYTES:
+            raise InputError(f"{path}: is larger than 1 GB; {_RIGHT}")
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; {_RIGHT}") from None
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror}); {_RIGHT}") from None
+
+
+def _of_yaml(path: Path, values: dict[str, object]) -> Calibrated:
+    readers = {"gripmon.camera_calibration/1": _camera, "gripmon.hand_eye_calibration/1": _hand_eye}
+    if values.get("schema") in readers:
+        return readers[str(values["schema"])](path)
+    if "camera" in values and "gripper" in values:
+        return _configuration(path)
+    raise InputError(f"{path}: holds no calibration; {_RIGHT}")
+
+
+def _camera(path: Path) -> Calibrated:
+    found = read_camera(path)
+    values = {**_plain(found.camera)}
+    sigmas = [
+        f"{name} {values[name]:.6g} ± {math.sqrt(max(found.covariance[i * (len(found.parameters) + 1)], 0.0)):.2g}"
+        for i, name in enumerate(found.parameters)
+    ]
+    notes = [*_origin(found.provenance), *([f"one standard deviation: {', '.join(sigmas)}"] if sigmas else [])]
+    if found.residuals is not None:
+        notes.append(f"rms {found.residuals.rms_px:.3f} px over {found.residuals.points} points")
+    return Calibrated(
+        str(path), "a camera calibration", found.camera, found.parameters, found.covariance, notes=tuple(notes)
+    )
+
+
+def _plain(camera: LensSettings) -> dict[str, float]:
+    """A camera's numbers by the names that its calibration gives them."""
+    values: dict[str, float] = {}
+    for key, value in msgspec.structs.asdict(camera).items():
+        values.update({f"{key}.{i}": v for i, v in enumerate(value)} if isinstance(value, tuple) else {key: value})
+    return values
+
+
+def _hand_eye(path: Path) -> Calibrated:
+    found = read_hand_eye(path)
+    residuals = found.residuals
+    return Calibrated(
+        str(path),
+        "a hand/eye calibration",
+        found.camera,
+        cam_T_grip=found.cam_T_grip,
+        covariance=found.covariance,
+        gripper=found.gripper,
+        jaw_opening_m=found.jaw_opening_m,
+        notes=_origin(found.provenance),
+        pose_notes=(
+            *_uncertainty(found.covariance),
+            f"rms {1e3 * residuals.rms_m:.4f} mm on the plate; {residuals.corners} corners, {residuals.images} images",
+        ),
+    )
+
+
+def _configuration(path: Path) -> Calibrated:
+    config = load_config(path, check_source=False, with_taught=False)
+    reference = config.reference
+    return Calibrated(
+        str(path),
+        "a configuration",
+        config.settings.camera,
+        cam_T_grip=reference.cam_T_grip,
+        covariance=reference.covariance,
+        pose_notes=(f"the configured reference {reference.reference_id}", *_uncertainty(reference.covariance)),
+    )
+
+
+def _state(path: Path, data: bytes) -> Calibrated:
+    try:
+        kept = unpack(data)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; {_RIGHT}") from None
+    reference = kept.state.references[-1]
+    said = f"the reference in force of {kept.owner.robot}/{kept.owner.camera}: {reference.reference_id}"
+    return Calibrated(
+        str(path),
+        "a monitor's state",
+        cam_T_grip=reference.cam_T_grip,
+        covariance=reference.covariance,
+        pose_notes=(f"{said}, revision {reference.revision}, {reference.origin}", *_uncertainty(reference.covariance)),
+    )
+
+
+def _estimates(path: Path, data: bytes) -> Calibrated:
+    """The last line with a valid transform."""
+    decoder = msgspec.json.Decoder(FrameRecord)
+    lines = data.splitlines()
+    for number in range(len(lines), 0, -1):
+        if not lines[number - 1].strip():
+            continue
+        try:
+            record = decoder.decode(lines[number - 1])
+        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: line {number}: is no estimate ({error}); {_RIGHT}") from None
+        if record.verdict == "valid" and record.cam_T_grip is not None and record.covariance is not None:
+            return Calibrated(
+                str(path),
+                "estimates",
+                cam_T_grip=record.cam_T_grip,
+                covariance=record.covariance,
+                jaw_opening_m=record.jaw_opening_m,
+                pose_notes=(f"the estimate of frame {record.seq} (line {number})", *_uncertainty(record.covariance)),
+            )
+    raise InputError(f"{path}: no line has a valid transform; {_RIGHT}")
+
+
+def _origin(provenance: Provenance) -> tuple[str, ...]:
+    return (f"calibrated {provenance.time} with gripmon {provenance.gripmon}: {provenance.command}",)
+
+
+def _uncertainty(covariance: tuple[float, ...]) -> list[str]:
+    sigma = [math.sqrt(max(covariance[7 * i], 0.0)) for i in range(6)]
+    if not any(sigma):
+        return []
+    mm = ", ".join(f"{1e3 * s:.2g}" for s in sigma[:3])
+    degrees = ", ".join(f"{math.degrees(s):.2g}" for s in sigma[3:])
+    return [f"one standard deviation along and about the camera's x, y, z: {mm} mm (TCP), {degrees} degrees"]
+
+
+def read_given_camera(path: Path) -> GivenCamera:
+    """A calibrated camera that can be used, with its covariance.  :class:`~gripmon.model.errors.InputError`."""
+    found = read_camera(path)
+    try:
+        make_camera(found.camera)
+    except ValueError as error:
+        raise InputError(f"{path}: camera.{error}") from None
+    count = len(found.parameters)
+    return GivenCamera(found.camera, found.parameters, np.reshape(found.covariance, (count, count)))
+
+
+def read_rough_corners(path: Path, gripper: Gripper | None) -> dict[str, tuple[float, float]]:
+    """Rough corners of a gripper, or (None) of one that isn't known.  :class:`~gripmon.model.errors.InputError`."""
+    try:
+        rough = to_settings(read_yaml(path), RoughCorners).corners
+        if gripper is None:
+            outlines_of(rough)
+        else:
+            check_rough(gripper, rough)
+    except (SettingsError, CalibrationError) as error:
+        raise InputError(f"{path}: {error}") from None
+    return rough
+
+
+def is_target_file(text: str) -> bool:
+    """Whether this names a file instead of describing a target."""
+    return text.lower().endswith((".yaml", ".yml"))
+
+
+def target_of(text: str) -> Target:
+    """A target as a command line has it: described, or in the file of a calibration that was made with it.
+
+    Raises :class:`~gripmon.model.targets.TargetError`, one line.
+    """
+    if not is_target_file(text):
+        return parse_target(text)
+    right = "a file of gripmon calibrate intrinsics or plane, or one with the line target: circles:8x8:0.008:0.004"
+    try:
+        values = read_yaml(Path(text))
+    except InputError as error:
+        raise TargetError(str(error)) from None
+    described = values.get("target")
+    if described is None:
+        described = _target_of_command(values.get("provenance"))
+    if described is None and "kind" in values:
+        described = values
+    if isinstance(described, dict):
+        return checked(described, text, right)
+    if not isinstance(described, str) or is_target_file(described):
+        raise TargetError(f"{text}: names no target; {right}")
+    try:
+        return parse_target(described)
+    except TargetError as error:
+        raise TargetError(f"{text}: {error}") from None
+
+
+def _target_of_command(provenance: object) -> str | None:
+    """What a file's provenance gives after ``--target``."""
+    command = provenance.get("command") if isinstance(provenance, dict) else None
+    try:
+        words = shlex.split(command) if isinstance(command, str) else []
+    except ValueError:
+        return None
+    return words[words.index("--target") + 1] if "--target" in words[:-1] else None
+
+
+def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> None:
+    """Write a calibration as YAML, whole or not at all.  OSError if it can't be written."""
+    write_atomically(path, as_yaml(msgspec.to_builtins(document)).encode())
+
+
+def measure_again(
+    first: Calibrated,
+    images: Sequence[str],
+    config_file: str | None,
+    target: Target | None = None,
+    *,
+    jaw_opening_m: float | None = None,
+) -> tuple[Calibrated, tuple[str, ...]]:
+    """The hand/eye calibration that images (files, folders) show, to compare with the ``first`` one; on the plate if
+    there is a ``target``, else as the configuration's monitor sees them.  And what is doubtful about it.
+    """
+    config = _same_config(first, config_file)
+    opening_m = _opening(first, config, jaw_opening_m)
+    paths = image_paths(images)
+    assert first.cam_T_grip is not None
+    expected = from_record(first.cam_T_grip), np.reshape(first.covariance, (6, 6))
+    lens = config.settings.camera
+    if target is None:
+        (cam_T_grip, covariance), doubts = measure_tracked(
+            paths, lens, config.gripper, expected, config.settings.monitor,
+            jaw_opening_m=opening_m, taught_edges=config.taught_edges,
+        )  # fmt: skip
+    else:
+        found = calibrate_plane(paths, lens, config.gripper, target, jaw_opening_m=opening_m, cam_T_grip=expected[0])
+        if found.not_used:
+            raise CalibrationError(found.not_used[0])
+        cam_T_grip, covariance, doubts = found.cam_T_grip, found.covariance, found.fit.warnings
+    flat = tuple(covariance.ravel().tolist())
+    return Calibrated(str(paths[0]), "images", lens, cam_T_grip=to_record(cam_T_grip), covariance=flat), doubts
+
+
+def _same_config(first: Calibrated, file: str | None) -> Config:
+    """The configuration, which has to be of the same camera and gripper."""
+    if file is None:
+        raise InputError("--config: is missing; with images, the configuration with gripper and monitor")
+    if first.cam_T_grip is None:
+        raise InputError(f"{first.name}: is {first.kind}; with images, a hand/eye calibration")
+    config = load_config(Path(file), check_source=False)
+    if first.lens is not None and first.lens != config.settings.camera:
+        raise InputError(f"{first.name}: camera: isn't the one of {file}; the same camera calibration in both")
+    if first.gripper is not None and first.gripper.sha256 != gripper_digest(config.gripper):
+        raise InputError(f"{first.name}: gripper: {first.gripper.name} isn't the one of {file}; the same file in both")
+    return config
+
+
+def _opening(first: Calibrated, config: Config, given_m: float | None) -> float | None:
+    gripper = config.gripper
+    if not gripper.has_jaw:
+        if given_m is not None:
+            raise InputError("--jaw-opening: the gripper has no jaw; leave it out")
+        return None
+    opening_m = next(m for m in (given_m, first.jaw_opening_m, config.jaw_opening_m) if m is not None)
+    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise InputError(
+            f"--jaw-opening: {opening_m:g} m; the gripper's {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        )
+    return opening_m

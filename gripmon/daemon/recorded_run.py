@@ -1,0 +1,133 @@
+"""A recording as the input of a replay: with what the monitor ran then, or with another configuration."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from gripmon.daemon.config import Config, ConfigError
+from gripmon.daemon.config.recorded import from_recorded, to_recorded
+from gripmon.model.errors import InputError, NoResultError
+from gripmon.model.records import FrameRecord, Limits, MonitorState
+from gripmon.record.read import recording_files
+from gripmon.record.read.replayed import RecordedFrames, SeveralRunsError, UnusableError
+from gripmon.record.write.compared import ComparedRecorder
+from gripmon.record.write.repair import keep_whole
+from gripmon.record.write.wire import make_scene
+
+
+class RecordedRun:
+    """What was recorded, and how a monitor goes through it again: with ``config``, beginning with ``state`` (None: with
+    the configured reference).  ``notes``: what is missing, one line each.
+    """
+
+    def __init__(self, paths: list[Path], config: Config | None, opened: contextlib.ExitStack) -> None:
+        """``config`` None: the recorded configuration.  What is opened is closed with ``opened``.
+
+        Raises :class:`~gripmon.model.errors.InputError`, :class:`~gripmon.model.errors.NoResultError`.
+        """
+        try:
+            self.source: RecordedFrames = RecordedFrames(recording_files(paths))
+        except SeveralRunsError as error:
+            raise InputError(f"replay: {error}") from None
+        except UnusableError as error:
+            raise NoResultError(f"replay: {error}") from None
+        self.name = str(paths[0]) if len(paths) == 1 else f"{paths[0]} and {len(paths) - 1} more"
+        self.recorded_config = self._recorded_config(opened)
+        begin = config or self.recorded_config
+        if begin is None:
+            raise InputError(f"{self.name}: holds no configuration; the one to replay with, by --config")
+        self.notes: list[str] = []
+        self.config, self.state = self._begin(begin)
+        self._note_what_is_missing()
+
+    @contextlib.contextmanager
+    def compared_in(self, path: Path) -> Iterator[ComparedRecorder]:
+        """A recorder into one file that shows what was recorded and what is replayed, overlaid.
+
+        OSError where ``path`` can't be written, :class:`~gripmon.model.errors.NoResultError` where writing fails later.
+        """
+        config, reference = self.config, self.config.reference
+        if path.resolve() in {source.resolve() for source in self.source.paths}:
+            raise InputError(f"--recording {path}: is what is replayed; another file")
+        if self.state is not None:
+            reference = self.state.references[-1]
+        part = path.with_name(f".{path.name}.part")
+        settings = config.settings
+        scene = make_scene(
+            settings.recording, str(path.parent), path.stem, settings.robot, settings.camera_name, config.camera,
+            config.gripper, reference, configuration=to_recorded(config, self.state),
+        )  # fmt: skip
+        recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
+        try:
+            yield recorder
+        finally:
+            recorder.close()
+            keep_whole([part], path, recorder.failure, whole=recorder.failure is None)
+
+    def _recorded_config(self, opened: contextlib.ExitStack) -> Config | None:
+        recorded = self.source.configuration
+        if recorded is None:
+            return None
+        folder = Path(opened.enter_context(tempfile.TemporaryDirectory(prefix="gripmon-replay-")))
+        try:
+            return from_recorded(recorded, folder)
+        except ConfigError as error:
+            text = str(error).replace(f"{folder}/", "")
+            wrong = f"its configuration can't be used ({text})"
+            raise InputError(f"{self.name}: {wrong}; one of this version, by --config") from None
+
+    def _begin(self, config: Config) -> tuple[Config, MonitorState | None]:
+        """Where the monitor starts from: the state then, if that was about this calibration."""
+        source = self.source
+        state = None if source.configuration is None else source.configuration.start
+        first, recorded = source.reference, self.recorded_config
+        ours = recorded is not None and recorded.state_owner.calibration == config.state_owner.calibration
+        if first is None or recorded is None or not ours:
+            if recorded is not None:
+                self.notes.append("--config has another calibration: it begins with that one's reference")
+            return config, None
+        began_with = recorded.reference if state is None else state.references[-1]
+        if state is None and first.origin == began_with.origin:
+            return dataclasses.replace(config, reference=first), None
+        if state is not None and (first.reference_id, first.revision) == (began_with.reference_id, began_with.revision):
+            return dataclasses.replace(config, reference=state.references[0]), state
+        self.notes.append(
+            f"the run's beginning isn't in {self.name}: it begins with the reference that was in force in the "
+            f"first file, {first.reference_id}; the result comes close only"
+        )
+        return dataclasses.replace(config, reference=first), None
+
+    def _note_what_is_missing(self) -> None:
+        source = self.source
+        self.notes += source.faults
+        if source.frames_without_image:
+            self.notes.append(
+                f"{self.name} holds images of {len(source) - source.stand_ins} frames; "
+                f"{source.frames_without_image} more were recorded without: the result comes close only"
+            )
+        if source.stand_ins:
+            self.notes.append(
+                f"{source.stand_ins} refused frames have no image in the recording; they are refused again as "
+                "their records say"
+            )
+
+
+def as_recorded_before_bounds(record: FrameRecord) -> FrameRecord:
+    """The record as a version wrote it that stated no bounds, and a reason only where nothing was measured."""
+    return msgspec.structs.replace(record, protection=None, reason=None if record.measured else record.reason)
+
+
+def _limits(config: Config | None) -> Limits | None:
+    """Those that a configuration sets; what a monitor learns of a stream is not among them."""
+    if config is None:
+        return None
+    policy, nothing = config.settings.monitor.policy, (0.0,) * 6
+    of_policy = policy.warn_m, policy.warn_rad, policy.limit_m, policy.limit_rad
+    alert_limits = policy.alert_limit_m, policy.alert_limit_rad
+    return Limits(*of_policy, nothing, None, None, None, nothing, nothing, *alert_limits)

@@ -1,0 +1,228 @@
+"""Files of teaching from corners: the taught model, a configuration, the corners; whole, or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import yaml
+
+from gripmon import __version__
+from gripmon.calibrate.detection.pictures import sharpest_blur_px, to_grey
+from gripmon.calibrate.detection.target import BLURRED_PX
+from gripmon.daemon.config import ConfigError, load_config
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.teaching.inputs import Inputs
+from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
+from gripmon.model.atomic import write_atomically
+from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges import TeachingImage, TeachingRefused
+from gripmon.teach.edges.bench import Found
+from gripmon.teach.edges.files import taught_model, to_yaml
+from gripmon.teach.page import Picture, Saved, SaveOrder, SavingRefused
+from gripmon.teach.page.desk import Labels
+from gripmon.track.edges import TaughtModel
+
+TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
+
+
+class FileSaving:
+    """Writes beside each other in one folder; what can't be used later is found before anything is written."""
+
+    def __init__(self, inputs: Inputs):
+        self._inputs = inputs
+
+    @property
+    def _paths(self) -> dict[str, Path]:
+        """Where each file goes."""
+        inputs, config = self._inputs, self._inputs.config
+        named = None if config is None else config.taught_path
+        return {
+            "taught": inputs.folder / TAUGHT if named is None else named,
+            "config": inputs.folder / CONFIG if config is None else config.path,
+            "corners": inputs.folder / CORNERS,
+        }
+
+    def labels(self) -> Labels:
+        """What the page shows."""
+        inputs, known = self._inputs, self._inputs.bench.reference
+        return Labels(
+            robot=inputs.robot,
+            camera_name=inputs.camera_name,
+            fixed_names=inputs.config is not None,
+            folder=str(inputs.folder.resolve()),
+            files={kind: str(path) for kind, path in self._paths.items()},
+            reference=None if known is None else known.reference_id,
+            live=inputs.live,
+        )
+
+    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+        """As :class:`gripmon.teach.page.Saving`."""
+        paths = self._paths
+        notes: list[str] = []
+        wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]
+        if not wanted:
+            raise SavingRefused("nothing is to be saved; at least one of the files")
+        if "config" in wanted and self._names_it_already(order):
+            wanted.remove("config")
+        exists = tuple(str(paths[kind]) for kind in wanted if paths[kind].exists())
+        if exists and not order.replace:
+            return Saved(exists=exists)
+        self._check_sharp(pictures)
+        texts: dict[str, str] = {}
+        if "corners" in wanted:
+            texts["corners"] = self._corners(order, found, pictures[number].name)
+        pictures, files = self._pictures(pictures)
+        reference = found.reference
+        if reference is None and {"taught", "config"} & set(wanted):
+            raise SavingRefused(f"{found.no_reference}; or save the corners only")
+        model = None
+        if order.taught and reference is not None:
+            model, notes = self._taught(order, found, reference, pictures, files)
+            texts["taught"] = to_yaml(model)
+        if "config" in wanted and reference is not None:
+            texts["config"] = self._config(order, found, reference, model is not None)
+        self._try_out(order, found, texts)
+        written = self._write(texts, files if order.taught else {})
+        config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
+        follows = None if config_path is None or not config_path.exists() else f"gripmon check {config_path}"
+        return Saved(written=written, notes=tuple(notes), next=follows)
+
+    def _names_it_already(self, order: SaveOrder) -> bool:
+        """A configuration that was given is only changed to name the taught model, if it doesn't."""
+        config = self._inputs.config
+        return config is not None and (config.taught_path is not None or not order.taught)
+
+    def _pictures(self, pictures: Sequence[Picture]) -> tuple[list[Picture], dict[str, bytes]]:
+        """Live images become files, so that their taught model can be made again."""
+        out, files = [], {}
+        for picture in pictures:
+            if picture.path is None:
+                ending = ".tif" if picture.image.dtype.kind == "f" else ".png"
+                path = str(self._inputs.folder / IMAGES / Path(picture.name).with_suffix(ending))
+                picture = replace(picture, path=path)
+                files[path] = cv2.imencode(ending, picture.image)[1].tobytes()
+            out.append(picture)
+        return out, files
+
+    @staticmethod
+    def _check_sharp(pictures: Sequence[Picture]) -> None:
+        for picture in pictures:
+            blur_px = sharpest_blur_px(to_grey(picture.image))
+            if blur_px > BLURRED_PX:
+                raise SavingRefused(
+                    f"{picture.name}: blurred: its sharpest edges have a standard deviation of {blur_px:.1f} px, at "
+                    f"most {BLURRED_PX:g} px; an image in focus, without motion"
+                )
+
+    def _taught(
+        self,
+        order: SaveOrder,
+        found: Found,
+        reference: ReferenceRecord,
+        pictures: Sequence[Picture],
+        files: Mapping[str, bytes],
+    ) -> tuple[TaughtModel, list[str]]:
+
+        bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
+        given = order.put.jaw_opening_m is not None
+        pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
+        nominal_m = bench.gripper.jaw_nominal_m
+        images = [
+            TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, p.name) for p in pictures
+        ]
+        try:
+            taught, _ = bench.taught(reference, images)
+        except TeachingRefused as refused:
+            raise SavingRefused(f"no taught model: {refused}; or save without it") from None
+        left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
+        model = taught_model(
+            taught, bench.camera, bench.gripper, bench.settings, reference, pictures, self._inputs.command, files
+        )
+        return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
+
+    def _corners(self, order: SaveOrder, found: Found, image: str) -> str:
+        """Corners as ``--corners`` reads them."""
+        lines = [
+            f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
+            "# For gripmon calibrate plane --corners, gripmon teach --corners; name: [column, row] in the image (px)",
+            "corners:",
+        ]
+        for corner in found.snapped.corners:
+            by_hand = order.put.corners.get(corner.name)
+            if by_hand is not None and (corner.name in order.put.by_hand or corner.uv_px is None):
+                lines.append(f"  {corner.name}: {yaml_value([round(v, 4) for v in by_hand])}  # by hand")
+            elif corner.uv_px is not None:
+                at = [round(v, 4) for v in corner.uv_px.tolist()]
+                lines.append(f"  {corner.name}: {yaml_value(at)}  # measured, +- {corner.sigma_px:.3f} px")
+        if len(lines) == 3:
+            lines[-1] = "corners: {}"
+        return "\n".join(lines) + "\n"
+
+    def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
+
+        given = self._inputs.config
+        if given is not None:
+            return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
+        return config_text(
+            self._inputs,
+            robot=order.robot,
+            camera_name=order.camera_name,
+            reference=reference,
+            measured_here=found.pose,
+            taught=TAUGHT if taught else None,
+            gripper=self._relative(self._inputs.gripper_path),
+            jaw_opening_m=found.snapped.jaw_opening_m,
+            jaw_known=order.put.jaw_opening_m is not None,
+            folder=self._relative,
+        )
+
+    def _relative(self, path: Path, to: Path | None = None) -> str:
+        """As a configuration in ``to``, or the folder written to, names it."""
+        return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
+
+    def _try_out(self, order: SaveOrder, found: Found, texts: Mapping[str, str]) -> None:
+        """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
+        if "config" not in texts:
+            return
+
+        base = self._inputs.folder if self._inputs.config is None else self._inputs.config.directory
+        with tempfile.TemporaryDirectory(prefix="gripmon-teach-") as name:
+            trial = Path(name) / CONFIG
+            trial.write_text(texts["config"], encoding="utf-8")
+            try:
+                values = read_yaml(trial)
+                values["gripper"] = str((base / values["gripper"]).resolve())
+                if "taught" in texts:
+                    (Path(name) / TAUGHT).write_text(texts["taught"], encoding="utf-8")
+                    values["taught"] = TAUGHT
+                for key in ("camera", "reference"):
+                    if isinstance(values.get(key), str):
+                        shutil.copy(base / values[key], Path(name) / f"{key}.yaml")
+                        values[key] = f"{key}.yaml"
+                trial.write_text(as_yaml(values), encoding="utf-8")
+                load_config(trial, check_source=False, with_taught="taught" in texts)
+            except (ConfigError, yaml.YAMLError, OSError) as error:
+                told = str(error).replace(f"{name}{os.sep}", "")
+                raise SavingRefused(f"the configuration would not be sound: {told}") from None
+
+    def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
+        """Each whole or not at all; the configuration last, since it names the others."""
+        words = {"corners": "the corners", "taught": "the taught model", "config": "the configuration"}
+        written: dict[str, str] = {}
+        todo = [(Path(path), data, "an image") for path, data in files.items()]
+        todo += [(self._paths[k], texts[k].encode(), words[k]) for k in ("corners", "taught", "config") if k in texts]
+        for path, data, what in todo:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(path, data)
+            except OSError as error:
+                done = f"; written before: {', '.join(written)}" if written else ""
+                raise SavingRefused(f"{path}: can't be written ({error.strerror or error}){done}") from None
+            written[str(path)] = what
+        return written

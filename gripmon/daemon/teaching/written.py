@@ -1,0 +1,225 @@
+"""The configuration that teaching writes: complete, with a comment at every key, from the settings' own descriptions.
+
+Written line by line: a YAML library that keeps comments (ruamel.yaml) would be one more dependency, and the lines that
+stand behind a #, as what holds anyway, it can't write.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from gripmon import __version__
+from gripmon.daemon.config import Config, Settings, load_config
+from gripmon.daemon.teaching.inputs import Inputs
+from gripmon.io.sources import FolderSettings, SourceError
+from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
+from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges.corner_pose import CornerPose
+
+_UNITS = """\
+# Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
+_JAW_SOURCES = "the opening below; zenoh: the robot puts it on gripmon/<robot>/<camera_name>/jaw; or ros2_joint_state"
+_AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", "state")
+
+
+def config_text(
+    inputs: Inputs,
+    *,
+    robot: str,
+    camera_name: str,
+    reference: ReferenceRecord,
+    measured_here: CornerPose | None,
+    taught: str | None,
+    gripper: str,
+    jaw_opening_m: float | None,
+    jaw_known: bool,
+    folder: Callable[[Path], str],
+) -> str:
+    """A whole file; ``folder`` names a path as the file does."""
+    source = inputs.source
+    assert source is not None
+    parts = [
+        f"# Written by: {inputs.command} (gripmon {__version__})",
+        _UNITS,
+        f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
+        f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
+        "",
+        *_camera(inputs, folder),
+        "",
+        f"gripper: {yaml_value(gripper)}  # path of the gripper file, relative to this file",
+    ]
+    if taught is not None:
+        parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
+    if "reference" in inputs.calibrations:
+        there = yaml_value(folder(inputs.calibrations["reference"]))
+        parts += ["", f"reference: {there}  # file of gripmon calibrate plane, relative to this file; or a section"]
+    else:
+        parts += ["", _reference(reference, measured_here)]
+    parts += ["", "source:"]
+    if isinstance(source, FolderSettings):
+        parts += [
+            "  kind: folder  # images in a folder",
+            f"  path: {yaml_value(folder(Path(source.path)))}  # relative",
+        ]
+        parts[-1] += " to this file"
+    else:
+        parts.append(lines_of(source, 2))
+    if inputs.bench.gripper.has_jaw:
+        parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
+    parts += ["", _defaults()]
+    return "\n".join(parts) + "\n"
+
+
+def _camera(inputs: Inputs, folder: Callable[[Path], str]) -> list[str]:
+    if "camera" in inputs.calibrations:
+        there = yaml_value(folder(inputs.calibrations["camera"]))
+        return [f"camera: {there}  # file of gripmon calibrate intrinsics, relative to this file; or a section"]
+    return ["camera:", lines_of(inputs.bench.camera.settings, 2)]
+
+
+def with_taught(path: Path, taught: str) -> str:
+    """A configuration's own text with a line more, which names the taught model."""
+    text = path.read_text(encoding="utf-8-sig")
+    return (
+        f"{text.rstrip()}\n\ntaught: {yaml_value(taught)}  # what the edges really look like; relative to this file\n"
+    )
+
+
+def name_taught(config: Config, taught: Path) -> Config:
+    """Write the line that names a taught model into a configuration, unless one is there; the configuration with it.
+
+    Raises :class:`~gripmon.model.errors.InputError` where it can't be written.
+    """
+    if config.taught_path is None:
+        name = Path(os.path.relpath(taught.resolve(), config.directory.resolve())).as_posix()
+        try:
+            write_atomically(config.path, with_taught(config.path, name).encode())
+        except OSError as error:
+            raise InputError(f"{config.path}: can't be written ({error.strerror or error}); a file") from None
+    return load_config(config.path, check_source=False)
+
+
+def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
+    transform, covariance = reference.cam_T_grip, list(reference.covariance)
+    said = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
+    lines = ["reference:"]
+    if measured_here is not None:
+        seen = f"{len(measured_here.corners)} corners of" if measured_here.corners else "the edges in"
+        lines.append(f"  # measured from {seen} one image: a plate (gripmon calibrate plane) tells it more exactly")
+    lines += [
+        f"  id: {yaml_value(reference.reference_id)}  # name of this calibration in messages",
+        f"  cam_T_grip:{said}",
+        f"    translation_m: {yaml_value(list(transform.translation_m))}  # the TCP in the camera frame: x, y, z (m)",
+        f"    rotation_xyzw: {yaml_value(list(transform.rotation_xyzw))}  # unit quaternion x, y, z, w (no unit)",
+        "  covariance:  # of its error, 6x6 row by row: TCP's position (m²), then rotation (rad²), camera axes",
+        "    [",
+        *(f"      {', '.join(yaml_value(v) for v in covariance[6 * row : 6 * row + 6])}," for row in range(6)),
+        "    ]",
+    ]
+    return "\n".join(lines)
+
+
+_FROM_ELSEWHERE = {
+    "frames": "the opening comes with each image (timestamps.csv)",
+    "zenoh": "the robot puts it on gripmon/<robot>/<camera_name>/jaw",
+}
+
+
+def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
+    if inputs.jaw_source in _FROM_ELSEWHERE:
+        return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
+    openings = [picture.jaw_opening_m for picture in inputs.pictures]
+    table = [(Path(p.path).parent / TIMESTAMPS_NAME).exists() for p in inputs.pictures if p.path is not None]
+    told = inputs.jaw_source is None and table and all(table)
+    if told and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+        return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
+    lines = [
+        "jaw:",
+        f"  source: fixed  # {_JAW_SOURCES}",
+    ]
+    if opening_m is not None:
+        how = "as given" if known else "as the image showed it; better what the robot says"
+        lines.append(f"  opening_m: {yaml_value(round(opening_m, 7))}  # jaw opening, {how} (m)")
+    return "\n".join(lines)
+
+
+def _in_table(inputs: Inputs) -> bool:
+    """Whether the images' own table has their openings: one given for all of them is fixed."""
+    try:
+        for picture in inputs.pictures:
+            assert picture.path is not None
+            path = Path(picture.path)
+            row = read_table(path.parent / TIMESTAMPS_NAME).get(path.name)
+            if row is None or row.jaw_opening_m is None or row.jaw_opening_m != picture.jaw_opening_m:
+                return False
+    except SourceError:
+        return False
+    return True
+
+
+def _defaults() -> str:
+    """What holds anyway, behind # signs."""
+    lines = [
+        "# Everything below holds as it stands; to change a value, take away the # before it and before what it is in."
+    ]
+    for field in msgspec.structs.fields(Settings):
+        if field.name in _AS_THEY_ARE:
+            lines += [f"# {field.name}:", lines_of(field.default, 2, off=True)]
+    return "\n".join(lines)
+
+
+def lines_of(settings: msgspec.Struct, indent: int = 0, *, off: bool = False) -> str:
+    """The lines of a section, each with its description; ``off``: behind a #, as what holds anyway.
+
+    Keys without value are left out.
+    """
+    lines = []
+    tag = type(settings).__struct_config__
+    if tag.tag_field is not None and not off:
+        lines.append(_line(indent, tag.tag_field, yaml_value(tag.tag), "", off))
+    section = msgspec.inspect.type_info(type(settings))
+    assert isinstance(section, msgspec.inspect.StructType)
+    for field in section.fields:
+        value = getattr(settings, field.name)
+        if value is None:
+            continue
+        if isinstance(value, msgspec.Struct):
+            lines.append(_line(indent, field.encode_name, "", "", off))
+            lines.append(lines_of(value, indent + 2, off=off))
+            continue
+        description = _described(field.type)
+        lines.append(_line(indent, field.encode_name, yaml_value(value), description, off))
+    return "\n".join(lines)
+
+
+def yaml_value(value: Any) -> str:
+    """A value on one line, as both YAML and JSON read it back."""
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    return f"[{', '.join(yaml_value(item) for item in value)}]"
+
+
+def _line(indent: int, key: str, value: str, description: str, off: bool) -> str:
+    text = f"{'# ' * off}{' ' * indent}{key}:{f' {value}' if value else ''}"
+    return f"{text}  # {description}" if description else text
+
+
+def _described(node: Any) -> str:
+    if isinstance(node, msgspec.inspect.Metadata):
+        own = (node.extra_json_schema or {}).get("description", "")
+        return own or _described(node.type)
+    if isinstance(node, msgspec.inspect.UnionType):
+        return next((text for each in node.types if (text := _described(each))), "")
+    return ""

@@ -1,0 +1,230 @@
+"""What kind of motion it is: a step or a creep from the drift's history over minutes, and a vibration, where the
+differences between frames grow in one direction while their mean stays.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+
+import numpy as np
+
+from gripmon.model.records import Array, Creep, Vibration
+
+BLOCK_S = 0.5
+"""Frames are averaged over so many seconds."""
+
+KEPT_BLOCKS = 256
+
+FEWEST_BLOCKS = 6
+"""Blocks below which a creep isn't told from a step."""
+
+LASTING_BLOCKS = 3
+"""Blocks that must have come after a step."""
+
+BETTER = 0.6
+"""A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
+
+SIGNIFICANT = 4.0
+"""Standard deviations by which a rate must differ from zero."""
+
+
+class History:
+    """Means over :data:`BLOCK_S` of the shift against the reference."""
+
+    def __init__(self) -> None:
+        self._times_s: deque[float] = deque(maxlen=KEPT_BLOCKS)
+        self._means: deque[Array] = deque(maxlen=KEPT_BLOCKS)
+        self._sum: Array = np.zeros(6)
+        self._count = 0
+        self._begun_s: float | None = None
+
+    def add(self, shift: Array, now_s: float) -> bool:
+        """One frame's shift (6,); True when a block is complete."""
+        if self._begun_s is None:
+            self._begun_s = now_s
+        complete = now_s - self._begun_s >= BLOCK_S and self._count > 0
+        if complete:
+            self._times_s.append(0.5 * (self._begun_s + now_s))
+            self._means.append(self._sum / self._count)
+            self._sum, self._count, self._begun_s = np.zeros(6), 0, now_s
+        self._sum = self._sum + shift
+        self._count += 1
+        return complete
+
+    def clear(self) -> None:
+        """The reference has changed."""
+        self._times_s.clear()
+        self._means.clear()
+        self._sum, self._count, self._begun_s = np.zeros(6), 0, None
+
+    def creep(self, towards: Array) -> Creep | None:
+        """The creep that the blocks show, None if a step explains them as well or if it doesn't go on.
+
+        ``towards`` (6,): its product with a shift is a number of standard deviations along the drift.
+        """
+        count = len(self._means)
+        if count < FEWEST_BLOCKS:
+            return None
+        times_s, means = np.array(self._times_s), np.array(self._means)
+        along = means @ towards
+        step, _ = _best(along, _steps(count))
+        ramp, onset = _best(along, _ramps(times_s))
+        if ramp > BETTER * step:
+            return None
+        moving = slice(max(onset, count - 4 * FEWEST_BLOCKS), None)
+        velocity = _slopes(times_s[moving], means[moving], along[moving], towards)
+        return None if velocity is None else Creep(velocity, float(times_s[onset]))
+
+    def is_step(self, towards: Array) -> bool:
+        """Whether the blocks show a step along ``towards`` (6,), and no creep explains them nearly as well."""
+        count = len(self._means)
+        if count < FEWEST_BLOCKS:
+            return False
+        along = np.array(self._means) @ towards
+        step, before = _best(along, _steps(count))
+        # Of a creep that has just begun the first block is a step, too.
+        lasts = count - 1 - before >= LASTING_BLOCKS
+        return lasts and step <= BETTER * _best(along, _ramps(np.array(self._times_s)))[0]
+
+
+def goes_on(values: Array) -> bool:
+    """Whether the newest of a series (n,) are still on their way rather than at a new place."""
+    count = len(values)
+    if count < FEWEST_BLOCKS:
+        return False
+    step, _ = _best(values, _steps(count))
+    ramp, _ = _best(values, _ramps(np.arange(float(count))))
+    return ramp < step
+
+
+def _steps(count: int) -> Array:
+    """(count - 1, count) a step before each block but the first."""
+    return np.triu(np.ones((count, count)))[1:]
+
+
+def _ramps(times_s: Array) -> Array:
+    """(count - 2, count) nothing until a block, from there on a straight line."""
+    return np.maximum(times_s[None, :] - times_s[:-2, None], 0.0)
+
+
+def _best(values: Array, shapes: Array) -> tuple[float, int]:
+    """Smallest sum of squares (n shapes) that a constant and one multiple of a shape leave, and the shape's index."""
+    centred = shapes - shapes.mean(axis=1, keepdims=True)
+    values = values - values.mean()
+    explained = (centred @ values) ** 2 / np.maximum((centred**2).sum(axis=1), 1e-300)
+    index = int(explained.argmax())
+    return float(max(values @ values - explained[index], 1e-12 * (values @ values))), index
+
+
+def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array | None:
+    """Velocity (6,) by least squares; None if it isn't significant along ``towards``."""
+    if len(times_s) < FEWEST_BLOCKS:
+        return None
+    t = times_s - times_s.mean()
+    spread = float(t @ t)
+    slope = float(t @ along) / spread
+    residual = along - along.mean() - slope * t
+    sigma = math.sqrt(float(residual @ residual) / (len(t) - 2) / spread)
+    return (t @ means) / spread if abs(slope) > SIGNIFICANT * sigma else None
+
+
+KEPT_FRAMES = 128
+"""Frames that are looked at: two seconds at 60 frames/s."""
+
+LOOK_FRAMES = 32
+"""Looked at once in so many frames."""
+
+PARTS = 4
+
+TIMES = 6.0
+"""Factor by which the variance in a direction must exceed what frames claim and what the stream has shown before."""
+
+
+STILL_THERE = 0.5
+"""Part of what it takes to find a vibration from which one that was found goes on."""
+
+
+class VibrationWatch:
+    """Looks at the last :data:`KEPT_FRAMES` shifts of the TCP."""
+
+    def __init__(self, smallest_m: float):
+        """``smallest_m``: root mean square from which a vibration is worth telling."""
+        self._smallest_m = smallest_m
+        self._shifts: deque[Array] = deque(maxlen=KEPT_FRAMES)
+        self._times_s: deque[float] = deque(maxlen=KEPT_FRAMES)
+        self._since_look = 0
+        self._found: Vibration | None = None
+        self._before: Array = np.eye(3)
+        self._learnt = True
+
+    @property
+    def is_news(self) -> bool:
+        """Whether it vibrates by more than the stream's noise, as learnt by now, explains."""
+        return self._found is not None and not self._learnt
+
+    def forget(self) -> None:
+        """The camera has moved: the step is no vibration."""
+        self._shifts.clear()
+        self._times_s.clear()
+        self._found = None
+
+    def add(self, shift: Array, now_s: float, usual: Array) -> Vibration | None:
+        """One frame's shift (6,); ``usual`` (6, 6): covariance of an unmoved camera's shifts about their mean.
+
+        What is going on; None for no vibration.  One that goes on is learnt as noise sooner or later, and goes on.
+        """
+        self._shifts.append(shift)
+        self._times_s.append(now_s)
+        self._since_look += 1
+        if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
+            self._since_look = 0
+            if self._found is None:
+                self._before = usual[:3, :3].copy()
+            self._found = self._look(self._before, usual[:3, :3], 1.0 if self._found is None else STILL_THERE)
+        return self._found
+
+    def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
+        shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
+        # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
+        parts = [_about_its_line(part) for part in np.split(shifts, PARTS)]
+        direction = _loudest(np.mean([part.T @ part / len(part) for part in parts], axis=0), usual)
+        loud = sorted(float(np.square(part @ direction).mean()) for part in parts)
+        expected = float(direction @ usual @ direction)
+        if loud[1] < ease * TIMES * expected:
+            return None
+        self._learnt = loud[1] < TIMES * float(direction @ learnt @ direction)
+        # A part may hold less than a period: the size is that about a line through all of them.
+        along = _about_its_line(shifts) @ direction
+        excess = float(np.median([np.square(part).mean() for part in np.split(along, PARTS)])) - expected
+        if excess < ease * self._smallest_m**2:
+            return None
+        return Vibration(math.sqrt(excess), _frequency_hz(along, times_s))
+
+
+def _about_its_line(values: Array) -> Array:
+    """(n, 3) what is left of values (n, 3) that grow evenly: a creep is no vibration."""
+    index = np.arange(len(values)) - 0.5 * (len(values) - 1)
+    line = np.column_stack([np.ones(len(values)), index])
+    return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
+
+
+def _loudest(covariance: Array, usual: Array) -> Array:
+    """The direction (3,) of length one in which a covariance exceeds the usual one the most."""
+    root = np.linalg.cholesky(usual)
+    inverse = np.linalg.inv(root)
+    _, directions = np.linalg.eigh(inverse @ covariance @ inverse.T)
+    direction = inverse.T @ directions[:, -1]
+    return np.asarray(direction / np.linalg.norm(direction))
+
+
+def _frequency_hz(values: Array, times_s: Array) -> float:
+    """Of the largest line in the spectrum, between lines by a parabola through its neighbours."""
+    interval_s = (times_s[-1] - times_s[0]) / (len(times_s) - 1)
+    if interval_s <= 0.0:
+        return 0.0
+    power = np.abs(np.fft.rfft((values - values.mean()) * np.hanning(len(values))))
+    top = int(power[1:-1].argmax()) + 1
+    below, at, above = power[top - 1 : top + 2]
+    bend = below - 2.0 * at + above
+    return float((top + (0.5 * (below - above) / bend if bend else 0.0)) / (len(values) * interval_s))

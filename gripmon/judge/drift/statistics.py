@@ -1,0 +1,228 @@
+"""Statistics of the stream for the drift test: means over windows, their covariance, their extremes.
+
+*Windows*: means over the last n frames for many n at once, at a cost that doesn't depend on n.
+
+*Scatter*: the covariance of the means of windows while nothing moves, learnt from the stream.  Frames err together:
+the background stands still for a while, lamps flicker, a mount hums.  No formula therefore gives the error of the mean
+of n frames.  It is measured, for every length n separately: the difference of two neighbouring windows of n frames has
+a covariance A(n) (twice the Allan variance), which a slow drift hardly touches.  By Haar's decomposition the mean of n
+frames is that of 2 n frames plus or minus half the difference of its two halves; the two are uncorrelated for
+stationary noise, so that the mean's covariance is the sum of A(n), A(2 n), A(4 n) ... over four.  Error that frames
+claim, but that the stream has not shown, counts as a bias of this background: it changes with it, at any moment.
+
+*Extremes*: the threshold of a stream, learnt by extreme value theory from the largest statistic of every block of
+frames.  Of the upper quarter of blocks the excess over the least of them is modelled as exponential in the statistic's
+square root, a number of standard deviations: between normal errors, whose tails are lighter, and Student's, whose are
+heavier.  The level that a block exceeds with a given chance follows by extrapolation, and is the predictive one, which
+holds for the next block although the tail's scale is known from few blocks: the fewer, the farther out it lies.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from gripmon.model.records import Array
+
+LENGTHS = tuple(2**k for k in range(13))
+"""Frames that a window holds: 1, 2, 4 ... 4096, which is a minute at 60 frames/s."""
+
+
+class Windows:
+    """Running means of ``streams`` series of 6-vectors, from a ring of their sums.
+
+    One stream is the daemon; benchmarks run hundreds beside one another.
+    """
+
+    def __init__(self, streams: int):
+        self._ring = np.zeros((2 * LENGTHS[-1] + 1, streams, 6))
+        self._lengths = np.array(LENGTHS)
+        self._shape = (-1, 1, 1)
+        self._frames = np.zeros(streams, dtype=np.intp)
+        self._newest = 0
+
+    @property
+    def frames(self) -> np.ndarray:
+        """(s,) frames in the windows of each stream."""
+        return self._frames
+
+    def add(self, values: Array) -> None:
+        """One frame's values (s, 6)."""
+        following = (self._newest + 1) % len(self._ring)
+        np.add(self._ring[self._newest], values, out=self._ring[following])
+        self._newest = following
+        self._frames += 1
+
+    def means(self) -> tuple[Array, Array]:
+        """Means (k, s, 6) of the last n frames, and of the n before those, for every n of :data:`LENGTHS`.
+
+        What reaches back beyond the first frame is meaningless; see :meth:`full`.
+        """
+        ago = self._ring[(self._newest - self._lengths) % len(self._ring)]
+        twice_ago = self._ring[(self._newest - 2 * self._lengths) % len(self._ring)]
+        count = self._lengths.reshape(self._shape)
+        return (self._ring[self._newest] - ago) / count, (ago - twice_ago) / count
+
+    def full(self) -> tuple[np.ndarray, np.ndarray]:
+        """(k, s) whether the last n frames, and the last 2 n, lie within the stream."""
+        count = self._lengths[:, None]
+        return self._frames >= count, self._frames >= 2 * count
+
+    def mean_of_last(self, frames: int) -> Array:
+        """(s, 6) mean over the last ``frames`` frames, 1 to 4096."""
+        return (self._ring[self._newest] - self._ring[(self._newest - frames) % len(self._ring)]) / frames
+
+    def keep(self, streams: np.ndarray, frames: np.ndarray | int) -> None:
+        """Forget all but the last ``frames`` frames of some streams (s,) bool."""
+        self._frames = np.where(streams, np.minimum(self._frames, frames), self._frames)
+
+
+PRIOR_WINDOWS, PRIOR_SHARE = 12.0, 0.3
+"""Pairs of windows that a small part of the reported covariance counts for at every length, before the stream has shown
+its own: until then nearly all of what is claimed is a bias that may change.
+"""
+
+LONGER, LONG = (4, 1), 64
+"""Lengths, each twice the one before, from a window's own on: noise that is seen in these is always there.  What shows
+only in yet longer ones comes in rare steps, of which the next may come at any moment.  Windows of so many frames and
+more are themselves as rare as that.
+"""
+
+MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
+"""What is learnt is forgotten over so many frames, or windows, whichever is longer."""
+
+LARGEST = 4.0
+"""Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
+
+_COUNT = np.array(LENGTHS, dtype=float)[:, None]
+_RARE = [min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)]
+
+
+class Scatter:
+    """Covariances of window means (k lengths, s streams, 6, 6)."""
+
+    def __init__(self, streams: int):
+        lengths = len(LENGTHS)
+        self._of_difference = np.zeros((lengths, streams, 6, 6))
+        self._windows = np.full((lengths, streams), PRIOR_WINDOWS)
+
+    @property
+    def windows(self) -> Array:
+        """(k, s) pairs of independent windows that the covariances rest on."""
+        return self._windows
+
+    def begin(self, covariance: Array) -> None:
+        """What to expect by the reported covariances (s, 6, 6), before the first frame has shown anything."""
+        self._of_difference[:] = PRIOR_SHARE * covariance
+
+    def learn(self, difference: Array, normalised: Array, usable: np.ndarray, frames: int) -> None:
+        """Differences (k, s, 6) of neighbouring windows after ``frames`` more of them, their squares ``normalised``
+        (k, s) to a mean of 6, and which of them to learn from.
+        """
+        share = np.minimum(0.5 * frames / _COUNT, 1.0)  # of an independent pair of windows
+        most = np.maximum(0.5 * MEMORY_FRAMES / _COUNT, MEMORY_WINDOWS)
+        self._windows = np.where(usable, np.minimum(self._windows + share, most), self._windows)
+        tame = np.minimum(1.0, 6.0 * LARGEST / np.maximum(normalised, 1e-12))
+        gain = np.where(usable, share / self._windows, 0.0)
+        outer = (tame[..., None] * difference)[..., :, None] * difference[..., None, :]
+        self._of_difference += gain[..., None, None] * (outer - self._of_difference)
+
+    @property
+    def of_differences(self) -> Array:
+        """(k, s, 6, 6) of the differences between neighbouring windows, as learnt."""
+        return self._of_difference
+
+    def covariances(self, reported: Array, inflation: Array) -> tuple[Array, Array]:
+        """(..., k, s, 6, 6) each: of the means of windows, and of the differences between neighbouring ones.
+
+        ``reported`` (s, 6, 6) is what a frame claims for itself; ``inflation`` (..., k, s) by how much more the
+        variance of what the stream has shown counts.
+        """
+        parts = 0.25 * self._of_difference
+        parts[-1] *= 2.0  # beyond the longest, windows count as independent
+        inflated = inflation[..., None, None]
+        total = np.flip(np.cumsum(np.flip(inflated * parts, axis=-4), axis=-4), axis=-4)
+        # What was only assumed has not been seen.
+        learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
+        seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
+        rare = np.concatenate([seen, np.zeros_like(seen[:1])])[_RARE]
+        # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
+        missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
+        return total + missing[0], inflated * self._of_difference + 2.0 * missing[1:]
+
+    def of_single_frames(self) -> Array:
+        """(s, 6, 6) of frames about their mean, as the stream has shown it."""
+        return np.asarray(0.25 * self._of_difference.sum(axis=0))
+
+
+def _what_is_missing(seen: Array, claimed: Array) -> Array:
+    """The part of a claimed covariance (s, 6, 6), direction by direction, that exceeds what was seen (..., s, 6, 6)."""
+    root = np.linalg.cholesky(claimed)
+    inverse = np.linalg.inv(root)
+    share, directions = np.linalg.eigh(inverse @ seen @ np.swapaxes(inverse, -1, -2))
+    towards = root @ directions
+    return np.asarray((towards * np.maximum(1.0 - share, 0.0)[..., None, :]) @ np.swapaxes(towards, -1, -2))
+
+
+BLOCK_FRAMES, KEPT_BLOCKS = 256, 512
+"""Frames of a block, longer than bursts last (they do for half a second), and blocks that are remembered: half an hour
+at 60 frames/s, since rare changes of the background must be among them.
+"""
+
+FEWEST_BLOCKS = 32
+"""Blocks below which nothing is said: eight of them are in the tail then, and its scale is known to a third."""
+
+UPPER = 0.25
+"""Part of the blocks that is the tail."""
+
+
+class Extremes:
+    """Limits of statistics (kinds, streams), each by its own extremes.
+
+    ``frames`` (kinds, 1): over how many frames a statistic stays alike; blocks within them count as one together.
+    """
+
+    def __init__(self, frames: Array, streams: int):
+        shape = (len(frames), streams)
+        self._ring = np.full((KEPT_BLOCKS, *shape), np.nan)
+        self._largest = np.zeros(shape)
+        self._usable = np.zeros(shape, dtype=np.intp)
+        self._frames = 0
+        self._alike = np.broadcast_to(np.maximum(frames / BLOCK_FRAMES, 1.0), shape)
+        self.blocks = np.zeros(shape, dtype=np.intp)
+        """(kinds, streams) that were remembered, each of :data:`BLOCK_FRAMES` frames."""
+
+    def add(self, squares: Array, usable: np.ndarray, frames: int) -> bool:
+        """Squared statistics (kinds, streams) after ``frames`` more frames, and which of them count; True if a block is
+        complete.  A block of which less than half counts is left out.
+        """
+        np.maximum(self._largest, squares, out=self._largest, where=usable)
+        self._usable += np.where(usable, frames, 0)
+        self._frames += frames
+        if self._frames % BLOCK_FRAMES:
+            return False
+        enough = 2 * self._usable >= BLOCK_FRAMES
+        place = (self._frames // BLOCK_FRAMES - 1) % KEPT_BLOCKS
+        self._ring[place] = np.where(enough, np.sqrt(self._largest), np.nan)
+        self._largest[:] = 0.0
+        self._usable[:] = 0
+        self.blocks = np.isfinite(self._ring).sum(axis=0)
+        return True
+
+    def limits(self, chance: float) -> Array:
+        """(kinds, streams) squares that a block exceeds with this chance; infinite where too little is known."""
+        shown = self._ring[: min(self._frames // BLOCK_FRAMES, KEPT_BLOCKS)]
+        enough = self.blocks >= FEWEST_BLOCKS * self._alike
+        if not enough.any():
+            return np.full(enough.shape, np.inf)
+        tail = (UPPER * self.blocks).astype(np.intp)
+        # Those that are missing come first.
+        ordered = np.sort(np.where(np.isnan(shown), -1.0, shown), axis=0)
+        rank = len(shown) - np.arange(len(shown))[:, None, None]
+        start = np.take_along_axis(ordered, (len(shown) - tail - 1).clip(0)[None], axis=0)[0]
+        scale = np.where(rank <= tail, ordered, 0.0).sum(axis=0) / np.maximum(tail, 1) - start
+        # An exponential law whose scale is the mean of n values: (1 + x / (n scale))^-n is the chance of the next.
+        known = np.maximum(tail / self._alike, 1.0)
+        reach = known * np.expm1(math.log(UPPER / chance) / known)
+        return np.where(enough, np.square(start + scale * reach), np.inf)

@@ -1,0 +1,190 @@
+"""Laser-pointer calibration and its check, for programs and notebooks; the command line calls the same functions.
+
+What is wrong with the input is an :class:`~gripmon.model.errors.InputError`, samples from which nothing can be
+calibrated a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gripmon.calibrate.documents import CameraCalibration
+from gripmon.calibrate.intrinsics import lens_vector, model_of
+from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.sighting import CalibrationError, NotFound
+from gripmon.laser.pointer.calibrating import LaserResult, Spots, calibrate, groups_of
+from gripmon.laser.pointer.document import LaserCalibration, document
+from gripmon.laser.pointer.picture import draw
+from gripmon.laser.pointer.planar_start import SEED
+from gripmon.laser.pointer.planning import Arm, Plan, plan
+from gripmon.laser.pointer.samples import Samples, read_samples, spots_of
+from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise
+from gripmon.laser.pointer.spots import Spot
+from gripmon.laser.watch import SpotJudgement, SpotSeen, SpotWatch, SpotWatchSettings
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import invert
+from gripmon.model.progress import Progress, quiet
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Alert, Array, Image
+
+__all__ = [
+    "SEED",
+    "CalibratedLaser",
+    "LaserCheck",
+    "PoseNoise",
+    "Samples",
+    "SpotWatchSettings",
+    "calibrate_laser",
+    "check_laser",
+    "read_samples",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class CalibratedLaser:
+    """``fit`` of the ``samples`` that have a spot; ``files``: images that were looked at; ``unseen``: samples without a
+    spot, and why; ``notes``: what else is to be said.
+    """
+
+    fit: LaserResult
+    samples: Samples
+    files: tuple[Path, ...]
+    unseen: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def base_T_cam(self) -> Array:
+        """(4, 4)."""
+        return invert(self.fit.refined.setup.cam_T_base)
+
+    def plan(self, reach_m: float, poses: int = 10) -> Plan:
+        """The poses that would help the most next, for an arm that reaches as far."""
+        return plan(self.fit.refined, Arm(reach_m), poses)
+
+    def document(self, provenance: Provenance) -> LaserCalibration:
+        """What a file holds of it."""
+        names = self.samples.names
+        other = [name for name, k in zip(names, self.fit.candidate, strict=True) if k > 0]
+        notes = [*self.unseen, *self.notes]
+        if other:
+            notes.append(f"not the brightest place but another one is the spot in: {', '.join(other)}")
+        orientations = len(groups_of(self.samples.groups, self.samples.base_T_ee))
+        return document(self.fit.refined, names, orientations, (*notes, *self.fit.warnings), provenance)
+
+    def picture(self) -> Image:
+        """Spots with their residuals, and the scene from the side; BGR."""
+        return draw(self.fit, self.samples.base_T_ee)
+
+
+def calibrate_laser(
+    samples: Samples | Sequence[Path],
+    camera: CameraCalibration | LensSettings,
+    *,
+    refine_lens: bool = False,
+    arm_noise: PoseNoise | None = None,
+    progress: Progress = quiet,
+) -> CalibratedLaser:
+    """A fixed camera, a plane that it sees and a laser pointer on an arm, from spots on the plane and the arm's poses
+    (``samples``, or tables with them).
+
+    ``refine_lens``: the lens is estimated, too, within its calibration's covariance; else it stays as it is, and what
+    its covariance leaves open comes into the result's.  ``arm_noise``: errors of the poses that the arm reports.
+    """
+    samples = samples if isinstance(samples, Samples) else read_samples(samples)
+    calibrated = camera.camera if isinstance(camera, CameraCalibration) else camera
+    try:
+        made = make_camera(calibrated)
+    except ValueError as error:
+        raise InputError(f"camera: {error}") from None
+    prior = _prior(camera) if isinstance(camera, CameraCalibration) else None
+    if prior is None and refine_lens:
+        raise InputError(
+            "--refine-lens: the camera has no covariance of parameters that can be refined; a file of gripmon "
+            "calibrate intrinsics"
+        )
+    found = spots_of(samples, (calibrated.width_px, calibrated.height_px), progress)
+    named = zip(samples.names, found, strict=True)
+    unseen = [f"{name}: {spots.reason}" for name, spots in named if isinstance(spots, NotFound)]
+    kept = [k for k, spots in enumerate(found) if not isinstance(spots, NotFound)]
+    if not kept:
+        raise CalibrationError(f"none of {len(samples)} images shows a spot", unseen)
+    seen = samples.picked(kept)
+    fit = calibrate(
+        made,
+        seen.base_T_ee,
+        _spots([spots for spots in found if not isinstance(spots, NotFound)], looked=bool(samples.files)),
+        seen.groups,
+        lens=prior,
+        refine_lens=refine_lens,
+        pose_noise=arm_noise,
+    )
+    notes = () if prior is not None else ("nothing is known of the camera's errors: it counts as exact",)
+    return CalibratedLaser(fit, seen, tuple(samples.files), tuple(unseen), notes)
+
+
+def _spots(found: Sequence[Sequence[Spot]], *, looked: bool) -> Spots:
+    """``looked``: some were found in images, which tell how exact they are; others count as exact to a pixel then."""
+    uv_px = np.array([spots[0].uv_px for spots in found])
+    if not looked:
+        return Spots(uv_px)
+    covariances = [spots[0].covariance_px if spots[0].area_px else np.eye(2) for spots in found]
+    others = tuple(np.array([spot.uv_px for spot in spots[1:]]).reshape(-1, 2) for spots in found)
+    return Spots(uv_px, np.array(covariances), others)
+
+
+def _prior(calibration: CameraCalibration) -> LensPrior | None:
+    """What a camera's calibration knows of its lens; None where it says nothing of its errors."""
+    camera, count = calibration.camera, len(calibration.parameters)
+    kind = model_of(camera)
+    names, values = parameter_names(kind), lens_vector(camera)
+    if count == 0 or not set(calibration.parameters) <= set(names) or len(values) != len(names):
+        return None
+    free = tuple(names.index(key) for key in calibration.parameters)
+    model = LensModel(kind, camera.width_px, camera.height_px)
+    return LensPrior(model, values, free, np.array(calibration.covariance).reshape(count, count))
+
+
+@dataclass(frozen=True, slots=True)
+class LaserCheck:
+    """Whether a laser calibration still holds: ``verdict`` "same", "moved", or "unclear" where half of the spots or
+    fewer could be believed; ``text`` says so for a person.  ``judged``: each sample's name and judgement.
+    """
+
+    verdict: str
+    text: str
+    alert: Alert | None
+    judged: tuple[tuple[str, SpotJudgement], ...]
+
+    @property
+    def last(self) -> SpotJudgement:
+        """What is known after all spots."""
+        return self.judged[-1][1]
+
+
+def check_laser(
+    calibration: LaserCalibration,
+    samples: Samples | Sequence[Path],
+    settings: SpotWatchSettings | None = None,
+    progress: Progress = quiet,
+) -> LaserCheck:
+    """Judge fresh spots one after the other, as the second camera's watch does."""
+    samples = samples if isinstance(samples, Samples) else read_samples(samples)
+    watch = SpotWatch(calibration, settings or SpotWatchSettings())
+    found = spots_of(samples, (calibration.camera.width_px, calibration.camera.height_px), progress)
+    judged = tuple(
+        (name, watch.judge(SpotSeen(k, pose, spots)))
+        for k, (name, pose, spots) in enumerate(zip(samples.names, samples.base_T_ee, found, strict=True))
+    )
+    alert = watch.motion_alert  # of all spots: the one that was raised knew the first few only
+    believed, count = sum(one.used for _, one in judged), len(judged)
+    if alert is not None:
+        return LaserCheck("moved", alert.text, alert, judged)
+    if 2 * believed <= count:
+        text = f"only {believed} of {count} spots can be believed, too few or too different to tell a motion by"
+        return LaserCheck("unclear", text, None, judged)
+    return LaserCheck("same", f"{believed} of {count} spots are where the calibration has them", None, judged)

@@ -1,0 +1,133 @@
+"""Image files: one by one, several that belong together, and all of a folder in the order in which a person counts."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import re
+import stat
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gripmon.model.errors import InputError
+
+if TYPE_CHECKING:
+    from gripmon.model.records import Image
+
+_SUFFIXES = "bmp dib exr hdr jp2 jpe jpeg jpg pbm pgm png pnm ppm tif tiff webp"
+IMAGE_SUFFIXES = frozenset(f".{suffix}" for suffix in _SUFFIXES.split())
+LARGEST_BYTES = 1 << 30
+"""More is no image and no table: 12,000 x 12,000 px of 16-bit colour are 0.8 GiB (bytes)."""
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND"
+_PNG_END_BYTES = 8
+"""The last chunk's name and checksum."""
+
+
+def natural_key(name: str) -> tuple[list[Any], str]:
+    """Order in which a person counts: digits as numbers, the rest as text; equal numbers by the name itself."""
+    parts = re.split(r"([0-9]+)", name)
+    return [int(part) if i % 2 else part for i, part in enumerate(parts)], name
+
+
+def image_paths(names: Sequence[str | Path]) -> list[Path]:
+    """The images that are meant: files as they are named, for a folder all images in it, in natural order.
+    :class:`~gripmon.model.errors.InputError` for a folder without any.
+    """
+    paths: list[Path] = []
+    for path in map(Path, names):
+        if not path.is_dir():
+            paths.append(path)
+            continue
+        inside = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
+        if not inside:
+            raise InputError(f"{path}: no image in this folder; e.g. *.png, *.jpg")
+        paths += sorted(inside, key=lambda p: natural_key(p.name))
+    return paths
+
+
+def images_of_one_camera(images: Sequence[str | Path | Image]) -> Iterator[tuple[str, Image]]:
+    """Each with its name (of an array "image 1", ...), all of one size.  :class:`~gripmon.model.errors.InputError` for
+    one that can't be read, has another size, or is the same as another.
+    """
+    seen: dict[bytes, str] = {}
+    first_shape: tuple[str, tuple[int, ...]] | None = None
+    for number, given in enumerate(images, 1):
+        if isinstance(given, str | Path):
+            name, image = str(given), image_in(Path(given))
+        else:
+            name, image = f"image {number}", given
+        # The same image twice would make every uncertainty too small.
+        first = seen.setdefault(hashlib.sha256(image.tobytes()).digest(), name)
+        if len(seen) < number:
+            raise InputError(f"{name}: is the same image as {first}; each image once")
+        height, width = image.shape[:2]
+        first_name, size = first_shape = first_shape or (name, (width, height))
+        if (width, height) != size:
+            raise InputError(
+                f"{name}: has {width} x {height} px and {first_name} {size[0]} x {size[1]} px; images of one camera, "
+                "in one size"
+            )
+        yield name, image
+
+
+def image_in(path: Path) -> Image:
+    """The image in a file.  :class:`~gripmon.model.errors.InputError` if there is none."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; an image file")
+    image, fault = read_image(path)
+    if image is None:
+        raise InputError(f"{path}: {fault}; an image file{'' if path.exists() else ', or a folder of them'}")
+    return image
+
+
+def check_size(name: str, image: Image, width_px: int, height_px: int) -> None:
+    """:class:`~gripmon.model.errors.InputError` for an image that isn't of a camera's size."""
+    height, width = image.shape[:2]
+    if (width, height) != (width_px, height_px):
+        raise InputError(
+            f"{name}: is {width} x {height} px, the camera {width_px} x {height_px}; images of this camera, as it was "
+            "calibrated"
+        )
+
+
+def read_image(path: Path) -> tuple[Image | None, str | None]:
+    """The image, or why there is none."""
+    import cv2
+    import numpy as np
+
+    try:
+        data = regular_bytes(path)
+    except FileNotFoundError:
+        return None, "the file is missing"
+    except OSError as error:
+        return None, f"the file can't be read: {error.strerror}"
+    if not data:
+        return None, "the file is empty"
+    if data.startswith(_PNG) and not 0 <= data.rfind(_PNG_END) <= len(data) - _PNG_END_BYTES:
+        return None, "truncated, damaged or not an image"  # libpng would complain on stderr by itself
+    try:
+        # From memory: unlike from a file, a truncated JPEG then fails instead of ending in grey.
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        return None, f"not an image: {error.err}"
+    if image is None:
+        return None, "truncated, damaged or not an image"
+    if image.dtype == np.float64:
+        image = image.astype(np.float32)
+    if image.ndim == 3:
+        image = np.ascontiguousarray(image[:, :, 0] if image.shape[2] < 3 else image[:, :, :3])
+    return image, None
+
+
+def regular_bytes(path: Path) -> bytes:
+    """A file's content.  OSError, too, for what is none: a pipe or a device might be waited for without end."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        status = os.fstat(descriptor)
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "it is no regular file")
+        if status.st_size > LARGEST_BYTES:
+            raise OSError(errno.EFBIG, f"it is larger than {LARGEST_BYTES >> 20} MiB")
+        return file.read(LARGEST_BYTES)

@@ -1,0 +1,153 @@
+"""Robust non-linear least squares, also on manifolds: the one minimiser of the off-line methods.
+
+Levenberg-Marquardt (Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", 1963) with columns
+scaled to unit length, so that metres, radians and pixels may stand beside each other.  A problem gives what it
+minimises as functions of its own kind of state (an array, a transform, several of them); ``retract`` moves a state by a
+step, on the manifold where it is one.  Costs are sums of squared whitened residuals, or of a robust loss of them.
+
+``scipy.optimize.least_squares`` does the same for vectors alone, with dense Jacobians and without normal equations that
+are assembled view by view; problems of that kind go there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Generic, TypeVar
+
+import numpy as np
+from scipy.stats import chi2
+
+from gripmon.model.records import Array
+
+S = TypeVar("S")
+Equations = tuple[Array, Array]
+"""Normal matrix ``JᵀWJ`` (p, p) and right-hand side ``JᵀWr`` (p,), r measured less predicted."""
+
+TUKEY = 4.685
+"""Residual in standard deviations from which Tukey's biweight gives no weight: 95 % efficiency for normal errors
+(Holland and Welsch, "Robust regression using iteratively reweighted least-squares", 1977)."""
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
+_DETERMINED = 1e13
+"""Condition number of scaled normal equations beyond which rounding alone decides (doubles have 16 digits)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Minimum(Generic[S]):
+    """Where a minimisation ended: the best ``state`` with its ``cost``; ``converged`` is False if ``iterations`` ran
+    out before the cost stood still.
+    """
+
+    state: S
+    cost: float
+    iterations: int
+    converged: bool
+
+
+def minimise(
+    start: S,
+    cost: Callable[[S], float],
+    equations: Callable[[S], Equations],
+    retract: Callable[[S, Array], S],
+    *,
+    iterations: int = 100,
+    tolerance: float = 1e-10,
+    damping: float = _DAMPING,
+) -> Minimum[S]:
+    """The state near ``start`` with the least cost.
+
+    A state that isn't allowed costs infinity (or NaN), and is not entered.  Ends when the cost, or what is expected of
+    a step that fails, decreases by less than ``tolerance`` of it.  A small ``damping`` is Gauss-Newton's method.
+    A direction that the equations say nothing about isn't moved in.
+    """
+    state, current = start, cost(start)
+    for iteration in range(1, iterations + 1):
+        normal, side = equations(state)
+        size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+        scaled, wanted = normal / np.outer(size, size), side / size
+        while True:
+            step = np.linalg.solve(scaled + damping * np.eye(len(size)), wanted)
+            trial = retract(state, step / size)
+            new = cost(trial)
+            if new < current:
+                break
+            if damping >= _MOST_DAMPING or step @ (wanted + damping * step) <= tolerance * current:
+                return Minimum(state, current, iteration, converged=True)
+            damping *= 10.0
+        gain = current - new
+        state, current, damping = trial, new, max(0.1 * damping, _LEAST_DAMPING)
+        if gain <= tolerance * current:
+            return Minimum(state, current, iteration, converged=True)
+    return Minimum(state, current, iterations, converged=False)
+
+
+def fit(
+    start: S,
+    linearised: Callable[[S], tuple[Array, Array]],
+    retract: Callable[[S, Array], S],
+    *,
+    iterations: int = 20,
+    tolerance: float = 1e-12,
+) -> Minimum[S]:
+    """:func:`minimise` for a small problem that begins near its end: ``linearised`` gives whitened Jacobian rows
+    (m, p), or (n, d, p), and residuals (m,) or (n, d), measured less predicted.
+    """
+
+    def cost(state: S) -> float:
+        return float(np.square(linearised(state)[1]).sum())
+
+    def equations(state: S) -> Equations:
+        return normal_equations(*linearised(state))
+
+    return minimise(start, cost, equations, retract, iterations=iterations, tolerance=tolerance, damping=_LEAST_DAMPING)
+
+
+def normal_equations(rows: Array, values: Array, weights: Array | None = None) -> Equations:
+    """Of whitened Jacobian rows (n, d, p) and residuals (n, d), or (m, p) and (m,), with ``weights`` (n,)."""
+    if weights is not None:
+        root = np.sqrt(weights)
+        rows, values = rows * root.reshape(-1, *[1] * (rows.ndim - 1)), values * root[:, None]
+    a, b = rows.reshape(-1, rows.shape[-1]), values.ravel()
+    return a.T @ a, a.T @ b
+
+
+def covariance_of(normal: Array, variance: float = 1.0) -> Array:
+    """(p, p), ``variance`` times the inverse of a normal matrix.  :class:`numpy.linalg.LinAlgError` where it leaves a
+    direction undetermined.
+    """
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    scaled = normal / np.outer(size, size)
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled) > _DETERMINED:
+        raise np.linalg.LinAlgError("the equations leave a direction undetermined")
+    out: Array = variance * np.linalg.inv(scaled) / np.outer(size, size)
+    return out
+
+
+def whitening(covariance: Array) -> Array:
+    """(..., d, d) that makes errors of a covariance (..., d, d) independent with unit variance."""
+    out: Array = np.linalg.inv(np.linalg.cholesky(covariance))
+    return out
+
+
+def tukey_weights(sizes: Array, width: float) -> Array:
+    """Weights (n,) of residuals of these sizes (n,): Tukey's biweight, 0 from ``width`` on (infinite sizes, too)."""
+    out: Array = np.square(1.0 - np.square(np.minimum(sizes / width, 1.0)))
+    return out
+
+
+def tukey_cost(sizes: Array, width: float) -> float:
+    """The sum of the loss whose weights :func:`tukey_weights` are: squared sizes where small, ``width²/3`` at most."""
+    return float((width**2 / 3.0 * (1.0 - (1.0 - np.square(np.minimum(sizes / width, 1.0))) ** 3)).sum())
+
+
+def robust_scale(sizes: Array, dimensions: int) -> float:
+    """Standard deviation of one coordinate, from lengths (n,) of residual vectors of as many dimensions: their median
+    over the chi distribution's; half of them may be wrong.
+    """
+    return float(np.median(sizes)) / _chi_median(dimensions)
+
+
+@cache
+def _chi_median(dimensions: int) -> float:
+    return float(np.sqrt(chi2.median(dimensions)))

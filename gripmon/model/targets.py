@@ -1,0 +1,124 @@
+"""Flat calibration targets, as they are described on a command line or in a file."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.model.errors import InputError
+
+_Count = Annotated[int, Meta(ge=2, le=200)]
+_Length = Annotated[float, Meta(gt=0.0, le=2.0)]
+FEWEST = {"chequerboard": 9, "charuco": 6, "circles": 9}
+"""Points that a view must show."""
+_WIDEST = 2.0
+"""A square beyond this many metres was meant in millimetres."""
+
+
+class TargetError(InputError):
+    """A target that can't be; ``str()`` is one line: what is wrong; what would be right."""
+
+
+class Chequerboard(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="chequerboard"):
+    """Squares in two colours; ``columns`` and ``rows`` count the *inner* corners, as OpenCV and ROS do."""
+
+    columns: _Count
+    rows: _Count
+    square_m: _Length
+
+
+class Charuco(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="charuco"):
+    """A chequerboard with ArUco marks in white squares; ``columns`` and ``rows`` count *squares*, as OpenCV does."""
+
+    columns: _Count
+    rows: _Count
+    square_m: _Length
+    marker_m: _Length
+    dictionary: str = "DICT_4X4_250"
+
+
+class CircleGrid(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind", tag="circles"):
+    """Discs on a square lattice, such as the self-viewing method's 8 x 8; dark on light or the reverse."""
+
+    columns: _Count
+    rows: _Count
+    spacing_m: _Length
+    diameter_m: _Length
+
+
+Target = Chequerboard | Charuco | CircleGrid
+_FORMS: dict[str, str] = {
+    "chequerboard": "chequerboard:COLUMNSxROWS:SQUARE (inner corners, m), e.g. chequerboard:9x6:0.025",
+    "charuco": "charuco:COLUMNSxROWS:SQUARE:MARKER[:DICTIONARY] (squares, m), e.g. charuco:8x6:0.03:0.022:DICT_4X4_250",
+    "circles": "circles:COLUMNSxROWS:SPACING:DIAMETER (discs, m), e.g. circles:8x8:0.008:0.004",
+}
+
+
+def parse_target(text: str) -> Target:
+    """A target from a command line.  Raises :class:`TargetError`."""
+    kind, *parts = text.split(":")
+    kind = "chequerboard" if kind == "checkerboard" else kind
+    if kind not in _FORMS:
+        raise TargetError(f"'{kind}' is no target; {' or '.join(_FORMS.values())}")
+    right = _FORMS[kind]
+    lengths = {"chequerboard": (2, 2), "charuco": (3, 4), "circles": (3, 3)}[kind]
+    if not lengths[0] <= len(parts) <= lengths[1]:
+        raise TargetError(f"'{text}' has {len(parts)} parts after its kind; {right}")
+    try:
+        columns, rows = (int(n) for n in parts[0].lower().split("x"))
+        numbers = [float(p) for p in parts[1 : 2 if kind == "chequerboard" else 3]]
+    except ValueError:
+        raise TargetError(f"'{text}' can't be read; {right}") from None
+    keys: dict[str, tuple[str, ...]] = {
+        "chequerboard": ("square_m",), "charuco": ("square_m", "marker_m"), "circles": ("spacing_m", "diameter_m")
+    }  # fmt: skip
+    fields = {"kind": kind, "columns": columns, "rows": rows, **dict(zip(keys[kind], numbers, strict=True))}
+    if len(parts) == 4:
+        fields["dictionary"] = parts[3]
+    return checked(fields, text, right)
+
+
+def checked(fields: dict[str, object], text: str, right: str) -> Target:
+    """A target from its fields.  Raises :class:`TargetError`."""
+    if max((v for k, v in fields.items() if k.endswith("_m") and isinstance(v, float)), default=0.0) > _WIDEST:
+        raise TargetError(
+            f"'{text}': {fields.get('square_m', fields.get('spacing_m'))} m between its points (millimetres?); {right}"
+        )
+    try:
+        target: Target = msgspec.convert(fields, Target)
+    except msgspec.ValidationError as error:
+        raise TargetError(f"'{text}': {error}; {right}") from None
+    inner, outer = {
+        "chequerboard": (0.0, 1.0), "charuco": ("marker_m", "square_m"), "circles": ("diameter_m", "spacing_m")
+    }[str(fields["kind"])]  # fmt: skip
+    if isinstance(inner, str) and not getattr(target, inner) < getattr(target, str(outer)):
+        raise TargetError(f"'{text}': {inner} is not below {outer}; {right}")
+    columns, rows = (
+        (target.columns, target.rows) if fields["kind"] != "charuco" else (target.columns - 1, target.rows - 1)
+    )
+    if min(columns, rows) < (2 if fields["kind"] == "charuco" else 3) or columns * rows < FEWEST[str(fields["kind"])]:
+        raise TargetError(
+            f"'{text}' has {columns} x {rows} points, too few to tell it from anything else; at least 3 x 3; {right}"
+        )
+    return target
+
+
+def name_of(target: Target) -> str:
+    """The target as :func:`parse_target` reads it."""
+    size = f"{target.columns}x{target.rows}"
+    if isinstance(target, Chequerboard):
+        return f"chequerboard:{size}:{target.square_m:g}"
+    if isinstance(target, CircleGrid):
+        return f"circles:{size}:{target.spacing_m:g}:{target.diameter_m:g}"
+    return f"charuco:{size}:{target.square_m:g}:{target.marker_m:g}:{target.dictionary}"
+
+
+def tells_its_turn(target: Target) -> bool:
+    """Whether an image of it tells which way up it is: by marks, or by the colours of a board whose numbers of corners
+    are one even, one odd (:mod:`gripmon.calibrate.detection.boards`).
+    """
+    if isinstance(target, Chequerboard):
+        return (target.columns + target.rows) % 2 == 1
+    return isinstance(target, Charuco)

@@ -1,0 +1,281 @@
+"""Hand/eye calibration from images of the gripper, for programs and notebooks: on a plate, or as the monitor sees it.
+
+``gripmon calibrate plane`` and ``verify`` call these functions.  Images are arrays (as OpenCV reads them) or paths.
+What is wrong with the input is an :class:`~gripmon.model.errors.InputError`, images from which nothing can be measured
+a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from gripmon.calibrate.detection import detect
+from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
+from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.plane_average import PlaneCalibration, average
+from gripmon.calibrate.sighting import CalibrationError, NotFound
+from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.errors import InputError
+from gripmon.model.geometry import from_record, to_record
+from gripmon.model.gripper import Gripper, GripperError, GripperModel
+from gripmon.model.images import check_size, images_of_one_camera
+from gripmon.model.progress import Progress, quiet
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
+from gripmon.model.targets import Target, TargetError, parse_target
+from gripmon.monitor import Monitor
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
+from gripmon.teach.onboarding.picture import draw
+from gripmon.track.edges.taught import TaughtEdges, gripper_digest
+
+Rough = Mapping[str, tuple[float, float]]
+Pose = tuple[Array, Array]
+"""``cam_T_grip`` (4, 4) and the covariance (6, 6) of its error."""
+
+
+@dataclass(frozen=True, slots=True)
+class HandEyeOnPlate:
+    """``fit`` of all images together; ``looks``: what each image gives; ``not_used``: images that give nothing, and
+    why; ``notes``: what was assumed; ``shown``: the first image that was used.
+    """
+
+    fit: PlaneCalibration
+    method: KnownGripper | UnknownGripper
+    looks: tuple[Look, ...]
+    not_used: tuple[str, ...]
+    notes: tuple[str, ...]
+    shown: Image
+
+    @property
+    def cam_T_grip(self) -> Array:
+        """(4, 4)."""
+        return self.fit.cam_T_grip
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of its error: position of the TCP, then rotation, camera axes."""
+        return self.fit.covariance
+
+    @property
+    def inferred(self) -> bool:
+        """Whether the gripper comes from the same images."""
+        return isinstance(self.method, UnknownGripper)
+
+    def gripper(
+        self,
+        name: str = "gripper",
+        jaw_range_m: tuple[float, float] | None = None,
+        jaw_opening_m: float | None = None,
+        provenance: Provenance | None = None,
+    ) -> Gripper:
+        """The gripper: the known one, or the one that the images show (``jaw_range_m`` in which its jaws move)."""
+        if isinstance(self.method, KnownGripper):
+            return self.method.gripper
+        try:
+            return Gripper(self.method.model(name, self.looks, self.fit, jaw_range_m, jaw_opening_m, provenance))
+        except GripperError as error:
+            raise CalibrationError(f"what the corners show is no gripper: {error}") from None
+
+    def document(self, gripper: Gripper, provenance: Provenance) -> HandEyeCalibration:
+        """What a file holds of it."""
+        opening_m = self.method.jaw_opening_m if isinstance(self.method, KnownGripper) else None
+        if opening_m is None and gripper.has_jaw:
+            opening_m = gripper.jaw_nominal_m
+        return HandEyeCalibration(
+            camera=self.method.camera.lens,
+            gripper=CalibratedGripper(name=gripper.name, sha256=gripper_digest(gripper)),
+            jaw_opening_m=opening_m,
+            cam_T_grip=to_record(self.fit.cam_T_grip),
+            covariance=tuple(self.fit.covariance.ravel().tolist()),
+            residuals=HandEyeResiduals(
+                rms_m=self.fit.rms_m,
+                rms_px=self.fit.rms_px,
+                corners=sum(len(image.corners.names) for image in self.fit.images),
+                images=len(self.fit.images),
+            ),
+            warnings=self.fit.warnings,
+            provenance=provenance,
+        )
+
+    def calibrated(self, name: str = "images") -> Calibrated:
+        """What :func:`gripmon.calibrate.api.verify` compares."""
+        flat = tuple(self.covariance.ravel().tolist())
+        transform = to_record(self.cam_T_grip)
+        return Calibrated(name, "images", self.method.camera.lens, cam_T_grip=transform, covariance=flat)
+
+    def picture(self) -> Image:
+        """The first image with its residuals, enlarged; BGR."""
+        return draw(self.shown, self.method.camera.lens, self.looks[0].coincidence)
+
+
+def calibrate_plane(
+    images: Sequence[str | Path | Image],
+    camera: GivenCamera | CameraCalibration | LensSettings,
+    gripper: Gripper | None,
+    target: Target | str,
+    *,
+    corners: Rough | Sequence[Rough] | None = None,
+    jaw_opening_m: float | None = None,
+    cam_T_grip: Array | None = None,
+    progress: Progress = quiet,
+) -> HandEyeOnPlate:
+    """``cam_T_grip`` from images of the gripper standing on a calibration plate (the Plane Coincidence Constraint).
+
+    Where the gripper is to be looked for, rough ``corners`` say (name: (u, v) in px; for all images or for each), or a
+    rough calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, whose
+    names :func:`gripmon.teach.onboarding.outlines_of` tells.  ``jaw_opening_m`` in the images; nominal if None.
+    """
+    target = parse_target(target) if isinstance(target, str) else target
+    given = _given(camera)
+    method = (
+        UnknownGripper(given, target)
+        if gripper is None
+        else KnownGripper(given, gripper, _checked_opening(gripper, jaw_opening_m), cam_T_grip)
+    )
+    taken = _of_camera(images, given.lens)
+    rough = _for_each(corners, len(taken))
+    looks: list[Look] = []
+    shown: Image | None = None
+    not_used = []
+    with progress(len(taken), "image") as step:
+        for (name, image), where in zip(taken, rough, strict=True):
+            try:
+                looks.append(_look(method, target, name, image, where))
+                shown = image if shown is None else shown
+            except CalibrationError as error:
+                not_used.append(f"{name}: {error}")
+            step()
+    if shown is None:
+        more = f" (and {len(not_used) - 1} more images)" if len(not_used) > 1 else ""
+        raise CalibrationError(f"{not_used[0]}{more}")
+    fit = average([look.coincidence for look in looks], isinstance(method, UnknownGripper))
+    return HandEyeOnPlate(fit, method, tuple(looks), tuple(not_used), _notes(method, jaw_opening_m), shown)
+
+
+def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamera:
+    if isinstance(camera, GivenCamera):
+        return camera
+    if isinstance(camera, CameraCalibration):
+        count = len(camera.parameters)
+        return GivenCamera(camera.camera, camera.parameters, np.reshape(camera.covariance, (count, count)))
+    return GivenCamera(camera)
+
+
+def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
+    if not gripper.has_jaw:
+        if opening_m is not None:
+            raise InputError(f"jaw opening: {gripper.name} has no jaw; leave it out")
+        return None
+    if opening_m is None:
+        return gripper.jaw_nominal_m
+    if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
+        raise InputError(
+            f"jaw opening {opening_m:g} m: the gripper's is {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        )
+    return opening_m
+
+
+def _notes(method: KnownGripper | UnknownGripper, given_m: float | None) -> tuple[str, ...]:
+    notes = []
+    if isinstance(method, KnownGripper) and method.gripper.has_jaw and given_m is None:
+        notes.append(f"jaw opening taken as {method.jaw_opening_m:g} m; --jaw-opening M if it was another")
+    if not method.camera.parameters:
+        notes.append("how certain the camera is isn't known: its errors are not in the covariance")
+    return tuple(notes)
+
+
+def _of_camera(images: Sequence[str | Path | Image], lens: LensSettings) -> list[tuple[str, Image]]:
+    taken = list(images_of_one_camera(images))
+    for name, image in taken:
+        check_size(name, image, lens.width_px, lens.height_px)
+    return taken
+
+
+def _for_each(corners: Rough | Sequence[Rough] | None, images: int) -> Sequence[Rough | None]:
+    if corners is None or isinstance(corners, Mapping):
+        return [corners] * images
+    if len(corners) not in (1, images):
+        raise InputError(f"rough corners {len(corners)} times for {images} images; once for all, or for each")
+    return list(corners) * (images if len(corners) == 1 else 1)
+
+
+def _look(method: KnownGripper | UnknownGripper, target: Target, name: str, image: Image, rough: Rough | None) -> Look:
+    sight = detect(image, target, name)
+    if isinstance(sight, NotFound):
+        if sight.larger:
+            raise TargetError(f"{name}: {sight.reason}; its full size")
+        raise CalibrationError(sight.reason)
+    if isinstance(method, KnownGripper):
+        return method.look(image, sight, rough)
+    if rough is None:
+        raise InputError("a gripper that isn't known needs rough corners")
+    return method.look(image, sight, rough)
+
+
+def gripper_values(model: GripperModel) -> dict[str, Any]:
+    """A gripper as a file has it: without keys that only say what goes without saying."""
+    out: dict[str, Any] = msgspec.to_builtins(model)
+    out["fingers"] = {
+        name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()
+    }
+    out["edges"] = {name: {"from": edge["from"], "to": edge["to"]} for name, edge in out["edges"].items()}
+    return {key: value for key, value in out.items() if value not in (None, [], ())}
+
+
+def measure_tracked(
+    images: Sequence[str | Path | Image],
+    camera: LensSettings,
+    gripper: Gripper,
+    expected: Pose,
+    settings: MonitorSettings | None = None,
+    *,
+    jaw_opening_m: float | None = None,
+    taught_edges: TaughtEdges | None = None,
+) -> tuple[Pose, tuple[str, ...]]:
+    """``cam_T_grip`` as the monitor measures it in images of one pose before different backgrounds, from where it is
+    ``expected``; and what is doubtful about it.  Images that contradict the others are left out.
+    """
+    taken = _of_camera(images, camera)
+    made = make_camera(camera)
+    cam_T_grip, covariance = expected
+    # Where the camera has moved, an image that begins at the calibration may end at a wrong place.  So once more, from
+    # where most of them end.
+    for _ in range(2):
+        found, reasons = {}, []
+        for number, (name, image) in enumerate(taken):
+            # Each image by itself: what a monitor learns from the last one is for a camera that stands still meanwhile.
+            flat = tuple(covariance.ravel().tolist())
+            reference = ReferenceRecord("verify", 0, 0, "configuration", to_record(cam_T_grip), flat)
+            monitor = Monitor(made, gripper, settings or MonitorSettings(), reference, taught_edges)
+            record = monitor.process(Frame(number, 1_000_000_000 * (number + 1), image, jaw_opening_m, name))
+            if record.cam_T_grip is None or record.covariance is None or record.source is Origin.HELD:
+                reasons.append(f"{name}: {record.reason or 'the gripper is not seen'}")
+                continue
+            found[name] = from_record(record.cam_T_grip), np.reshape(record.covariance, (6, 6))
+        if not found:
+            raise CalibrationError(f"no image can be measured; {reasons[0]}")
+        transforms, covariances = zip(*found.values(), strict=True)
+        agree = agreeing(transforms, covariances)
+        chosen = np.flatnonzero(agree)
+        cam_T_grip, covariance = mean_of_one_scene([transforms[k] for k in chosen], [covariances[k] for k in chosen])
+    if 2 * len(chosen) <= len(found) and len(found) > 1:
+        share = f"only {len(chosen)}" if len(chosen) > 1 else "no two"
+        raise CalibrationError(
+            f"{share} of {len(found)} images agree on where the gripper is; images of one pose, in which the "
+            "background doesn't hide its edges"
+        )
+    doubts = [f"left out: {reason}" for reason in reasons]
+    doubts += [
+        f"left out: {name}: contradicts the other images" for name, kept in zip(found, agree, strict=True) if not kept
+    ]
+    if len(found) == 1:
+        doubts.insert(0, f"{next(iter(found))} alone: nothing confirms what it shows; three images or more are better")
+    return (cam_T_grip, covariance), tuple(doubts)

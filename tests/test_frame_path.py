@@ -1,0 +1,88 @@
+"""How much of the product one frame passes from the source to its published transform: files and functions, counted.
+
+Counts don't depend on the machine, as times do.  They may only fall: lower the limits when they have.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import CodeType, FrameType
+
+from support.loopback import free_endpoint
+
+import gripmon
+from gripmon.daemon import run
+from gripmon.daemon.config import builtin_config, load_config
+from gripmon.io.publish import ZenohPublisher
+from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.geometry import from_record
+from gripmon.model.records import Frame, FrameRecord, Verdict
+from gripmon.monitor import Monitor
+from gripmon.record.write import NullRecorder
+from gripmon.simulate import Scenario, Simulator
+
+COUNTED = range(40, 56)  # past the start's checks; one drift test's refresh falls among 16 frames
+MOST_FILES, MOST_FUNCTIONS, MOST_CALLS = 44, 245, 600
+PACKAGE = str(Path(gripmon.__file__).parent)
+
+
+class Counted:
+    """A source and a publisher around the daemon's loop that count what runs between them."""
+
+    live, connected, dropped = False, True, 0
+
+    def __init__(self, frames: list[Frame], publisher: ZenohPublisher) -> None:
+        self._frames, self._publisher = iter(frames), publisher
+        self.passed: list[list[CodeType]] = []
+        self.verdicts: list[Verdict] = []
+
+    def read(self) -> Frame | None:
+        frame = next(self._frames, None)
+        if frame is not None and frame.seq in COUNTED:
+            self.passed.append([])
+            sys.setprofile(self._count)
+        return frame
+
+    def transform(self, record: FrameRecord) -> None:
+        self._publisher.transform(record)
+        sys.setprofile(None)
+        self.verdicts.append(record.verdict)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._publisher, name)  # what isn't about a frame
+
+    def close(self) -> None: ...
+
+    def _count(self, frame: FrameType, event: str, _argument: object) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
+            self.passed[-1].append(frame.f_code)
+
+
+def test_the_way_of_a_frame_gets_no_longer():
+    config = load_config(builtin_config("demo.yaml"), check_source=False)
+    settings = config.settings
+    start = from_record(config.reference.cam_T_grip)
+    simulator = Simulator(config.camera, config.gripper, start, Scenario(name="way", duration_s=2.0, fps=60.0), seed=1)
+    link = Link(PublishSettings(listen=(free_endpoint(),)))
+    publisher = ZenohPublisher(link, settings.robot, settings.camera_name)
+    counted = Counted([simulator.frame(k) for k in range(COUNTED.stop)], publisher)
+    try:
+        monitor = Monitor(config.camera, config.gripper, settings.monitor, config.reference)
+        run(
+            monitor, counted, counted, NullRecorder(), settings.daemon,
+            robot=settings.robot, camera=settings.camera_name,
+        )  # fmt: skip
+    finally:
+        sys.setprofile(None)
+        publisher.close()
+        link.close()
+    assert counted.verdicts[-len(COUNTED) :] == [Verdict.VALID] * len(COUNTED)
+    passed = sorted(counted.passed, key=len)
+    usual, longest = passed[len(passed) // 2], passed[-1]
+    files = {code.co_filename for code in usual}
+    functions = {(code.co_filename, code.co_qualname) for code in usual}
+    said = f"{len(files)} files, {len(functions)} functions, {len(usual)} calls; at most {len(longest)} calls"
+    assert len(files) <= MOST_FILES, said
+    assert len(functions) <= MOST_FUNCTIONS, said
+    assert len(usual) <= MOST_CALLS, said

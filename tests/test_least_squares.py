@@ -1,0 +1,175 @@
+"""The one least-squares minimiser: recovery of simulated truth, honest covariances, outliers, manifolds, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares as scipy_least_squares
+from scipy.stats import chi2
+
+from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.least_squares import (
+    TUKEY,
+    covariance_of,
+    fit,
+    minimise,
+    normal_equations,
+    robust_scale,
+    tukey_cost,
+    tukey_weights,
+    whitening,
+)
+
+TIMES = np.linspace(0.0, 3.0, 60)
+TRUE = np.array([2.0, 1.3, 0.5])
+
+
+def decay(unknown: np.ndarray) -> np.ndarray:
+    return unknown[0] * np.exp(-unknown[1] * TIMES) + unknown[2]
+
+
+def decay_rows(unknown: np.ndarray) -> np.ndarray:
+    falling = np.exp(-unknown[1] * TIMES)
+    return np.stack([falling, -unknown[0] * TIMES * falling, np.ones_like(TIMES)], axis=1)
+
+
+def linearised(seen: np.ndarray, sigma: float):
+    return lambda unknown: (decay_rows(unknown) / sigma, (seen - decay(unknown)) / sigma)
+
+
+def test_it_ends_where_scipy_ends():
+    seen = decay(TRUE) + np.random.default_rng(1).normal(0.0, 0.02, len(TIMES))
+    found = fit(np.array([1.0, 0.5, 0.0]), linearised(seen, 0.02), np.add)
+    other = scipy_least_squares(lambda x: (decay(x) - seen) / 0.02, [1.0, 0.5, 0.0], xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    assert found.converged
+    np.testing.assert_allclose(found.state, other.x, rtol=1e-7)
+    assert found.cost == pytest.approx(2.0 * other.cost, rel=1e-10)
+
+
+def test_errors_have_the_spread_that_the_covariance_claims():
+    rng, sigma, squares = np.random.default_rng(2), 0.02, []
+    for _ in range(200):
+        seen = decay(TRUE) + rng.normal(0.0, sigma, len(TIMES))
+        found = fit(np.array([1.0, 0.5, 0.0]), linearised(seen, sigma), np.add).state
+        covariance = covariance_of(normal_equations(*linearised(seen, sigma)(found))[0])
+        squares.append((found - TRUE) @ np.linalg.solve(covariance, found - TRUE))
+    low, high = chi2.ppf([0.001, 0.999], 3 * len(squares)) / len(squares)
+    assert low < np.mean(squares) < high
+
+
+def test_gross_outliers_hardly_move_a_robust_fit():
+    rng, sigma = np.random.default_rng(3), 0.02
+    seen = decay(TRUE) + rng.normal(0.0, sigma, len(TIMES))
+    wrong = rng.choice(len(TIMES), 8, replace=False)
+    dirty = seen.copy()
+    dirty[wrong] += rng.choice([-1.0, 1.0], 8) * rng.uniform(0.5, 2.0, 8)
+    width = TUKEY * sigma
+
+    def sizes(unknown: np.ndarray) -> np.ndarray:
+        return np.abs(dirty - decay(unknown))
+
+    def equations(unknown: np.ndarray, wide: float = width):
+        values = (dirty - decay(unknown))[:, None]
+        return normal_equations(decay_rows(unknown)[:, None, :], values, tukey_weights(sizes(unknown), wide))
+
+    start = fit(np.array([1.0, 0.5, 0.0]), linearised(dirty, sigma), np.add).state
+    assert np.abs(start - TRUE).max() > 0.05, "without robustness the outliers are felt"
+    for scale in (4.0, 2.0, 1.0):
+        wide = width * scale
+        start = minimise(
+            start,
+            lambda x, w=wide: tukey_cost(sizes(x), w),
+            lambda x, w=wide: equations(x, w),
+            np.add,
+        ).state
+    normal, _ = equations(start)
+    assert (start - TRUE) @ normal @ (start - TRUE) / sigma**2 < chi2.ppf(0.999, 3)
+
+
+@pytest.mark.parametrize("size", [0.0, 0.3, 1.0, 2.9])
+def test_the_weight_is_the_losss_slope(size: float):
+    step, width = 1e-5, 3.0
+    slope = (tukey_cost(np.array([size + step]), width) - tukey_cost(np.array([size - step]), width)) / (2.0 * step)
+    assert slope == pytest.approx(2.0 * size * tukey_weights(np.array([size]), width)[0], abs=1e-8)
+
+
+def test_far_and_infinite_residuals_have_no_weight_and_a_finite_cost():
+    sizes = np.array([3.0, 50.0, np.inf])
+    assert tukey_weights(sizes, 3.0).tolist() == [0.0, 0.0, 0.0]
+    assert tukey_cost(sizes, 3.0) == pytest.approx(3 * 3.0)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 3, 6])
+def test_the_robust_scale_is_one_coordinates_deviation_though_a_quarter_is_wrong(dimensions: int):
+    rng = np.random.default_rng(4)
+    sizes = np.linalg.norm(rng.normal(0.0, 0.7, (20_000, dimensions)), axis=1)
+    assert robust_scale(sizes, dimensions) == pytest.approx(0.7, rel=0.02)
+    sizes[: len(sizes) // 4] = 1e6
+    assert 0.7 < robust_scale(sizes, dimensions) < 1.1
+
+
+def test_a_pose_on_its_manifold_from_far_away():
+    rng = np.random.default_rng(5)
+    true = perturb(np.eye(4), np.array([0.3, -0.2, 0.5, 0.8, -1.1, 0.4]))
+    points = rng.normal(0.0, 0.2, (12, 3))
+    seen = points @ true[:3, :3].T + true[:3, 3]
+
+    def rows_of(pose: np.ndarray):
+        turned = points @ pose[:3, :3].T
+        cross = np.zeros((len(points), 3, 3))
+        cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = turned[:, 2], -turned[:, 1], turned[:, 0]
+        cross -= cross.transpose(0, 2, 1)
+        rows = np.concatenate([np.tile(np.eye(3), (len(points), 1, 1)), cross], axis=2)
+        return rows, seen - turned - pose[:3, 3]
+
+    # The rows are the derivatives by the perturbation that the retraction applies.
+    rows, _ = rows_of(np.eye(4))
+    for k in range(6):
+        step = 1e-6 * np.eye(6)[k]
+        there, back = rows_of(perturb(np.eye(4), step))[1], rows_of(perturb(np.eye(4), -step))[1]
+        np.testing.assert_allclose((back - there) / 2e-6, rows[:, :, k], atol=1e-8)
+    found = fit(np.eye(4), rows_of, perturb, iterations=50)
+    assert found.converged and np.linalg.norm(perturbation_between(found.state, true)) < 1e-9
+    assert found.cost < 1e-18
+
+
+def test_states_that_are_not_allowed_are_not_entered():
+    """The minimum lies behind a wall: it ends before it, wherever the steps would lead."""
+    entered = []
+
+    def cost(x: np.ndarray) -> float:
+        entered.append(float(x[0]))
+        return (x[0] - 3.0) ** 2 if x[0] < 1.0 else np.inf
+
+    found = minimise(np.zeros(1), cost, lambda x: (np.eye(1), np.array([3.0 - x[0]])), np.add, tolerance=1e-6)
+    assert 0.99 < found.state[0] < 1.0 and max(entered) >= 1.0
+
+
+def test_directions_without_information_stay_where_they_are():
+    rows = np.array([[1.0, 0.0], [2.0, 0.0]])
+    found = fit(np.array([0.0, 7.0]), lambda x: (rows, np.array([1.0, 2.0]) - rows @ x), np.add)
+    np.testing.assert_allclose(found.state, [1.0, 7.0], atol=1e-9)
+    with pytest.raises(np.linalg.LinAlgError, match="undetermined"):
+        covariance_of(normal_equations(rows, np.zeros(2))[0])
+
+
+def test_columns_of_very_different_units_don_t_matter():
+    units = np.array([1e-6, 1.0, 1e5])
+    seen = decay(TRUE)
+    found = fit(
+        np.array([1.0, 0.5, 0.0]) / units,
+        lambda x: (decay_rows(x * units) * units, seen - decay(x * units)),
+        np.add,
+    )
+    np.testing.assert_allclose(found.state * units, TRUE, rtol=1e-9)
+
+
+def test_running_out_of_iterations_is_said():
+    seen = decay(TRUE)
+    assert not fit(np.array([1.0, 0.5, 0.0]), linearised(seen, 1e-3), np.add, iterations=2).converged
+
+
+def test_whitened_errors_are_independent_with_unit_variance():
+    covariance = np.array([[4.0, 1.0], [1.0, 2.0]])
+    root = whitening(covariance)
+    np.testing.assert_allclose(root @ covariance @ root.T, np.eye(2), atol=1e-14)
