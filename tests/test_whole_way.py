@@ -113,6 +113,7 @@ def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, cal
     assert closed[0] == pytest.approx(0.005, abs=3e-5)
 
 
+@pytest.mark.slow("a browser; without one it is in the default run")
 def test_taught_in_the_browser_the_monitor_notices_a_knock(
     user: new_user.NewUser, calibrated: Path, driver: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
