@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from support.loopback import wait_for_default_port
 
 from gripmon.model.geometry import from_record, perturbation_between
 from gripmon.model.records import Array, Transform
@@ -77,6 +78,8 @@ def walked(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     for block in blocks:
         printed = ""
         for command in block.commands:
+            if command.startswith("gripmon run"):
+                wait_for_default_port()
             code, out = run(command, folder)
             promised = re.search(r"# exit code (\d+)", command)
             assert code == (int(promised[1]) if promised else 0), f"{command}\n{out}"
@@ -124,7 +127,7 @@ def test_the_knock_is_noticed_and_measured(walked: Path):
         assert np.median(np.linalg.norm(np.array(off)[:knock, :2], axis=1)) < 3e-5
         sizes = [e @ np.linalg.solve(square(r["covariance"]), e) for e, r in zip(off, records, strict=True)]
         assert np.median(sizes) < CHI2_999[6]
-    assert "report" in (walked / "report.html").read_text(encoding="utf-8")[:2000].lower()
+    assert "moved once" in (walked / "report.html").read_text(encoding="utf-8")
 
 
 def test_the_arm_and_the_second_camera_are_the_true_ones(walked: Path):

@@ -7,10 +7,8 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
 import sys
-import time
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import new_user
+from support.loopback import wait_for_default_port
 from support.simulated import BOX_FINGERS, PAPER_LENS
 from support.teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
@@ -32,8 +31,6 @@ from gripmon.model.gripper import load_gripper
 from gripmon.model.records import Transform
 
 INNER = ("left_inner_near", "left_inner_far", "right_inner_near", "right_inner_far")
-PORT = 7447
-"""Where a configuration that nobody has edited listens."""
 CHI2_999 = 22.5
 """Of six degrees of freedom."""
 STEP = new_user.STEP
@@ -148,7 +145,7 @@ def test_taught_without_a_page_the_running_monitor_notices_a_knock(
     _checked(tmp_path / "config.yaml", capsys)
     records = _replayed(calibrated, tmp_path)
     _held_against_the_truth(user, records)
-    _wait_for_port()
+    wait_for_default_port()
     ran = subprocess.run(
         [sys.executable, "-m", "gripmon", "run", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "run")],
         capture_output=True, text=True, timeout=4 * DEADLINE_S, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
@@ -230,19 +227,3 @@ def _held_against_the_truth(user: new_user.NewUser, records: list[dict[str, Any]
 
 def _pose(value: dict[str, Any]) -> np.ndarray:
     return from_record(Transform(tuple(value["translation_m"]), tuple(value["rotation_xyzw"])))
-
-
-def _wait_for_port() -> None:
-    """Until nobody else listens where the monitor will."""
-    deadline = time.monotonic() + DEADLINE_S
-    while True:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("127.0.0.1", PORT))
-            except OSError:
-                if time.monotonic() > deadline:
-                    pytest.skip(f"another program listens on port {PORT}")
-                time.sleep(0.2)
-            else:
-                return

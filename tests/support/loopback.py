@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+import pytest
 import zenoh
 
 from gripmon.model.records import (
@@ -150,3 +151,23 @@ def alert_record(text: str = "moved 1.5 mm") -> AlertRecord:
         robot="arm", camera="wrist", seq=7, stamp_ns=5, state=State.DRIFTING, reference_id="plate-2", revision=3,
         kind=AlertKind.DRIFT, cause=Cause.CAMERA_MOUNT, severity=Severity.WARNING, text=text,
     )  # fmt: skip
+
+
+DEFAULT_PORT = 7447
+"""Where a configuration that no one has edited listens."""
+
+
+def wait_for_default_port(deadline_s: float = 120.0) -> None:
+    """Until no other program listens where a configuration that no one has edited will; skips the test if one stays."""
+    deadline = time.monotonic() + deadline_s
+    while True:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("127.0.0.1", DEFAULT_PORT))
+            except OSError:
+                if time.monotonic() > deadline:
+                    pytest.skip(f"another program listens on port {DEFAULT_PORT}")
+                time.sleep(0.2)
+            else:
+                return
