@@ -254,6 +254,7 @@ def test_a_signal_stops_the_daemon_with_everything_written(
     assert list(out.glob("*.rrd"))
 
 
+@pytest.mark.slow("6 s; a run that a signal ends is in the default run")
 def test_run_ends_after_its_duration(live_simulation: Path, tmp_path: Path):
     done = gripmon("run", live_simulation, "--duration", "1.5", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
@@ -300,3 +301,35 @@ def wait_for(condition: Any, process: subprocess.Popen[str], timeout_s: float = 
         assert process.poll() is None, process.communicate()[1]
         assert time.monotonic() < deadline_s, "it never came"
         time.sleep(0.05)
+
+
+BASH = r"""
+source "$1"; shift
+COMP_WORDS=("$@") COMP_CWORD=$(($# - 1)) COMP_LINE="$*" COMP_POINT=${#COMP_LINE}
+function=$(complete -p gripmon | sed 's/.*-F \([^ ]*\).*/\1/')
+$function gripmon "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD - 1]}"
+echo "${COMPREPLY[@]}"
+"""
+
+
+def test_bash_completes_commands_options_and_choices(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    """As bash does it: the function that the script registers for ``gripmon`` fills COMPREPLY."""
+    with pytest.raises(SystemExit) as ended:
+        main(["--print-completion", "bash"])
+    assert ended.value.code == 0
+    script = tmp_path / "completion.bash"
+    script.write_text(capsys.readouterr().out)
+
+    def completed(*words: str) -> set[str]:
+        command = ["bash", "-c", BASH, "bash", str(script), "gripmon", *words]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return set(done.stdout.split())
+
+    assert completed("repl") == {"replay"}
+    assert {"--config", "--recording", "--fps"} <= completed("replay", "--")
+    assert completed("send", "re") == {"recalibrate", "reject", "reset"}
+    assert "--print-completion" not in completed("--"), "it is not advertised"
+    with pytest.raises(SystemExit) as refused:
+        main(["--print-completion", "tcsh"])
+    assert refused.value.code == 2

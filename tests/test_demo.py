@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from support.gripmon_process import gripmon
 
+from gripmon.analyse.comparison import compare
 from gripmon.cli import demo
-from gripmon.cli.comparison import compare
 from gripmon.model.geometry import from_record, make_transform, to_record
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
 from gripmon.simulate import FrameTruth
@@ -31,7 +31,7 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
         msgspec.json.decode(line, type=FrameRecord) for line in (out / "estimates.jsonl").read_bytes().splitlines()
     ]
     assert len(list(out.glob("*.rrd"))) == 1 and summary["recordings"] == ["demo-0001.rrd"]
-    assert summary["frames"] == len(records) > 60
+    assert summary["frames"] == len(records) > 20
     assert summary["transforms_received"] == summary["frames"]
     comparison = summary["comparison"]
     assert comparison["without_correction"]["across_mm"]["max"] > 4.0

@@ -18,14 +18,14 @@ from rerun.chunk import RrdReader
 from support import recorded
 from support.replayed import EVERY_FRAME, replayed, without_latency
 
+from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import main
 from gripmon.cli.recorded_run import RecordedRun
-from gripmon.cli.replay import _recorder
-from gripmon.cli.replay_differences import Differences
-from gripmon.cli.replaying import replay
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
+from gripmon.daemon.one_recording import one_recording
 from gripmon.daemon.recorded_run import as_recorded_before_bounds
+from gripmon.daemon.replaying import replay
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
@@ -38,6 +38,7 @@ from gripmon.model.records import (
     Refusal,
     Severity,
     Verdict,
+    to_json,
 )
 from gripmon.record.write import open_recorder
 
@@ -108,8 +109,8 @@ def odd_frames(sequence: Path) -> list[Frame]:
 
 def test_refused_and_odd_frames_are_given_again(sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     config = load_config(sequence_config(sequence), check_source=False)
-    with _recorder(str(tmp_path / "odd.rrd"), config) as recorder:
-        lines = [line for line, _ in replay(config, Given(odd_frames(sequence)), recorder)]
+    with one_recording(tmp_path / "odd.rrd", config) as recorder:
+        lines = [to_json(each) + b"\n" for each in replay(Given(odd_frames(sequence)), config, recorder)]
     reasons = {json.loads(line)["reason"].partition(":")[0] for line in lines if json.loads(line)["reason"]}
     assert reasons >= set(Refusal) - {Refusal.FROZEN}, "every kind of refusal"
     (tmp_path / "then.jsonl").write_bytes(b"".join(lines))
@@ -131,8 +132,8 @@ def test_the_files_of_one_run_are_one_recording(sequence: Path, tmp_path: Path, 
         )  # fmt: skip
         source = FolderSource(FolderSettings(path="."), sequence)
         lines = b""
-        for line, _ in replay(config, source, recorder):
-            lines += line
+        for record in replay(source, config, recorder):
+            lines += to_json(record) + b"\n"
             time.sleep(0.05)  # the files change at flushes
         recorder.close(timeout_s=60.0)
         paths[name] = sorted((tmp_path / name).glob("*.rrd"))
@@ -267,6 +268,7 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is what is replayed; another file"]
 
 
+@pytest.mark.slow("4 s; other limits on the same recording are in the default run")
 def test_another_calibration_begins_with_its_own_reference(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -289,7 +291,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         config.settings.recording, robot="demo", camera_name="wrist", camera=config.camera, gripper=config.gripper,
         reference=config.reference, directory=tmp_path, name="old", patience_s=30.0,
     )  # fmt: skip
-    for _ in replay(config, FolderSource(FolderSettings(path="."), sequence), old):
+    for _ in replay(FolderSource(FolderSettings(path="."), sequence), config, old):
         pass
     old.close(timeout_s=60.0)
     other = rr.RecordingStream("somebody_else", recording_id="x")

@@ -1,4 +1,7 @@
-"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs."""
+"""The command ``gripmon``: one file a subcommand, nothing heavy imported before a subcommand runs.
+
+``argparse`` stays: it costs no import time, and its error lines and exit codes are what scripts rely on.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from gripmon.cli import (
     view,
     watch,
 )
-from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandFailedError
+from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
 from gripmon.model.errors import InputError, NoResultError
 
 _COMMANDS = (
@@ -83,10 +86,23 @@ def build_parser() -> argparse.ArgumentParser:
         prog="gripmon", description=_DESCRIPTION, epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--version", action="version", version=f"gripmon {__version__}")
+    parser.add_argument("--print-completion", action=_PrintCompletion, choices=("bash", "zsh"), help=argparse.SUPPRESS)
     commands = parser.add_subparsers(title="commands", metavar="COMMAND")
     for command in _COMMANDS:
         command.add_parser(commands)
     return parser
+
+
+class _PrintCompletion(argparse.Action):
+    """Print what a shell needs to complete commands, options and choices: source <(gripmon --print-completion bash)."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, _namespace: object, value: object, _option: str | None = None
+    ) -> None:
+        import shtab
+
+        print(shtab.complete(parser, str(value)))
+        parser.exit()
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -101,12 +117,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code: int = chosen.handler(chosen)
         sys.stdout.flush()
-    except CommandFailedError as error:
+    except (CommandFailedError, InputError, NoResultError) as error:
         print(error, file=sys.stderr)
         return error.exit_code
-    except (InputError, NoResultError) as error:
-        print(error, file=sys.stderr)
-        return EXIT_USAGE if isinstance(error, InputError) else EXIT_FAILED
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

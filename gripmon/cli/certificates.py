@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.io.wire.certificates import Issued
@@ -80,9 +81,9 @@ def make(arguments: argparse.Namespace) -> int:
         text = (
             "certificates: the package cryptography is missing; pip install -e '.[certificates]' in gripmon's checkout"
         )
-        raise common.CommandFailedError(text, common.EXIT_USAGE) from None
+        raise InputError(text) from None
     if arguments.rules and not arguments.robot:
-        raise common.CommandFailedError("certificates: --rules for whom? add --robot NAME", common.EXIT_USAGE)
+        raise InputError("certificates: --rules for whom? add --robot NAME")
     wanted = _wanted(arguments)
     folder = common.make_directory(Path(arguments.out))
     if arguments.rules:
@@ -101,7 +102,7 @@ def make(arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise common.not_writable(folder, error) from None
     except ValueError as error:
-        raise common.CommandFailedError(f"certificates: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"certificates: {error}") from None
     return common.EXIT_DONE
 
 
@@ -115,7 +116,7 @@ def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
             return dict.fromkeys(arguments.names, arguments.host) | {name: [] for name in robots}
         names = (*_CLIENTS, *(robots or names_of(_ROBOT)))
     except ValueError as error:
-        raise common.CommandFailedError(f"certificates: --robot: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"certificates: --robot: {error}") from None
     return {"router": [*_LOCAL, *arguments.host], **{name: [] for name in names}}
 
 
@@ -134,7 +135,7 @@ def _add_rules(path: Path, robots: list[str]) -> None:
         raise common.not_writable(path, error, "--rules") from None
     except ValueError as error:
         said = "is no text" if isinstance(error, UnicodeDecodeError) else str(error)
-        raise common.CommandFailedError(f"certificates: --rules {path} {said}", common.EXIT_USAGE) from None
+        raise InputError(f"certificates: --rules {path} {said}") from None
     which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
     print(f"{path}: {which}{'; restart the router' if text != before else ' already'}")
 

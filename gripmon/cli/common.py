@@ -11,13 +11,14 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gripmon.model.errors import InputError
+
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
 
 EXIT_DONE = 0
 EXIT_USAGE = 2
 EXIT_FAILED = 3
-EXIT_TAKEN = 4  # another monitor has the name
 EXIT_INTERRUPTED = 130
 RECORDING_PATIENCE_S = 30.0  # images that can wait outrun any camera: they wait for the recording, none is dropped
 EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
@@ -83,13 +84,10 @@ def seed(text: str) -> int:
 
 
 def load(path: str, *, check_source: bool = True, with_taught: bool = True) -> Config:
-    """The checked configuration in a file; a fault ends the command with exit code 2."""
-    from gripmon.daemon.config import ConfigError, load_config
+    """The checked configuration in a file."""
+    from gripmon.daemon.config import load_config
 
-    try:
-        return load_config(Path(path), check_source=check_source, with_taught=with_taught)
-    except ConfigError as error:
-        raise CommandFailedError(str(error), EXIT_USAGE) from None
+    return load_config(Path(path), check_source=check_source, with_taught=with_taught)
 
 
 def load_demo_or(path: str | None) -> Config:
@@ -104,17 +102,15 @@ def make_directory(path: Path, option: str = "--out") -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise CommandFailedError(
-            f"{option} {path}: can't be made ({error.strerror}); a directory to write to", EXIT_USAGE
-        ) from None
+        raise InputError(f"{option} {path}: can't be made ({error.strerror}); a directory to write to") from None
     if not os.access(path, os.W_OK | os.X_OK):
-        raise CommandFailedError(f"{option} {path}: may not be written to; a directory of your own", EXIT_USAGE)
+        raise InputError(f"{option} {path}: may not be written to; a directory of your own")
     return path
 
 
-def not_writable(path: Path, error: OSError, option: str = "--out") -> CommandFailedError:
+def not_writable(path: Path, error: OSError, option: str = "--out") -> InputError:
     """What to raise when a file for output can't be opened."""
-    return CommandFailedError(f"{option} {path}: can't be written ({error.strerror or error}); a file", EXIT_USAGE)
+    return InputError(f"{option} {path}: can't be written ({error.strerror or error}); a file")
 
 
 def check_file(path: Path, option: str = "--out") -> None:
@@ -125,10 +121,12 @@ def check_file(path: Path, option: str = "--out") -> None:
         raise not_writable(path, error, option) from None
 
 
-def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[[], None]]:
-    """A context that gives a function to call once for each step; it draws on stderr, and only for a person."""
+def progress_bar(total: int | None, unit: str) -> AbstractContextManager[Callable[..., None]]:
+    """A context that gives a function to call once for each step, with the total if that is known then; it draws on
+    stderr, and only for a person.
+    """
     if not sys.stderr.isatty():
-        return nullcontext(lambda: None)
+        return nullcontext(lambda *_total: None)
     return _TqdmSteps(total, unit)
 
 
@@ -144,17 +142,18 @@ def messages_above_bar(logger: str) -> AbstractContextManager[object]:
     return redirected
 
 
-class _TqdmSteps(AbstractContextManager[Callable[[], None]]):
+class _TqdmSteps(AbstractContextManager[Callable[..., None]]):
     def __init__(self, total: int | None, unit: str):
         from tqdm import tqdm
 
         self._bar = tqdm(total=total, unit=unit, file=sys.stderr, dynamic_ncols=True)
 
-    def __enter__(self) -> Callable[[], None]:
+    def __enter__(self) -> Callable[..., None]:
         return self._step
 
     def __exit__(self, *_exception: object) -> None:
         self._bar.close()
 
-    def _step(self) -> None:
+    def _step(self, total: int | None = None) -> None:
+        self._bar.total = total or self._bar.total
         self._bar.update()

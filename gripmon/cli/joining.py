@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
-from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.io.wire import PublishError
@@ -31,8 +31,6 @@ def misuse(arguments: argparse.Namespace) -> str:
     return "--connect has no effect beside --zenoh-config; one of them" if both else ""
 
 
-def failure(command: str, error: PublishError) -> common.CommandFailedError:
+def failure(command: str, error: PublishError) -> InputError:
     """What to raise when there is no session: it names the option, since no key was written."""
-    return common.CommandFailedError(
-        f"{command}: {_OPTIONS.get(error.key, error.key)}: {error.text}", common.EXIT_USAGE
-    )
+    return InputError(f"{command}: {_OPTIONS.get(error.key, error.key)}: {error.text}")

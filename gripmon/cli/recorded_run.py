@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import common
-from gripmon.cli.replay_differences import Differences
-from gripmon.cli.replaying import Past
 
 if TYPE_CHECKING:
     from gripmon.model.records import FrameRecord
@@ -38,6 +37,7 @@ class RecordedRun:
     def __init__(self, paths: list[Path], config_path: str | None, opened: contextlib.ExitStack) -> None:
         """``config_path`` None: the recorded configuration.  What is opened is closed with ``opened``."""
         from gripmon.daemon import recorded_run
+        from gripmon.daemon.replaying import Past
 
         given = None if config_path is None else common.load(config_path, check_source=False)
         self._run = run = recorded_run.RecordedRun(paths, given, opened)

@@ -4,26 +4,21 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import logging
 import math
 import sys
-import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sized
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
-from gripmon.cli import common, promising, second_run
-from gripmon.cli.one_recording import keep
-from gripmon.cli.recorded_run import RecordedRun, is_recording
-from gripmon.cli.replaying import NOTHING_BEFORE, replay
+from gripmon.cli import common, second_run
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config, SecondConfig
     from gripmon.io.sources import Source
     from gripmon.model.records import FrameRecord
-    from gripmon.record.write import Recorder
 
 _DESCRIPTION = """\
 Run recorded frames through the monitor and write one JSON line for every input frame, in input
@@ -96,6 +91,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon replay``."""
     import cv2
 
+    from gripmon.cli.recorded_run import RecordedRun, is_recording
+    from gripmon.daemon.forecast import limits_warning
+    from gripmon.daemon.one_recording import one_recording
+    from gripmon.daemon.replaying import NOTHING_BEFORE, replay
+    from gripmon.model.records import to_json
+
     cv2.setNumThreads(1)
     paths = [Path(name) for name in arguments.input]
     _refuse_empty_folder(paths)
@@ -109,16 +110,16 @@ def run(arguments: argparse.Namespace) -> int:
         opened.callback(source.close)
         out = opened.enter_context(_output(arguments.out))
         overlaid = recorded.compared_in(arguments.recording) if recorded and arguments.recording else None
-        recorder = opened.enter_context(overlaid or _recorder(arguments.recording, config))
-        if (said := promising.warning(config)) is not None:
-            print(f"replay: {said}", file=sys.stderr)
+        recorder = opened.enter_context(overlaid or one_recording(_recording_path(arguments.recording), config))
+        if (text := limits_warning(config)) is not None:
+            _say(text)
         counts = _Counts()
         try:
             step = opened.enter_context(
                 common.progress_bar(len(source) if isinstance(source, Sized) else None, "frame")
             )
-            for line, record in replay(config, source, recorder, recorded.past if recorded else NOTHING_BEFORE):
-                out.write(line)
+            for record in replay(source, config, recorder, recorded.past if recorded else NOTHING_BEFORE, _say):
+                out.write(to_json(record) + b"\n")
                 counts.add(record)
                 if recorded:
                     recorded.compare(record)
@@ -133,6 +134,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
     """The pulses of a second camera, on recorded frames."""
     from gripmon.cli import second_replay
+    from gripmon.cli.recorded_run import is_recording
 
     path = Path(arguments.input[0])
     wrong = ""
@@ -143,7 +145,7 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
     elif len(arguments.input) > 1 or is_recording([path]):
         wrong = f"{path}: no input for a second camera's configuration; one folder of images, or one video"
     if wrong:
-        raise common.CommandFailedError(wrong, common.EXIT_USAGE)
+        raise InputError(wrong)
     config = second_run.with_pulses(config)
     with contextlib.ExitStack() as opened:
         source = _open_input(path, arguments.fps)
@@ -164,19 +166,15 @@ def _refuse_empty_folder(paths: list[Path]) -> None:
         try:
             images = any(entry.suffix.lower() in IMAGE_SUFFIXES for entry in path.iterdir())
         except OSError as error:
-            raise common.CommandFailedError(f"{path}: can't be read ({error.strerror})", common.EXIT_USAGE) from None
+            raise InputError(f"{path}: can't be read ({error.strerror})") from None
         if not images:
-            raise common.CommandFailedError(
-                f"{path}: no recordings and no images in it; .rrd files, or images such as *.png, *.jpg, *.tif, *.pgm",
-                common.EXIT_USAGE,
-            )
+            right = ".rrd files, or images such as *.png, *.jpg, *.tif, *.pgm"
+            raise InputError(f"{path}: no recordings and no images in it; {right}")
 
 
 def _given_config(path: Path, name: str | None) -> Config:
     if name is None:
-        raise common.CommandFailedError(
-            f"{path}: only a recording brings its own configuration; --config CONFIG", common.EXIT_USAGE
-        )
+        raise InputError(f"{path}: only a recording brings its own configuration; --config CONFIG")
     return common.load(name, check_source=False)
 
 
@@ -227,21 +225,18 @@ class _Counts:
 
 
 def _open_input(path: Path, fps: float | None) -> Source:
-    import msgspec
-
     from gripmon.io.sources import SourceError, open_source, settings_for_path
 
     if not path.exists():
-        raise common.CommandFailedError(
-            f"{path}: there is no such file or folder; a folder of images, a video or an .rrd", common.EXIT_USAGE
-        )
+        raise InputError(f"{path}: there is no such file or folder; a folder of images, a video or an .rrd")
     try:
-        settings = settings_for_path(path)
-        if fps is not None:
-            settings = msgspec.structs.replace(settings, fps=fps)
-        return open_source(settings)
+        return open_source(settings_for_path(path, fps))
     except SourceError as error:
-        raise common.CommandFailedError(f"{path}: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"{path}: {error}") from None
+
+
+def _say(text: str) -> None:
+    print(f"replay: {text}", file=sys.stderr)
 
 
 class _Lines:
@@ -266,7 +261,7 @@ class _Lines:
         except BrokenPipeError:
             raise  # a reader that has seen enough is no fault
         except OSError as error:
-            raise common.CommandFailedError(f"--out {self._name}: writing failed ({error.strerror})") from None
+            raise NoResultError(f"--out {self._name}: writing failed ({error.strerror})") from None
 
 
 @contextmanager
@@ -291,68 +286,11 @@ def _output(name: str) -> Iterator[_Lines]:
             file.close()
 
 
-@contextmanager
-def _recorder(name: str | None, config: Config) -> Iterator[Recorder]:
-    """A recorder into exactly one file, finished when the context ends; the null recorder without a name."""
-    import msgspec
-
-    from gripmon.daemon.config.recorded import to_recorded
-    from gripmon.record.write import NullRecorder, open_recorder
-
+def _recording_path(name: str | None) -> Path | None:
     if name is None:
-        yield NullRecorder()
-        return
+        return None
     path = Path(name)
-    # One file, whatever its length.
-    settings = msgspec.structs.replace(
-        config.settings.recording, enabled=True, max_file_bytes=2**62, max_file_s=math.inf, budget_bytes=0
-    )
     if path.is_dir():
-        raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+        raise InputError(f"--recording {path}: is a folder; a file")
     common.make_directory(path.parent, "--recording")
-    with contextlib.ExitStack() as opened:
-        try:
-            scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
-        except OSError as error:
-            raise common.not_writable(path, error, "--recording") from None
-        recorder = open_recorder(
-            settings,
-            robot=config.settings.robot,
-            camera_name=config.settings.camera_name,
-            camera=config.camera,
-            gripper=config.gripper,
-            reference=config.reference,
-            directory=Path(scratch),
-            name=path.stem,
-            patience_s=common.RECORDING_PATIENCE_S,
-            configuration=to_recorded(config),
-        )
-        opened.enter_context(_told_at_the_end())
-        try:
-            yield recorder
-        finally:
-            recorder.close(timeout_s=60.0)
-            # A disk that failed for a moment has left a whole file of the frames after it.
-            missing = _missing(recorder)
-            keep(sorted(Path(scratch).glob("*.rrd")), path, recorder.failure or missing, whole=missing is None)
-
-
-def _missing(recorder: Recorder) -> str | None:
-    """What is not in a recording that is to hold all; None if nothing is missing."""
-    if recorder.dropped:
-        return f"{recorder.dropped} frames are missing"
-    return f"{recorder.images_dropped} images are missing" if recorder.images_dropped else None
-
-
-@contextmanager
-def _told_at_the_end() -> Iterator[None]:
-    """What a daemon logs of its recording while it goes on, a replay says in one line when it is over."""
-    logger = logging.getLogger("gripmon.record.write")
-    propagates, silent = logger.propagate, logging.NullHandler()
-    logger.addHandler(silent)
-    logger.propagate = False
-    try:
-        yield
-    finally:
-        logger.propagate = propagates
-        logger.removeHandler(silent)
+    return path

@@ -41,13 +41,14 @@ def add_parser(commands: Any) -> None:
 def route(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon router``."""
     from gripmon.io.wire import Router, ZenohFileError
+    from gripmon.model.errors import InputError
     from gripmon.model.stopping import signals_exit
 
     with signals_exit():
         try:
             router = Router(Path(arguments.config))
         except ZenohFileError as error:
-            raise common.CommandFailedError(f"router: {error}", common.EXIT_USAGE) from None
+            raise InputError(f"router: {error}") from None
         with router:
             try:
                 _say(f"listening on {', '.join(router.listens_on)}")

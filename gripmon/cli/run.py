@@ -3,24 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import dataclasses
-import logging
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from gripmon.cli import camera_source, common, promising, second_run, viewing
+from gripmon.cli import common, second_run, viewing
+from gripmon.model.errors import InputError
 from gripmon.model.stopping import StopRequest, signals_exit
-
-if TYPE_CHECKING:
-    from gripmon.daemon.config import Config
-    from gripmon.judge.statefile import StateFile
-    from gripmon.model.records import Alert, MonitorState
-    from gripmon.monitor import Monitor
-    from gripmon.record.write import Recorder
-
-_log = logging.getLogger(__name__)
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -93,7 +81,7 @@ def _run(arguments: argparse.Namespace, stop: StopRequest) -> int:
     if second is not None:
         if arguments.fresh_state:
             text = f"run: --fresh-state is for wrist cameras, {arguments.config} is a second camera's; leave it out"
-            raise common.CommandFailedError(text, common.EXIT_USAGE)
+            raise InputError(text)
         out = None if arguments.out is None else common.make_directory(Path(arguments.out))
         return second_run.run_second(
             second,
@@ -104,10 +92,16 @@ def _run(arguments: argparse.Namespace, stop: StopRequest) -> int:
             take_over=arguments.take_over,
             stop=stop,
         )
+    from gripmon.daemon.camera_source import look_ahead
+    from gripmon.daemon.starting import run_monitor
+
     config = common.load(arguments.config)
-    camera_source.look_ahead(config)
+    look_ahead(config)
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
-    return run_daemon(
+    if out is not None:
+        common.check_file(out / "estimates.jsonl")
+    view = None if arguments.view is None else viewing.LiveView(config.settings.view, arguments.view, str(config.path))
+    return run_monitor(
         config,
         out=out,
         duration_s=arguments.duration,
@@ -115,164 +109,7 @@ def _run(arguments: argparse.Namespace, stop: StopRequest) -> int:
         warns=True,
         keep_state=True,
         fresh_state=arguments.fresh_state,
-        view=arguments.view,
+        view=view,
         take_over=arguments.take_over,
         stop=stop,
     )
-
-
-def run_daemon(
-    config: Config,
-    *,
-    out: Path | None,
-    stop: StopRequest,
-    duration_s: float | None = None,
-    verbose: bool = False,
-    recording_name: str | None = None,
-    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None = None,
-    on_network: Callable[[], None] = lambda: None,
-    warns: bool = False,
-    keep_state: bool = False,
-    fresh_state: bool = False,
-    view: str | None = None,
-    take_over: bool = False,
-) -> int:
-    """Open everything that a configuration names and run the daemon on it; returns the exit code.
-
-    ``stop``: from :func:`gripmon.model.stopping.signals_exit`, in which this is called.
-    ``truth_tcp_m``, which a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it
-    goes into the recording.  ``on_network`` is called when the publisher is open, before the camera is.
-    ``warns``: it is logged when the view can't keep the alert limits.  ``keep_state``: what survives a restart is read
-    from the configuration's state file, unless ``fresh_state``, and kept there.  ``view`` is one of
-    :data:`gripmon.cli.viewing.KINDS`; ``take_over``: see :func:`gripmon.cli.network.open_network`.
-    """
-    import cv2
-
-    from gripmon import daemon
-    from gripmon.cli.network import open_network, with_metrics, with_source
-    from gripmon.monitor import Monitor
-
-    settings = config.settings
-    estimates = None if out is None else out / "estimates.jsonl"
-    if estimates is not None:
-        common.check_file(estimates)
-    cv2.setNumThreads(1)
-    daemon.log_to_stderr(verbose=verbose)
-    if warns and (said := promising.warning(config)) is not None:
-        _log.warning("%s", said)
-    live = None if view is None else viewing.LiveView(settings.view, view, str(config.path))
-    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
-        kept = _open_state(config, fresh=fresh_state) if keep_state else None
-        if kept is not None:
-            opened.callback(kept.close)
-            config = dataclasses.replace(config, reference=kept.configured)
-        state = None if kept is None else kept.state
-        keeper = daemon.StateKeeper(kept)
-        monitor = Monitor(
-            config.camera, config.gripper, settings.monitor, config.reference, config.taught_edges, state,
-            keeper.references,
-        )  # fmt: skip
-        if monitor.look_refused is not None:
-            _log.warning("%s", monitor.look_refused)
-        network = open_network(config, take_over=take_over)
-        opened.callback(network.publisher.close)
-        publisher = with_metrics(config, network.publisher)
-        opened.callback(publisher.close)
-        on_network()
-        source = camera_source.open_source(config, network.link)
-        opened.callback(source.close)
-        patience_s = 0.0 if source.live else common.RECORDING_PATIENCE_S
-        recorder = _open_recorder(config, monitor, state, out, recording_name, truth_tcp_m, live, patience_s)
-        opened.callback(recorder.close)
-        if live is not None:
-            live.open(viewed)
-        opened.pop_all()  # from here on the daemon closes them
-        return daemon.run(
-            monitor,
-            source,
-            publisher,
-            recorder,
-            settings.daemon,
-            robot=settings.robot,
-            camera=settings.camera_name,
-            estimates=estimates,
-            jaw=network.jaw,
-            keeper=keeper,
-            commands=network.commands,
-            reports=dataclasses.replace(
-                with_source(network.reports, source), alert_limit_m=settings.monitor.policy.alert_limit_m
-            ),
-            notices=_notices(kept),
-            duration_s=duration_s,
-            stop=stop,
-        )
-
-
-def _open_state(config: Config, *, fresh: bool) -> StateFile | None:
-    """The file for what survives a restart; None without one."""
-    from gripmon.judge.statefile import StateFile, StateFileError
-    from gripmon.model.records import MonitorState
-
-    path = config.state_path
-    if path is None:
-        return None
-    try:
-        kept = StateFile(path, config.state_owner, config.reference, fresh=fresh)
-    except StateFileError as error:
-        raise common.CommandFailedError(f"{config.path}: state.file: {error}", common.EXIT_USAGE) from None
-    if kept.configured.revision != config.reference.revision:
-        # The one who knew the revisions so far was set aside, and what follows may fail: a camera that can't be opened.
-        kept.write(MonitorState((kept.configured,)))
-    return kept
-
-
-def _notices(kept: StateFile | None) -> list[Alert]:
-    """What was found at the start, as alerts."""
-    from gripmon.model.records import Alert, AlertKind, Cause, Severity
-
-    texts = () if kept is None else kept.notices
-    return [Alert(AlertKind.RESTARTED, Cause.UNKNOWN, Severity.WARNING, text) for text in texts]
-
-
-def _open_recorder(
-    config: Config,
-    monitor: Monitor,
-    state: MonitorState | None,
-    out: Path | None,
-    name: str | None,
-    truth_tcp_m: Callable[[int], tuple[float, float, float]] | None,
-    live: viewing.LiveView | None,
-    patience_s: float,
-) -> Recorder:
-    from gripmon.daemon.config.recorded import to_recorded
-    from gripmon.record.write import open_recorder
-
-    settings = config.settings
-    try:
-        configuration = to_recorded(config, state)
-    except OSError as error:
-        text = f"{config.path}: {error.filename}: can't be read any more ({error.strerror})"
-        raise common.CommandFailedError(text, common.EXIT_USAGE) from None
-    try:
-        return open_recorder(
-            settings.recording,
-            robot=settings.robot,
-            camera_name=settings.camera_name,
-            camera=config.camera,
-            gripper=config.gripper,
-            reference=monitor.reference,
-            directory=out,
-            name=name,
-            truth_tcp_m=truth_tcp_m,
-            patience_s=patience_s,
-            configuration=configuration,
-            view=None if live is None else live.settings,
-        )
-    except OSError as error:
-        if out is not None:
-            raise common.not_writable(out, error) from None
-        raise common.CommandFailedError(
-            f"{config.path}: recording.directory: {settings.recording.directory} can't be made ({error.strerror}); "
-            "a folder that may be written",
-            common.EXIT_USAGE,
-        ) from None

@@ -38,12 +38,11 @@ def add_parser(commands: Any) -> None:
 
 def schema(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon schema``."""
+    from gripmon.model.errors import InputError
     from gripmon.model.records import MESSAGES, json_schema, schema_name, summary
 
     if arguments.list and arguments.message:
-        raise common.CommandFailedError(
-            f"schema: --list is about all messages, but {arguments.message} is given; one of them", common.EXIT_USAGE
-        )
+        raise InputError(f"schema: --list is about all messages, but {arguments.message} is given; one of them")
     names = tuple(MESSAGES) if arguments.message is None else (arguments.message,)
     if arguments.list:
         for name in names:

@@ -6,7 +6,7 @@ import json
 import math
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import check_laser, findings, outside
+from gripmon.cli import check_laser, check_text
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import SecondConfig
@@ -14,21 +14,26 @@ if TYPE_CHECKING:
 
 def run(config: SecondConfig, *, as_json: bool, verbose: bool) -> int:
     """Print what the configuration comes to; returns the exit code."""
+    import msgspec
+
+    from gripmon.daemon.findings import second_findings
+    from gripmon.daemon.surroundings import surroundings
+
     watch = config.settings.laser.watch
+    around = surroundings(config)
     report = {
         **_values(config),
         "foreseen": check_laser.expectation(str(config.calibration_path), config.calibration, watch),
-        **outside.values(config),
-        "zenoh": outside.zenoh_values(config),
-        "source": outside.source_report(config),
+        **msgspec.to_builtins(around),
     }
-    found = findings.of_second(report)
+    found = second_findings(report, around)
     if as_json:
-        print(json.dumps({"findings": findings.plain(found), **report}, indent=2))
+        print(json.dumps({"findings": [each._asdict() for each in found], **report}, indent=2))
     else:
-        lines = findings.lines(report["config"], found)
-        print("\n".join([*lines, "", *_details(report)] if verbose else lines))
-    return findings.exit_code(found)
+        lines = check_text.lines(report["config"], found)
+        more = [*_details(report), *check_text.surrounding_lines(around)]
+        print("\n".join([*lines, "", *more] if verbose else lines))
+    return check_text.exit_code(found)
 
 
 def _values(config: SecondConfig) -> dict[str, Any]:
@@ -81,7 +86,7 @@ def _details(report: dict[str, Any]) -> list[str]:
     }
     lines = [f"{name:<10} {text}" for name, text in sections.items()]
     lines += check_laser.expectation_lines(report["foreseen"])[1:]
-    return [*lines, *outside.lines(report)]
+    return lines
 
 
 def _calibration_line(calibration: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.cli import camera_source, common
+from gripmon.cli import common
 from gripmon.cli.viewing import LiveView
 from gripmon.model.stopping import StopRequest
 
@@ -58,7 +58,8 @@ def run_second(
     import cv2
 
     from gripmon import daemon
-    from gripmon.cli.network import with_source
+    from gripmon.daemon import camera_source
+    from gripmon.daemon.network import with_source
 
     settings, laser = config.settings, config.settings.laser
     camera_source.look_ahead(config)
@@ -101,7 +102,7 @@ def run_second(
 
 
 def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
-    """Open all of it; ends the command as :func:`gripmon.cli.network.open_network` does."""
+    """Open all of it; ends the command as :func:`gripmon.daemon.network.open_network` does."""
     from gripmon.daemon import Reports
     from gripmon.daemon.config import ConfigError, check_second_network
     from gripmon.io.publish import NullPublisher
@@ -124,8 +125,8 @@ def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
 
 
 def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
-    from gripmon.cli.network import alone
     from gripmon.daemon import Reports
+    from gripmon.daemon.network import alone
     from gripmon.io.publish import ZenohCommands, ZenohPulses, ZenohSpotPublisher
 
     settings = config.settings
@@ -146,7 +147,7 @@ def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
 
 def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
-    from gripmon.cli.network import metrics_server
+    from gripmon.daemon.network import metrics_server
     from gripmon.io.publish import SpotPublishers
 
     metrics = metrics_server(config)

@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common, joining, snapshots
+from gripmon.cli import common, joining
 from gripmon.cli.fleet_table import printable
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.model.records import CommandReply, MonitorState, ReferenceRecord
@@ -68,8 +69,10 @@ def add_parser(commands: Any) -> None:
 
 def send(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon send``."""
+    from gripmon.client import snapshots
+
     if wrong := _misuse(arguments):
-        raise common.CommandFailedError(f"send: {wrong}", common.EXIT_USAGE)
+        raise InputError(f"send: {wrong}")
     out = None if arguments.out is None else common.make_directory(Path(arguments.out))
     if out is not None:
         snapshots.check_table(out)
@@ -120,7 +123,7 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
     except PublishError as error:
         raise joining.failure("send", error) from None
     except ValueError as error:
-        raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"send: {error}") from None
     with client:
         try:
             if arguments.out is not None:
@@ -131,13 +134,13 @@ def _ask(arguments: argparse.Namespace) -> tuple[CommandReply, bytes | None]:
             )
             return reply, None
         except ValueError as error:
-            raise common.CommandFailedError(f"send: {error}", common.EXIT_USAGE) from None
+            raise InputError(f"send: {error}") from None
         except Ambiguous as error:
             option = {"camera": "--camera", "monitor_id": "--monitor ID"}[error.argument]
-            raise common.CommandFailedError(f"send: {error} ({option})", common.EXIT_USAGE) from None
+            raise InputError(f"send: {error} ({option})") from None
         except NotCarriedOut as error:
             again = f" (--request {error.request_id})" if error.fault is CommandFault.TIMEOUT else ""
-            raise common.CommandFailedError(f"send: {printable(str(error))}{again}", common.EXIT_FAILED) from None
+            raise NoResultError(f"send: {printable(str(error))}{again}") from None
 
 
 def _table(state: MonitorState) -> list[str]:

@@ -4,29 +4,41 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gripmon import __version__
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.simulate import Scenario
+    from gripmon.daemon.simulating import SimulatedImages
 
 _DESCRIPTION = """\
 Write a simulated sequence: one PNG a frame, timestamps.csv (file, stamp_ns, jaw_opening_m as the robot
 reports it), truth.jsonl (per frame cam_T_grip, TCP shift, jaw opening, corner pixels and what hides
 them; m, px), and config.yaml with gripper.yaml, so that gripmon replay works at once.  The same seed
-gives the same images."""
+gives the same images.
+
+For the way from a new gripper to a running monitor without any hardware, all of one camera and gripper:
+plate        a calibration plate, tilted to all sides, for gripmon calibrate intrinsics
+standing     the gripper stands on the plate; rough.yaml has its corners as a person would put them
+work         the gripper at work before clutter; in the middle something knocks the camera by 0.9 mm
+robot_world  a board from many poses of the robot (views.csv), for gripmon calibrate robot-world
+spots        a second camera: its plate, laser spots (spots.csv), and spots after a knock (fresh.csv)
+truth.json (of work: truth.jsonl) holds the truth beside the images; no step reads it."""
 
 _EXAMPLES = """\
   gripmon simulate --list
   gripmon simulate bump --out bump/ --seed 3
   gripmon simulate creep --out creep/ --seconds 60 --fps 10
   gripmon simulate my_scenario.yaml --config my_robot.yaml --out mine/
-  gripmon replay bump/ --config bump/config.yaml --out bump.jsonl"""
+  gripmon replay bump/ --config bump/config.yaml --out bump.jsonl
+
+inputs for every step from a new gripper to a running monitor
+  gripmon simulate plate --out plate
+  gripmon simulate standing --out standing
+  gripmon simulate work --out work"""
 
 
 def add_parser(commands: Any) -> None:
@@ -53,100 +65,50 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon simulate``."""
-    from gripmon.simulate import SCENARIO_NAMES, Simulator, write_sequence
+    from gripmon.daemon.simulating import simulate_images
+    from gripmon.simulate import CALIBRATION_KINDS, SCENARIO_NAMES
 
     if arguments.list:
-        print("\n".join(SCENARIO_NAMES))
+        print("\n".join((*SCENARIO_NAMES, *CALIBRATION_KINDS)))
         return common.EXIT_DONE
-    if arguments.scenario is None or arguments.out is None:
-        raise common.CommandFailedError(
-            "simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/", common.EXIT_USAGE
-        )
+    kind = arguments.scenario
+    if kind is None or arguments.out is None:
+        raise InputError("simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/")
     config = common.load_demo_or(arguments.config)
-    scenario = _scenario(arguments, config)
-    out = _empty_directory(Path(arguments.out))
-    try:
-        simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, scenario, arguments.seed)
-    except ValueError as error:
-        raise common.CommandFailedError(f"{arguments.scenario}: {error}", common.EXIT_USAGE) from None
-    shutil.copyfile(config.gripper_path, out / "gripper.yaml")
-    (out / "config.yaml").write_text(_config_text(config, scenario, arguments), encoding="utf-8")
-    with common.progress_bar(simulator.frame_count, "frame") as step:
-        count = write_sequence(simulator, out, lambda _done, _total: step())
-    replay = shlex.join(["gripmon", "replay", str(out), "--config", str(out / "config.yaml"), "--out", f"{out}.jsonl"])
-    print(f"{count} frames in {out}; next: {replay}")
+    single = kind in CALIBRATION_KINDS
+    with common.progress_bar(None, "image" if single else "frame") as step:
+        made = simulate_images(
+            kind,
+            Path(arguments.out),
+            config=config,
+            seed=arguments.seed,
+            duration_s=arguments.seconds,
+            fps=arguments.fps,
+            step=lambda _done, total: step(total),
+        )
+    print(f"{made.frames} {'images' if single else 'frames'} in {made.folder}; next: {_next_step(kind, made, config)}")
     return common.EXIT_DONE
 
 
-def _scenario(arguments: argparse.Namespace, config: Config) -> Scenario:
-    from gripmon.daemon.config import ConfigError, load_scenario
-    from gripmon.simulate import make_scenario
+def _next_step(kind: str, made: SimulatedImages, config: Config) -> str:
+    """The command that takes these images."""
+    from gripmon.model.targets import name_of
+    from gripmon.simulate.calibration_images import BOARD, PLATE, SECOND_PLATE
 
-    name: str = arguments.scenario
-    if Path(name).suffix in (".yaml", ".yml"):
-        if arguments.seconds is not None or arguments.fps is not None:
-            raise common.CommandFailedError(
-                f"{name}: --seconds and --fps are for built-in scenarios; duration_s and fps in the file",
-                common.EXIT_USAGE,
-            )
-        try:
-            return load_scenario(Path(name))
-        except ConfigError as error:
-            raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
-    try:
-        return make_scenario(name, duration_s=arguments.seconds, fps=arguments.fps, finger=config.gripper.finger_ids[0])
-    except ValueError as error:
-        raise common.CommandFailedError(f"simulate: {error}", common.EXIT_USAGE) from None
-
-
-def _empty_directory(path: Path) -> Path:
-    common.make_directory(path)
-    if any(path.iterdir()):
-        raise common.CommandFailedError(f"--out {path}: is not empty; a new or empty folder", common.EXIT_USAGE)
-    return path
-
-
-def _config_text(config: Config, scenario: Scenario, arguments: argparse.Namespace) -> str:
-    """A configuration for the sequence, commented, in the form of the hand-written ones."""
-    import msgspec
-
-    camera = msgspec.to_builtins(config.settings.camera)
-    x, y, z, w = config.reference.cam_T_grip.rotation_xyzw
-    lens = "\n".join(f"  {key}: {_yaml(value)}  # {_LENS_UNITS[key]}" for key, value in camera.items())
-    jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
-    return f"""\
-# Written by: gripmon simulate {scenario.name} --seed {arguments.seed} (gripmon {__version__})
-robot: simulated  # name of the robot in the Zenoh keys
-camera_name: wrist  # name of the camera in the Zenoh keys
-camera:
-{lens}
-gripper: gripper.yaml  # path of the gripper file, relative to this file
-reference:
-  cam_T_grip:  # what a perfect calibration gave at the beginning: maps gripper coordinates to camera coordinates
-    translation_m: {_yaml(list(config.reference.cam_T_grip.translation_m))}  # x, y, z (m)
-    rotation_xyzw: {_yaml([x, y, z, w])}  # unit quaternion x, y, z, w
-jaw:
-  source: {jaw}  # the opening comes with each frame (timestamps.csv), or is the nominal one if fixed
-source:
-  kind: folder  # images in a folder
-  path: .  # the folder, relative to this file
-"""
-
-
-_LENS_UNITS = {
-    "model": "lens model: paper, brown_conrady or fisheye",
-    "width_px": "image width (px)",
-    "height_px": "image height (px)",
-    "fx_px": "focal length over the pixel's width (px)",
-    "fy_px": "focal length over the pixel's height (px)",
-    "cx_px": "column of the principal point (px)",
-    "cy_px": "row of the principal point (px)",
-    "kappa_per_px2": "radial distortion (1/px²)",
-    "coefficients": "distortion in OpenCV's order (no unit)",
-}
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_yaml, value))}]"
-    return repr(value) if isinstance(value, float) else str(value)
+    folder, gripper = shlex.quote(str(made.folder)), config.gripper
+    jaw = f"--jaw-range {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g} " if gripper.has_jaw else ""
+    follows = {
+        "plate": f"gripmon calibrate intrinsics {folder} --target {name_of(PLATE)} --model paper --out camera.yaml",
+        "standing": f"gripmon calibrate plane {folder} --target camera.yaml --camera camera.yaml --corners "
+        f"{folder}/rough.yaml --infer {jaw}--gripper-out gripper.yaml --out hand_eye.yaml",
+        "work": f"gripmon teach {folder}/000000.png --corners standing/rough.yaml --camera camera.yaml "
+        "--gripper gripper.yaml --reference hand_eye.yaml --robot arm1 --out mine",
+        "robot_world": f"gripmon calibrate robot-world {folder}/views.csv --camera camera.yaml --target "
+        f"{name_of(BOARD)} --eye-in-hand --out robot_world.yaml",
+        "spots": f"gripmon calibrate intrinsics {folder}/plate --target {name_of(SECOND_PLATE)} --out second.yaml, "
+        f"then gripmon calibrate laser {folder}/spots.csv --camera second.yaml --out laser.yaml",
+    }
+    if made.config is None:
+        return follows[kind]
+    out = str(made.folder)
+    return shlex.join(["gripmon", "replay", out, "--config", str(made.config), "--out", f"{out}.jsonl"])

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli import common, sweep_table
-from gripmon.cli.margins import rig_of
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -75,7 +75,7 @@ def refuse_without_sweep(arguments: argparse.Namespace) -> None:
     """End the command if an option of the sweep stands alone."""
     for name in _OPTIONS:
         if getattr(arguments, name) is not None:
-            raise common.CommandFailedError(f"--{name}: only has a meaning for a sweep; add --sweep", common.EXIT_USAGE)
+            raise InputError(f"--{name}: only has a meaning for a sweep; add --sweep")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -86,23 +86,16 @@ def run(arguments: argparse.Namespace) -> int:
     picture = None if arguments.picture is None else Path(arguments.picture)
     if picture is not None:
         _check_picture(picture)
-    from gripmon.teach.forecast import Mount, tried, try_mount
+    from gripmon.daemon.forecast import rig_of
+    from gripmon.daemon.sweeping import as_plain, sweep
     from gripmon.teach.forecast.picture import draw_sweep
 
-    opening_m = config.jaw_opening_m
-    present = try_mount(rig_of(config), Mount.of(config.cam_T_grip), -1, config.cam_T_grip, opening_m, travel_m)
-    trials = []
     with common.progress_bar(len(grid), "mount") as step:
-        for trial in tried(grid, opening_m, travel_m):
-            trials.append(trial)
-            step()
-    ranked = sorted(trials, key=lambda trial: trial.rank)
-    if arguments.json:
-        print(json.dumps(sweep_table.as_json(config, grid, at_px, present, ranked), indent=2))
-    else:
-        print("\n".join(sweep_table.as_text(config, grid, at_px, present, ranked)))
+        swept = sweep(config, grid, at_px, travel_m, step)
+    print(json.dumps(as_plain(swept), indent=2) if arguments.json else "\n".join(sweep_table.as_text(swept)))
     if picture is not None:
-        _write(picture, draw_sweep(rig_of(config), grid, present, trials, opening_m))
+        drawn = draw_sweep(rig_of(config), grid, swept.present, list(swept.trials), config.jaw_opening_m)
+        _write(picture, drawn)
         if not arguments.json:
             print(f"picture    {picture}")
     return common.EXIT_DONE
@@ -110,7 +103,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check_picture(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise common.CommandFailedError(f"--picture {path}: is no kind of picture; .png or .jpg", common.EXIT_USAGE)
+        raise InputError(f"--picture {path}: is no kind of picture; .png or .jpg")
     if path.is_dir() or not os.access(path.parent, os.W_OK | os.X_OK):
         raise common.not_writable(path, OSError("is a folder" if path.is_dir() else "no such place"), "--picture")
 
@@ -127,6 +120,7 @@ def _write(path: Path, picture: Image) -> None:
 
 
 def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
+    from gripmon.daemon.forecast import rig_of
     from gripmon.teach.forecast import Grid, Mount, towards
 
     present, rig = Mount.of(config.cam_T_grip), rig_of(config)
@@ -141,7 +135,7 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
     try:
         directions = tuple(towards(camera, _same_place(at_px, config.camera, camera)) for camera in cameras)
     except ValueError as error:
-        raise common.CommandFailedError(f"--at: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"--at: {error}") from None
     grid = Grid(
         distances_m,
         tuple(math.radians(v) for v in tilts),
@@ -151,9 +145,7 @@ def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[fl
         directions,
     )
     if len(grid) > _MOST_MOUNTS:
-        raise common.CommandFailedError(
-            f"--sweep: {len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis", common.EXIT_USAGE
-        )
+        raise InputError(f"--sweep: {len(grid)} mounts; at most {_MOST_MOUNTS}, with fewer values on an axis")
     return grid, at_px
 
 
@@ -164,13 +156,13 @@ def _travel(config: Config, text: str | None) -> tuple[float, float] | None:
         return None
     right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
     if not gripper.jaw_max_m > gripper.jaw_min_m:
-        raise common.CommandFailedError("--jaw: the gripper's jaw doesn't move; leave it out", common.EXIT_USAGE)
+        raise InputError("--jaw: the gripper's jaw doesn't move; leave it out")
     try:
         low_m, high_m = (float(part) for part in text.split(":"))
     except ValueError:
-        raise common.CommandFailedError(f"--jaw {text}: is no range; {right}", common.EXIT_USAGE) from None
+        raise InputError(f"--jaw {text}: is no range; {right}") from None
     if not gripper.jaw_min_m <= low_m < high_m <= gripper.jaw_max_m:
-        raise common.CommandFailedError(f"--jaw {text}: is not in the jaw's travel; {right}", common.EXIT_USAGE)
+        raise InputError(f"--jaw {text}: is not in the jaw's travel; {right}")
     return low_m, high_m
 
 
@@ -200,7 +192,7 @@ def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
     try:
         return [with_focal(camera, focal_px) for focal_px in focals_px]
     except ValueError as error:
-        raise common.CommandFailedError(f"{option} {text}: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"{option} {text}: {error}") from None
 
 
 def _calibrated(path: Path) -> Camera:
@@ -212,7 +204,7 @@ def _calibrated(path: Path) -> Camera:
     try:
         return make_camera(read_camera(path).camera)
     except (ConfigError, ValueError) as error:
-        raise common.CommandFailedError(f"--lens {error}", common.EXIT_USAGE) from None
+        raise InputError(f"--lens {error}") from None
 
 
 def _same_place(at_px: tuple[float, float], camera: Camera, other: Camera) -> tuple[float, float]:
@@ -232,14 +224,10 @@ def _spot(config: Config, text: str | None) -> tuple[float, float]:
         try:
             u, v = (float(part) for part in text.split(","))
         except ValueError:
-            raise common.CommandFailedError(
-                f"--at {text}: is no point of the image; {right}", common.EXIT_USAGE
-            ) from None
+            raise InputError(f"--at {text}: is no point of the image; {right}") from None
         where = "lies at"
     if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
-        raise common.CommandFailedError(
-            f"--at: {where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}", common.EXIT_USAGE
-        )
+        raise InputError(f"--at: {where} ({u:.1f}, {v:.1f}) px, outside of the image; {right}")
     return u, v
 
 
@@ -256,9 +244,9 @@ def _values(option: str, text: str, lowest: float, highest: float, unit: str) ->
         else:
             values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise common.CommandFailedError(f"{option} {text}: is no range; {right}", common.EXIT_USAGE) from None
+        raise InputError(f"{option} {text}: is no range; {right}") from None
     wrong = [v for v in values if not lowest <= v <= highest]
     if wrong or len(values) > _MOST_VALUES:
         what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
-        raise common.CommandFailedError(f"{option} {text}: {what}; {right}", common.EXIT_USAGE)
+        raise InputError(f"{option} {text}: {what}; {right}")
     return tuple(sorted(set(values)))

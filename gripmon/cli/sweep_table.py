@@ -1,82 +1,18 @@
-"""What a sweep of camera mounts says: a table for a person, plain values for JSON."""
+"""What a sweep of camera mounts says, as a table."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
+    from gripmon.daemon.sweeping import Sweep
     from gripmon.model.camera import Camera
-    from gripmon.teach.forecast import Grid, Trial
+    from gripmon.teach.forecast import Trial
 
 _SHOWN = 8
 _REASONS_SHOWN = 4
-
-
-def as_json(
-    config: Config, grid: Grid, at_px: tuple[float, float], present: Trial, ranked: list[Trial]
-) -> dict[str, Any]:
-    return {
-        "config": str(config.path),
-        "tcp_at_px": list(at_px),
-        "jaw_opening_m": config.jaw_opening_m,
-        "warn_m": config.settings.monitor.policy.warn_m,
-        "limit_m": config.settings.monitor.policy.limit_m,
-        "alert_limit_m": config.settings.monitor.policy.alert_limit_m,
-        "alert_limit_rad": config.settings.monitor.policy.alert_limit_rad,
-        "present": _trial_values(config.camera, present),
-        "mounts": [_trial_values(grid.rigs[trial.lens].camera, trial) for trial in ranked],
-    }
-
-
-def _trial_values(camera: Camera, trial: Trial) -> dict[str, Any]:
-    from gripmon.model.geometry import to_record
-    from gripmon.teach.forecast import field_of_view_rad, weakest_direction
-
-    transform, covariance = to_record(trial.cam_T_grip), trial.covariance
-    sigma = weakest = None
-    if covariance is not None and trial.lever_m is not None:
-        sigma = [math.sqrt(v) for v in covariance.diagonal().tolist()]
-        weakest = weakest_direction(covariance, trial.lever_m).tolist()
-    smallest = None if trial.smallest is None else trial.smallest.tolist()
-    angle = field_of_view_rad(camera)
-    return {
-        **trial.mount._asdict(),
-        "image_px": [camera.width_px, camera.height_px],
-        "focal_px": camera.fx_px,
-        "field_of_view_rad": None if math.isnan(angle) else angle,
-        "cam_T_grip": {
-            "translation_m": list(transform.translation_m),
-            "rotation_xyzw": list(transform.rotation_xyzw),
-        },
-        "works": trial.works,
-        "reasons": list(trial.reasons),
-        "corners": trial.sight.corners,
-        "edges": trial.sight.edges,
-        "jaw": {
-            "opening_m": trial.openings_m.tolist(),
-            "corners": trial.corners.tolist(),
-            "edges": trial.edges.tolist(),
-            "share": trial.share,
-        },
-        "sigma": None if sigma is None else {"tcp_m": sigma[:3], "rotation_rad": sigma[3:]},
-        "weakest": None if weakest is None else {"tcp_m": weakest[:3], "rotation_rad": weakest[3:]},
-        "worst_sigma_m": trial.worst_sigma_m,
-        "worst_at_m": trial.worst_at_m,
-        "protection": None
-        if trial.promise is None
-        else {
-            "position_m": trial.promise.protection.position_m,
-            "rotation_rad": trial.promise.protection.rotation_rad,
-            "risk": trial.promise.protection.risk,
-        },
-        "smallest": None if smallest is None else {"tcp_m": smallest[:3], "rotation_rad": smallest[3:]},
-        "delay_frames": trial.delay_frames,
-        "margin_px": trial.margin_px,
-        # JSON knows no infinity.
-        "shift_m": None if trial.shift_m is None or math.isinf(trial.shift_m) else trial.shift_m,
-    }
 
 
 _COLUMNS = (
@@ -86,7 +22,9 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def as_text(config: Config, grid: Grid, at_px: tuple[float, float], present: Trial, ranked: list[Trial]) -> list[str]:
+def as_text(swept: Sweep) -> list[str]:
+    """A table for a person: mm, degrees."""
+    config, grid, at_px, present, ranked = swept.config, swept.grid, swept.at_px, swept.present, swept.ranked
     working = sum(trial.works for trial in ranked)
     warn_mm = 1e3 * config.settings.monitor.policy.warn_m
     lines = [

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common, fleet_table, joining
 from gripmon.cli.alert_log import AlertLog
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.client import Fleet, MonitorStatus
@@ -95,7 +96,7 @@ def _check(arguments: argparse.Namespace) -> None:
     elif arguments.alerts and (arguments.once or arguments.transforms):
         wrong = "--alerts prints alerts alone; leave out --once and --transforms"
     if wrong:
-        raise common.CommandFailedError(f"watch: {wrong}", common.EXIT_USAGE)
+        raise InputError(f"watch: {wrong}")
 
 
 def _open_log(arguments: argparse.Namespace) -> AlertLog:
@@ -105,9 +106,7 @@ def _open_log(arguments: argparse.Namespace) -> AlertLog:
     try:
         return AlertLog(path, as_json=arguments.json)
     except OSError as error:
-        raise common.CommandFailedError(
-            f"--out {path}: can't be read ({error.strerror}); a file of your own", common.EXIT_USAGE
-        ) from None
+        raise InputError(f"--out {path}: can't be read ({error.strerror}); a file of your own") from None
 
 
 def _open_fleet(arguments: argparse.Namespace, log: AlertLog | None) -> Fleet:
@@ -157,7 +156,7 @@ def _show_once(fleet: Fleet, arguments: argparse.Namespace) -> int:
         doubt = "is --connect right?"
         if arguments.zenoh_config:  # a router's rules drop without a word what they don't allow
             doubt = f"is {arguments.zenoh_config} for the right router, and may its certificate read there?"
-        raise common.CommandFailedError(f"watch: no monitor is on the network; {fleet.fault() or doubt}")
+        raise NoResultError(f"watch: no monitor is on the network; {fleet.fault() or doubt}")
     return common.EXIT_DONE
 
 

@@ -21,6 +21,7 @@ import msgspec
 from gripmon.judge.references import state_fault
 from gripmon.model.atomic import remove_leftovers, write_atomically
 from gripmon.model.camera import LensSettings
+from gripmon.model.errors import InputError
 from gripmon.model.gripper import GripperModel, contents_of
 from gripmon.model.records import MonitorState, ReferenceRecord
 
@@ -54,7 +55,7 @@ class StateSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     ) = AUTO
 
 
-class StateFileError(ValueError):
+class StateFileError(InputError):
     """The monitor can't start with this file: "file: what is wrong; what would be right"."""
 
 

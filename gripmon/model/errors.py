@@ -8,8 +8,12 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """What was given is wrong: a file, a table, a value.  Exit code 2."""
+    """What was given is wrong: a file, a table, a value.  The command line ends with this exit code."""
+
+    exit_code = 2
 
 
 class NoResultError(RuntimeError):
-    """The input is sound, and yet there is no result: no usable frame, a calibration that is refused.  Exit code 3."""
+    """The input is sound, and yet there is no result: no usable frame, a calibration that is refused."""
+
+    exit_code = 3

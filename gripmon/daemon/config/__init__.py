@@ -136,7 +136,7 @@ class Config:
 
 
 def load_config(
-    path: Path, *, check_source: bool = True, with_taught: bool = True, say_deprecated: bool = True
+    path: str | Path, *, check_source: bool = True, with_taught: bool = True, say_deprecated: bool = True
 ) -> Config:
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
@@ -144,6 +144,7 @@ def load_config(
     ``with_taught=False`` leaves out the taught model, for those who teach anew; ``say_deprecated=False`` logs no
     warning of settings that have been replaced, for files that nobody can edit.
     """
+    path = Path(path)
     values = read_yaml(path)
     if SECTION in values:
         right = "a wrist camera's configuration; gripmon run, check and replay take both"

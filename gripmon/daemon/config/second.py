@@ -10,7 +10,6 @@ import msgspec
 from msgspec import Meta
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.daemon import DaemonSettings
 from gripmon.daemon.config.calibrated import wrong_schema
 from gripmon.daemon.config.errors import ConfigError
 from gripmon.daemon.config.inputs import network_fault, source_fault
@@ -18,6 +17,7 @@ from gripmon.daemon.config.session import second_joined_or_fault
 from gripmon.daemon.config.settings import Name
 from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
+from gripmon.daemon.settings import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
 from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
 from gripmon.io.sources.pulses import read_pulses

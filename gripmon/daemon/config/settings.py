@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
-from gripmon.daemon import DaemonSettings
+from gripmon.daemon.settings import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
 from gripmon.io.ros2 import JointOpening, Ros2Settings
 from gripmon.io.sources import SourceSettings

@@ -1,7 +1,9 @@
 """Parsed YAML -> typed settings, with errors that a person can act on.
 
 ``msgspec`` does the conversion.  As its errors name neither the entry of a mapping nor what would be right, the first
-fault is searched for here, along the type, with the description and the bounds that stand in the settings.
+fault is searched for here, along the type, with the description and the bounds that stand in the settings.  This stays
+beside pydantic, which names the entry, but not what would be right, and would be a second model of what ``msgspec``
+also encodes.
 """
 
 from __future__ import annotations
@@ -12,6 +14,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 from msgspec import inspect as mi
+
+from gripmon.model.errors import InputError
 
 _T = TypeVar("_T")
 
@@ -24,7 +28,7 @@ class Fault(NamedTuple):
     right: str
 
 
-class SettingsError(ValueError):
+class SettingsError(InputError):
     """A value doesn't fit its settings type; ``fault`` says where and why."""
 
     def __init__(self, fault: Fault):

@@ -13,13 +13,14 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from gripmon.io.metrics.settings import MetricsSettings
 from gripmon.io.metrics.tally import Tally
+from gripmon.model.errors import InputError
 
 _POLL_S = 0.1  # how long a stop waits for the server at most
 
 _log = logging.getLogger(__name__)
 
 
-class MetricsError(ValueError):
+class MetricsError(InputError):
     """Metrics can't be served as configured: ``key: what is wrong; what would be right``."""
 
 

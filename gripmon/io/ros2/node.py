@@ -9,11 +9,13 @@ from __future__ import annotations
 import itertools
 import struct
 import time
-
-import zenoh
+from typing import TYPE_CHECKING
 
 from gripmon.io.ros2.names import DEFAULT_QOS, EndpointKind, NodeName, Qos, endpoint_token, node_token, topic_key
 from gripmon.io.ros2.types import type_hash, typestore
+
+if TYPE_CHECKING:
+    import zenoh
 
 _ids = itertools.count()
 """Nodes, publishers and subscriptions of a session share one row of numbers; ours are unique in the process."""
@@ -52,17 +54,19 @@ class Node:
         type_name: str,
         qos: Qos = DEFAULT_QOS,
         *,
-        priority: zenoh.Priority = zenoh.Priority.DATA,
+        priority: zenoh.Priority | None = None,
         express: bool = False,
     ) -> TopicPublisher:
         """Publish on a topic (its full name).  A message that a congested link can't take is dropped, not waited for:
-        so does ``rmw_zenoh`` with every history but keep all.
+        so does ``rmw_zenoh`` with every history but keep all.  ``priority`` is Zenoh's ``DATA`` by default.
         """
+        import zenoh
+
         token = self.declare("MP", topic, type_name, qos)
         publisher = self._session.declare_publisher(
             topic_key(self.domain_id, topic, type_name, type_hash(type_name)),
             congestion_control=zenoh.CongestionControl.DROP,
-            priority=priority,
+            priority=zenoh.Priority.DATA if priority is None else priority,
             express=express,
         )
         return TopicPublisher(publisher, type_name, gid_of(token))

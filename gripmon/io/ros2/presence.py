@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from typing import NamedTuple
-
-import zenoh
+from typing import TYPE_CHECKING, NamedTuple
 
 from gripmon.io.ros2.names import NodeName, Qos
 from gripmon.io.ros2.node import Node
 from gripmon.io.wire import Link
+
+if TYPE_CHECKING:
+    import zenoh
 
 _log = logging.getLogger(__name__)
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass
-
-import zenoh
+from typing import TYPE_CHECKING
 
 from gripmon.io.ros2.messages import Messages, inverse
 from gripmon.io.ros2.names import Qos
@@ -23,6 +22,9 @@ from gripmon.model.records import (
     StateRecord,
     Transform,
 )
+
+if TYPE_CHECKING:
+    import zenoh
 
 _log = logging.getLogger(__name__)
 
@@ -143,6 +145,8 @@ class Ros2Publisher:
 
     def _adopt(self, session: zenoh.Session) -> None:
         """Enter the graph.  Others wait for the session, too: what goes wrong here is said later."""
+        import zenoh
+
         layout = self._layout
         node = None
         try:

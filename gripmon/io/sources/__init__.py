@@ -7,7 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, Source, SourceError, Waiting
+import msgspec
+
+from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.io.sources.live import LiveCamera, LiveSettings
 from gripmon.io.sources.network import NetworkCamera, NetworkSettings, network_key
@@ -28,6 +30,7 @@ __all__ = [
     "NetworkCamera",
     "NetworkSettings",
     "NewestFrame",
+    "OpenedSource",
     "SimulatedScene",
     "SimulatedSettings",
     "Source",
@@ -81,6 +84,9 @@ def open_source(
             return NetworkCamera(settings, link, keys["image"], size_px)
 
 
-def settings_for_path(path: Path) -> FolderSettings | VideoSettings:
-    """Settings for a recorded input that a person named on the command line: a folder of images, else a video file."""
-    return FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))
+def settings_for_path(path: Path, fps: float | None = None) -> FolderSettings | VideoSettings:
+    """Settings for a recorded input that a person named: a folder of images, else a video file; ``fps`` (1/s) counts
+    where the input has no time stamps.
+    """
+    settings = FolderSettings(path=str(path)) if path.is_dir() else VideoSettings(path=str(path))
+    return settings if fps is None else msgspec.structs.replace(settings, fps=fps)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
+from gripmon.model.errors import InputError
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Frame
 
 
-class SourceError(ValueError):
+class SourceError(InputError):
     """A source that can't start: "key: what is wrong; what would be right", the key as in the source's settings."""
 
 
@@ -50,13 +52,13 @@ class Source(Protocol):
 READ_TIMEOUT_S = 0.5
 
 
-class FullScale:
-    """A source of a camera that fills only a part of its 16 bits, in the full scale of the type: so that recordings and
-    previews show what is measured, too.
+class OpenedSource:
+    """A source to iterate over: ``for frame in source``, which waits for a live camera, and ends with the frames or by
+    ``close``.  As a context manager it closes itself.
     """
 
-    def __init__(self, source: Source, bit_depth: int) -> None:
-        self._source, self._bit_depth = source, bit_depth
+    def __init__(self, source: Source) -> None:
+        self._source = source
 
     @property
     def live(self) -> bool:
@@ -71,8 +73,32 @@ class FullScale:
         return self._source.dropped
 
     def read(self) -> Frame | Waiting | None:
-        answer = self._source.read()
-        return in_full_scale(answer, self._bit_depth) if isinstance(answer, Frame) else answer
+        return self._source.read()
 
     def close(self) -> None:
         self._source.close()
+
+    def __iter__(self) -> Iterator[Frame]:
+        while (answer := self.read()) is not None:
+            if isinstance(answer, Frame):
+                yield answer
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+
+class FullScale(OpenedSource):
+    """A source of a camera that fills only a part of its 16 bits, in the full scale of the type: so that recordings and
+    previews show what is measured, too.
+    """
+
+    def __init__(self, source: Source, bit_depth: int) -> None:
+        super().__init__(source)
+        self._bit_depth = bit_depth
+
+    def read(self) -> Frame | Waiting | None:
+        answer = self._source.read()
+        return in_full_scale(answer, self._bit_depth) if isinstance(answer, Frame) else answer

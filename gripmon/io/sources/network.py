@@ -5,10 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from typing import Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import msgspec
-import zenoh
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
 from gripmon.io.sources.lateness import MOST_LATE_S, Lateness
@@ -26,6 +25,9 @@ from gripmon.io.wire import Link
 from gripmon.io.wire.malformed import Malformed
 from gripmon.io.wire.settings import KEY_PATTERN
 from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
+
+if TYPE_CHECKING:
+    import zenoh
 
 _log = logging.getLogger(__name__)
 
@@ -213,6 +215,8 @@ class NetworkCamera:
         return Waiting(self._why_silent())
 
     def close(self) -> None:
+        import zenoh
+
         with self._changed:
             self._closed = True
             self._slot = None
@@ -225,10 +229,14 @@ class NetworkCamera:
                 return  # the session was closed before
 
     def _attach(self, session: zenoh.Session) -> None:
+        import zenoh
+
         # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
         self._subscriber = session.declare_subscriber(self.key, zenoh.handlers.Callback(self._receive, indirect=False))
 
     def _receive(self, sample: zenoh.Sample) -> None:
+        import zenoh
+
         if sample.kind != zenoh.SampleKind.PUT:
             return
         arrival = _Arrival(sample, time.time_ns(), time.monotonic())

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-
-import zenoh
+from typing import TYPE_CHECKING
 
 from gripmon.io.wire.files import said
+
+if TYPE_CHECKING:
+    import zenoh
 
 _ADDRESS = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
 _WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
-import zenoh
 
 from gripmon.io.wire.zenoh_errors import in_short
+from gripmon.model.errors import InputError
+
+if TYPE_CHECKING:
+    import zenoh
 
 _TLS = "transport/link/tls"
 _TLS_FILES = (
@@ -21,7 +25,7 @@ _TLS_FILES = (
 _SECRETS = ("listen_private_key", "connect_private_key")
 
 
-class ZenohFileError(ValueError):
+class ZenohFileError(InputError):
     """The file can't be used; the text is one line, ``file: key: what is wrong; what would be right``."""
 
 
@@ -31,6 +35,8 @@ def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
     The files that it names for TLS count from its folder.  Where it is silent, Zenoh would listen on all interfaces and
     look for others by multicast; with gripmon it doesn't.  Raises :class:`ZenohFileError`.
     """
+    import zenoh
+
     if not path.is_file():
         raise ZenohFileError(f"no file {path}; give a json5 or yaml file of Zenoh's")
     try:

@@ -7,8 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-
-import zenoh
+from typing import TYPE_CHECKING
 
 from gripmon.io.wire.endpoints import endpoints
 from gripmon.io.wire.files import said
@@ -16,6 +15,9 @@ from gripmon.io.wire.reach import missing
 from gripmon.io.wire.session import open_session, zenoh_config
 from gripmon.io.wire.settings import PublishSettings
 from gripmon.io.wire.zenoh_errors import in_short
+
+if TYPE_CHECKING:
+    import zenoh
 
 _log = logging.getLogger(__name__)
 
@@ -92,6 +94,8 @@ class Link:
 
     def close(self) -> None:
         """Tell everyone attached, close the session and free its port.  Calling it twice does nothing more."""
+        import zenoh
+
         self._closing.set()
         if self._opener is not None:
             # A process that ended with this thread inside Zenoh would be aborted by the interpreter.
@@ -131,6 +135,8 @@ class Link:
         return True
 
     def _open_until_it_works(self, config: zenoh.Config) -> None:
+        import zenoh
+
         pause_s = self.settings.retry_first_s
         while not self._closing.is_set():
             try:

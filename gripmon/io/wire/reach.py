@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import zenoh
+if TYPE_CHECKING:
+    import zenoh
+
 
 _LOCATOR = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
 _PORT = re.compile(r"(?P<host>.*):(?P<port>\d+)")

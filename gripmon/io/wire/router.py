@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Self
-
-import zenoh
+from typing import TYPE_CHECKING, Self
 
 from gripmon.io.wire.endpoints import endpoints, endpoints_fault
 from gripmon.io.wire.files import ZenohFileError, load_file, said
 from gripmon.io.wire.reach import missing
 from gripmon.io.wire.zenoh_errors import in_short
+
+if TYPE_CHECKING:
+    pass
 
 
 class Router:
@@ -19,6 +20,8 @@ class Router:
 
     def __init__(self, path: Path) -> None:
         """``path``: a json5 or yaml file of Zenoh's.  Raises :class:`ZenohFileError`."""
+        import zenoh
+
         config = load_file(path, default_mode="router")
         if (mode := said(config, "mode")) != "router":
             raise ZenohFileError(f"{path}: mode: {mode} doesn't route; router")

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
-import zenoh
 
 from gripmon.io.wire.endpoints import endpoints, endpoints_fault
 from gripmon.io.wire.files import ZenohFileError, load_file, said
 from gripmon.io.wire.settings import PublishError, PublishSettings, form_fault
 from gripmon.io.wire.zenoh_errors import in_short
+
+if TYPE_CHECKING:
+    import zenoh
 
 _SEND_BUFFER_BYTES = 8192
 """Linux takes twice this, with its own overhead: three or four transforms of 2.7 kB.  Half of it would be less than
@@ -26,6 +28,8 @@ def zenoh_config(settings: PublishSettings, relative_to: Path = Path()) -> zenoh
 
     Raises :class:`PublishError`.
     """
+    import zenoh
+
     defaults = PublishSettings()
     if settings.zenoh_config is not None:
         for key in ("mode", "listen", "connect", "multicast_scouting"):
@@ -98,6 +102,8 @@ def joining(settings: PublishSettings, relative_to: Path = Path()) -> Joining:
 
 def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Session:
     """Raises :class:`PublishError` that names the key."""
+    import zenoh
+
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:

@@ -8,6 +8,8 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from gripmon.model.errors import InputError
+
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 _ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
 _NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
@@ -19,7 +21,7 @@ Endpoint = Annotated[
 ]
 
 
-class PublishError(ValueError):
+class PublishError(InputError):
     """The session can't be opened as configured; the text is ``key: what is wrong; what would be right``.
 
     ``key`` is the one of the section ``publish``; ``text`` what follows it, for those who call it by another name.

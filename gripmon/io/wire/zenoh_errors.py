@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from typing import TYPE_CHECKING
 
-import zenoh
+if TYPE_CHECKING:
+    import zenoh
+
 
 _SOURCE_PLACE = re.compile(r"\s+at \S+\.rs:\d+\.?")
 _PARSER = re.compile(r"\s*--> (?P<line>\d+):(?P<column>\d+)\n.*\n\s*= (?P<text>.*)", re.DOTALL)

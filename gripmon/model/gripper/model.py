@@ -7,13 +7,14 @@ from typing import Annotated, Any, Literal
 import msgspec
 from msgspec import Meta
 
+from gripmon.model.errors import InputError
 from gripmon.model.provenance import Provenance
 
 Vector = tuple[float, float, float]
 Opening = Annotated[float, Meta(ge=0.0, le=0.5, description="jaw opening (m)")]
 
 
-class GripperError(ValueError):
+class GripperError(InputError):
     """A gripper file that can't be used; the text is ``key: what is wrong; what would be right``."""
 
 

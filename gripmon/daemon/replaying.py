@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
-import sys
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from gripmon.daemon.config import Config
-    from gripmon.io.sources import Source
-    from gripmon.model.records import FrameRecord, MonitorState, RecordedCommand
-    from gripmon.monitor import Monitor
-    from gripmon.record.write import Recorder
+import msgspec
+
+from gripmon.daemon.api import Monitor, open_source
+from gripmon.daemon.config import Config
+from gripmon.io.sources import Source
+from gripmon.model.records import (
+    Command,
+    Frame,
+    FrameRecord,
+    MonitorState,
+    RecordedCommand,
+    unmeasured_record,
+)
+from gripmon.record.write import NullRecorder, Recorder
+
+_log = logging.getLogger(__name__)
 
 
 class Past(NamedTuple):
@@ -30,25 +40,38 @@ NOTHING_BEFORE = Past()
 
 
 def replay(
-    config: Config, source: Source, recorder: Recorder, past: Past = NOTHING_BEFORE
-) -> Iterator[tuple[bytes, FrameRecord]]:
-    """Process every frame of a source that isn't live: yields each record with its JSON line."""
-    import msgspec
+    source: str | Path | Source,
+    config: Config,
+    recorder: Recorder | None = None,
+    past: Past = NOTHING_BEFORE,
+    warn: Callable[[str], None] = _log.warning,
+) -> Iterator[FrameRecord]:
+    """Process every frame of a source that isn't live: one record for each, in order; the same input gives the same
+    records, ``latency_ns`` aside.
 
-    from gripmon.model.records import Frame, to_json, unmeasured_record
-    from gripmon.monitor import Monitor
+    ``source``: a folder of images or a video file, or what :func:`gripmon.open_source` gave, which the caller closes.
+    ``recorder`` gets what a recording holds; ``past`` is what the monitor went through before and beside the frames;
+    ``warn`` gets a line of text when something beside the frames is wrong.
 
-    monitor = Monitor(
-        config.camera, config.gripper, config.settings.monitor, config.reference, config.taught_edges, past.state
-    )
-    with_jaw = _jaw_of(config)
+    Raises :class:`SourceError` for a source that can't be read.  A frame that can't be used is a record with a reason.
+    """
+    if isinstance(source, str | Path):
+        with open_source(source) as opened:
+            yield from replay(opened, config, recorder, past, warn)
+        return
+    recorder = NullRecorder() if recorder is None else recorder
+    monitor = Monitor(config, past.state)
     waiting = deque(past.commands)
     revision = monitor.reference.revision
+    ignored = False
     while (frame := source.read()) is not None:
         assert isinstance(frame, Frame), "only a live source waits"
         while waiting and waiting[0].seq < frame.seq:
             recorder.command(_told(monitor, waiting.popleft()))
-        frame = with_jaw(frame)
+        if not ignored and monitor.ignores_opening(frame):
+            ignored = True
+            warn("the frames bring jaw openings, but jaw.source is fixed: they are not used")
+        frame = monitor.with_opening(frame)
         start_ns = time.perf_counter_ns()
         try:
             record = monitor.process(frame)
@@ -59,19 +82,15 @@ def replay(
             revision = monitor.reference.revision
             recorder.reference(monitor.reference)
         recorder.offer(frame, record, monitor.trace, monitor.notes)
-        yield to_json(record) + b"\n", record
+        yield record
         try:
             monitor.ponder()  # now, as the daemon: a command would find other thoughts
         except Exception as error:  # noqa: BLE001  as the daemon does
-            print(f"replay: frame {frame.seq}: reflection failed: {_in_short(error)}", file=sys.stderr)
+            warn(f"frame {frame.seq}: reflection failed: {_in_short(error)}")
 
 
 def _told(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:
     """Give the monitor a command as it was given then, at the same time; what became of it now."""
-    import msgspec
-
-    from gripmon.model.records import Command
-
     try:
         answer = monitor.command(Command(then.name, then.argument), then.stamp_ns)
     except Exception as error:  # noqa: BLE001  as the daemon does
@@ -83,20 +102,3 @@ def _in_short(error: Exception) -> str:
     """As the daemon says it."""
     text = " ".join(str(error).split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
-
-
-def _jaw_of(config: Config) -> Callable[[Any], Any]:
-    """How a frame gets its jaw opening: from the configuration, or it keeps what it came with."""
-    if config.settings.jaw.source != "fixed":
-        return lambda frame: frame
-    warned = False
-
-    def with_fixed_jaw(frame: Any) -> Any:
-        nonlocal warned
-        other = frame.jaw_opening_m is not None and frame.jaw_opening_m != config.jaw_opening_m
-        if other and not warned and config.gripper.has_jaw:
-            warned = True
-            print("replay: the frames bring jaw openings, but jaw.source is fixed: they are not used", file=sys.stderr)
-        return dataclasses.replace(frame, jaw_opening_m=config.jaw_opening_m)
-
-    return with_fixed_jaw

@@ -6,44 +6,36 @@ import csv
 import io
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from gripmon.cli import common
-
-if TYPE_CHECKING:
-    from gripmon.model.records import CommandReply
+from gripmon.io.sources import SourceError
+from gripmon.io.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
+from gripmon.model.atomic import write_atomically
+from gripmon.model.errors import InputError
+from gripmon.model.records import CommandReply, to_json
 
 _SUFFIXES = {"png": ".png", "jpeg": ".jpg"}  # a name from outside makes no path
 _NUMBERED = re.compile(r"snapshot-([0-9]{1,9})\.(json|png|jpg)")
 
 
 def check_table(out: Path) -> None:
-    """End the command with exit code 2, before any work, if no row can be added to the table in a folder."""
-    from gripmon.io.sources import SourceError
-    from gripmon.io.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
-
+    """Raises :class:`InputError` if no row can be added to the table in a folder."""
     path = out / TIMESTAMPS_NAME
     if not path.exists():
         return
     try:
         read_table(path)
     except SourceError as error:
-        raise common.CommandFailedError(f"--out {out}: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"--out {out}: {error}") from None
     header = path.read_text(encoding="utf-8-sig").partition("\n")[0]
     if tuple(cell.strip() for cell in header.split(",")) != COLUMNS:
-        raise common.CommandFailedError(
-            f"--out {out}: {path} has no column {COLUMNS[-1]}; another folder", common.EXIT_USAGE
-        )
+        raise InputError(f"--out {out}: {path} has no column {COLUMNS[-1]}; another folder")
 
 
 def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
     """``snapshot-<n>.png``, ``snapshot-<n>.json`` and a row in ``timestamps.csv``, as a source of kind ``folder`` and
-    ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.
+    ``gripmon teach`` read them; n counts on from what is there.  Each file is there whole or not at all.  Raises
+    :class:`InputError` where one can't be written.
     """
-    from gripmon.io.sources.folder import TIMESTAMPS_NAME
-    from gripmon.model.atomic import write_atomically
-    from gripmon.model.records import to_json
-
     number = 1 + max((int(found[1]) for p in out.iterdir() if (found := _NUMBERED.fullmatch(p.name))), default=0)
     files = {out / f"snapshot-{number}.json": to_json(reply) + b"\n"}
     snapshot = reply.snapshot
@@ -57,13 +49,11 @@ def write(reply: CommandReply, image: bytes | None, out: Path) -> list[Path]:
         for path, data in files.items():
             write_atomically(path, data)
     except OSError as error:
-        raise common.not_writable(path, error) from None
+        raise InputError(f"--out {path}: can't be written ({error.strerror or error}); a file") from None
     return list(files)
 
 
 def _with_row(table: Path, name: str, stamp_ns: int, jaw_m: float | None) -> bytes:
-    from gripmon.io.sources.folder import COLUMNS
-
     text = io.StringIO()
     lines = csv.writer(text, lineterminator="\n")
     before = table.read_text(encoding="utf-8-sig") if table.exists() else ",".join(COLUMNS)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sized
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-from gripmon.cli import common
-
-if TYPE_CHECKING:
-    from gripmon.daemon.config import Config, SecondConfig
-    from gripmon.io.sources import Source
-    from gripmon.io.wire import Link
-    from gripmon.model.records import Frame
+from gripmon.daemon.config import Config, ConfigError, SecondConfig
+from gripmon.io.sources import FolderSettings, FullScale, Source, SourceError, VideoSettings
+from gripmon.io.sources import open_source as start
+from gripmon.io.wire import Keys, Link
+from gripmon.model.errors import NoResultError
+from gripmon.model.records import Frame
 
 
 class RecordedInput(NamedTuple):
@@ -22,19 +21,14 @@ class RecordedInput(NamedTuple):
 
 
 def open_source(config: Config | SecondConfig, link: Link | None = None) -> Source:
-    """Start the configured source; one that can't start ends the command with exit code 2."""
-    from gripmon.daemon.config import SecondConfig
-    from gripmon.io.sources import FullScale, SourceError
-    from gripmon.io.sources import open_source as started
-    from gripmon.io.wire import Keys
-
+    """Start the configured source, on the network through ``link``.  Raises :class:`ConfigError` if it can't start."""
     settings, size_px = config.settings, (config.camera.width_px, config.camera.height_px)
     scene = None if isinstance(config, SecondConfig) else config.scene
     keys = Keys(settings.robot, settings.camera_name)
     try:
-        source = started(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
+        source = start(settings.source, config.directory, scene=scene, size_px=size_px, link=link, keys=keys)
     except SourceError as error:
-        raise common.CommandFailedError(f"{config.path}: source.{error}", common.EXIT_USAGE) from None
+        raise ConfigError(config.path, "", f"source.{error}") from None
     bit_depth = 16 if isinstance(config, SecondConfig) else config.settings.monitor.bit_depth
     return source if bit_depth == 16 else FullScale(source, bit_depth)
 
@@ -42,10 +36,8 @@ def open_source(config: Config | SecondConfig, link: Link | None = None) -> Sour
 def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
     """Look at the beginning of recorded frames; None for a source of another kind.
 
-    Frames that don't fit the camera end the command with exit code 2, and with 3 if none can be read.
+    Raises :class:`ConfigError` for frames that don't fit the camera, and :class:`NoResultError` if none can be read.
     """
-    from gripmon.io.sources import FolderSettings, VideoSettings
-
     if not isinstance(config.settings.source, FolderSettings | VideoSettings):
         return None
     source = open_source(config)
@@ -57,11 +49,9 @@ def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
     height_px, width_px = frame.image.shape[:2]
     camera = config.camera
     if (width_px, height_px) != (camera.width_px, camera.height_px):
-        raise common.CommandFailedError(
-            f"{config.path}: {_camera_key(config)}: {camera.width_px} x {camera.height_px} px; "
-            f"{frame.name} is {width_px} x {height_px}; the calibration that belongs to these images",
-            common.EXIT_USAGE,
-        )
+        key = "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"
+        wrong = f"{camera.width_px} x {camera.height_px} px; {frame.name} is {width_px} x {height_px}"
+        raise ConfigError(config.path, key, wrong, "the calibration that belongs to these images")
     count = f"{len(source)} frames, " if isinstance(source, Sized) else ""
     detail = f"{count}first one {frame.name}, {width_px} x {height_px} px, {frame.image.dtype}"
     if not unreadable:
@@ -73,19 +63,10 @@ def look_ahead(config: Config | SecondConfig) -> RecordedInput | None:
 
 def _first_readable(config: Config | SecondConfig, source: Source) -> tuple[Frame, list[str]]:
     """The first frame with an image, and why those before it have none."""
-    from gripmon.model.records import Frame
-
     unreadable: list[str] = []
     while isinstance(frame := source.read(), Frame):
         if frame.image is not None:
             return frame, unreadable
         unreadable.append(f"{frame.name}: {frame.fault}")
     why = unreadable[0] if unreadable else "it holds none"
-    raise common.CommandFailedError(f"{config.path}: source.path: no frame of it can be read ({why}); readable images")
-
-
-def _camera_key(config: Config | SecondConfig) -> str:
-    """Which key the size of an image belongs to."""
-    from gripmon.daemon.config import SecondConfig
-
-    return "laser.calibration" if isinstance(config, SecondConfig) else "camera.width_px"
+    raise NoResultError(f"{config.path}: source.path: no frame of it can be read ({why}); readable images")

@@ -5,20 +5,37 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-from typing import TYPE_CHECKING
 
-from gripmon.cli import common
-
-if TYPE_CHECKING:
-    from gripmon.daemon import JawFeed, Reports
-    from gripmon.daemon.config import Config, SecondConfig
-    from gripmon.io.metrics import MetricsServer
-    from gripmon.io.publish import Presence, Publisher, ZenohCommands
-    from gripmon.io.sources import Source
-    from gripmon.io.wire import Keys, Link
-
+from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_network
+from gripmon.daemon.neighbours import JawFeed, Reports
+from gripmon.io.metrics import MetricsError, MetricsServer
+from gripmon.io.publish import NullPublisher, Presence, Publisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
+from gripmon.io.publish.jaw import opening_of_joints
+from gripmon.io.publish.presence import in_words
+from gripmon.io.ros2 import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    JOINT_STATE,
+    HeardTopic,
+    Listeners,
+    NodeName,
+    Ros2Publisher,
+    as_token,
+    layout_of,
+    network_of,
+    subscription_key,
+)
+from gripmon.io.sources import NetworkCamera, NetworkSettings, Source
+from gripmon.io.wire import Keys, Link, PublishError
+from gripmon.model.errors import NoResultError
 
 _log = logging.getLogger(__name__)
+
+
+class NameTakenError(NoResultError):
+    """Another monitor has the robot's and camera's name."""
+
+    exit_code = 4
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,17 +52,10 @@ class Network:
 
 
 def open_network(config: Config, *, take_over: bool = False) -> Network:
-    """Open all of it; ends the command with exit code 2 where it can't be opened as configured, and with 4 where the
-    robot's and camera's name is another monitor's, unless it is to ``take_over``.
+    """Open all of it.  Raises :class:`ConfigError` where it can't be opened as configured, and :class:`NameTakenError`
+    where the robot's and camera's name is another monitor's, unless it is to ``take_over``.
     """
-    from gripmon.daemon import Reports
-    from gripmon.daemon.config import ConfigError, check_network
-    from gripmon.io.publish import NullPublisher
-
-    try:
-        check_network(config)
-    except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+    check_network(config)
     settings, link = config.settings, _open_link(config)
     jaw: JawFeed | None = _FixedJaw(config.jaw_opening_m) if settings.jaw.source == "fixed" else None
     if link is None:
@@ -58,24 +68,17 @@ def open_network(config: Config, *, take_over: bool = False) -> Network:
 
 
 def alone(link: Link, robot: str, camera: str, *, take_over: bool) -> Presence:
-    """Who this start of the monitor is; ends the command where another monitor has the name and keeps it."""
-    from gripmon.io.publish import Presence
-    from gripmon.io.publish.presence import in_words
-    from gripmon.io.wire import Keys
-
+    """Who this start of the monitor is; raises :class:`NameTakenError` where another monitor has the name, keeps it."""
     presence = Presence(link, Keys(robot, camera))
     _log.info("this start of %s/%s is %s", robot, camera, presence.monitor_id)
     others = () if take_over else presence.wait_alone()
     if others:
         remedy = "stop it, give this one another name, or start it with --take-over and stop the other one then"
-        raise common.CommandFailedError(f"{in_words(others)}; {remedy}", common.EXIT_TAKEN)
+        raise NameTakenError(f"{in_words(others)}; {remedy}")
     return presence
 
 
 def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence) -> Network:
-    from gripmon.daemon import Reports
-    from gripmon.io.publish import Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
-
     settings = config.settings
     publisher = ZenohPublisher(link, settings.robot, settings.camera_name, presence)
     if settings.jaw.source in ("zenoh", "ros2_joint_state"):
@@ -94,33 +97,25 @@ def _on_link(config: Config, link: Link, jaw: JawFeed | None, presence: Presence
 
 def with_metrics(config: Config, publisher: Publisher) -> Publisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
-    from gripmon.io.publish import Publishers
-
     metrics = metrics_server(config)
     return publisher if metrics is None else Publishers(publisher, {"metrics": metrics})
 
 
 def metrics_server(config: Config | SecondConfig) -> MetricsServer | None:
-    """The server for Prometheus where the configuration wants one; ends the command with exit code 2 where it can't
-    listen.
-    """
-    from gripmon.io.metrics import MetricsError, MetricsServer
-
+    """The server for Prometheus where there is to be one.  Raises :class:`ConfigError` where it can't listen."""
     settings = config.settings
     if not settings.metrics.enabled:
         return None
     try:
         metrics = MetricsServer(settings.metrics, settings.robot, settings.camera_name)
     except MetricsError as error:
-        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+        raise ConfigError(config.path, "", str(error)) from None
     _log.info("metrics at http://%s:%d/metrics", settings.metrics.address, settings.metrics.port)
     return metrics
 
 
 def with_source(reports: Reports, source: Source) -> Reports:
     """The reports, and what a camera on the network says beside them."""
-    from gripmon.io.sources import NetworkCamera
-
     if not isinstance(source, NetworkCamera):
         return reports
     return dataclasses.replace(
@@ -132,9 +127,6 @@ def with_source(reports: Reports, source: Source) -> Reports:
 
 def _open_link(config: Config) -> Link | None:
     """The session; None if nothing is published."""
-    from gripmon.io.ros2 import network_of
-    from gripmon.io.wire import Link, PublishError
-
     if not config.settings.publish.enabled:
         return None
     settings = network_of(config.settings.publish, config.settings.ros2)
@@ -143,13 +135,11 @@ def _open_link(config: Config) -> Link | None:
     try:
         return Link(settings, config.directory)
     except PublishError as error:
-        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+        raise ConfigError(config.path, "", str(error)) from None
 
 
 def _ros2_node(config: Config, link: Link) -> Publisher | None:
     """The monitor as a ROS 2 node, where the configuration wants one."""
-    from gripmon.io.ros2 import Ros2Publisher, layout_of
-
     settings = config.settings
     if not settings.ros2.enabled:
         return None
@@ -158,9 +148,6 @@ def _ros2_node(config: Config, link: Link) -> Publisher | None:
 
 def _show_listeners(config: Config, link: Link) -> None:
     """Let ROS 2 know of the topics that frames and jaw opening come from."""
-    from gripmon.io.ros2 import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners, NodeName, as_token
-    from gripmon.io.sources import NetworkSettings
-
     settings = config.settings
     jaw, source = settings.jaw, settings.source
     topics = []
@@ -176,10 +163,6 @@ def _show_listeners(config: Config, link: Link) -> None:
 
 def _network_jaw(config: Config, link: Link, keys: Keys) -> JawFeed:
     """The jaw opening that the robot publishes, on a key of ours or on a topic of ROS 2."""
-    from gripmon.io.publish import ZenohJaw
-    from gripmon.io.publish.jaw import opening_of_joints
-    from gripmon.io.ros2 import JOINT_STATE, subscription_key
-
     jaw = config.settings.jaw
     travel_m = config.gripper.jaw_min_m, config.gripper.jaw_max_m
     if jaw.source == "zenoh":

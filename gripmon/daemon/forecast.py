@@ -1,0 +1,314 @@
+"""What a configuration's view lets a monitor expect, before there is any image: what ``gripmon check`` prints."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from gripmon.daemon.config import Config
+from gripmon.daemon.forecast_values import (
+    Accuracy,
+    BorderValues,
+    Bounds,
+    CameraFreedom,
+    CameraValues,
+    CornerView,
+    DriftForecast,
+    EdgeView,
+    FarthestEdge,
+    Forecast,
+    GapValues,
+    GripperValues,
+    InView,
+    JawAccuracy,
+    JawTravelForecast,
+    JawValues,
+    OpeningCertainty,
+    PoseValues,
+    RecalibrationForecast,
+    ReferenceValues,
+    TaughtValues,
+    UnknownJaw,
+)
+from gripmon.judge.drift import CORRELATION_FRAMES, foresee
+from gripmon.judge.recalibrate import coplanar, refusal
+from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
+from gripmon.monitor import CORNER_COUNTS
+from gripmon.teach.forecast import (
+    EDGE_POINT_SIGMA_PX,
+    FEWEST_CORNERS,
+    FEWEST_EDGES,
+    JawOutlook,
+    Mount,
+    Outlook,
+    Promise,
+    Rig,
+    border,
+    certainty,
+    expect,
+    foresee_frame,
+    freedom,
+    over_jaw,
+    promise,
+    see,
+)
+from gripmon.teach.forecast.margins import SOUGHT_M, SOUGHT_RAD
+
+__all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
+
+_AXES = ("x", "y", "z")
+_DIRECTIONS = (
+    "a shift along x", "a shift along y", "the distance (z)", "a tilt about x", "a tilt about y", "a roll about z",
+)  # fmt: skip
+_STEPS_M = (5e-5, 1e-4, 5e-4)  # of the TCP, for which the delay is given
+
+
+def forecast(config: Config) -> Forecast:
+    """What a monitor of this configuration may expect; without network and without its source.
+
+    A view that shows too little is no error: ``in_view.reason`` says what is missing, and what needs more is None.
+    """
+    settings, gripper, found = config.settings, config.gripper, promise_of(config)
+    policy = settings.monitor.policy
+    return Forecast(
+        config=str(config.path),
+        robot=settings.robot,
+        camera_name=settings.camera_name,
+        camera=_camera(config),
+        gripper=GripperValues(
+            file=str(config.gripper_path),
+            name=gripper.name,
+            corners=len(gripper.corner_ids),
+            edges=len(gripper.edge_ids),
+            faces=len(gripper.faces),
+            notes=tuple(gripper.notes),
+            jaw_m=(gripper.jaw_min_m, gripper.jaw_max_m) if gripper.has_jaw else None,
+        ),
+        reference=_reference(config),
+        taught=_taught(config),
+        jaw=JawValues(settings.jaw.source, config.jaw_opening_m, settings.jaw.opening_m is None),
+        corners=_corners(config),
+        edges=tuple(map(EdgeView, gripper.edge_ids, config.view().edges_visible.tolist())),
+        accuracy=_accuracy(config),
+        protection=None if found is None else _bounds(found),
+        alert_limit_m=policy.alert_limit_m,
+        alert_limit_rad=policy.alert_limit_rad,
+        reachable=found is not None and found.reachable,
+        needed=None if found is None or found.reachable else found.needed,
+        promise="nothing: too little is in view" if found is None else found.text(),
+        in_view=_in_view(config),
+    )
+
+
+def rig_of(config: Config) -> Rig:
+    """What the configuration looks with and at."""
+    return Rig(config.camera, config.gripper, config.settings.monitor, config.taught_edges)
+
+
+def promise_of(config: Config) -> Promise | None:
+    """What a frame at the configured pose and opening may promise; None where too little is in view to measure it."""
+    rig, cam_T_grip, opening_m = rig_of(config), config.cam_T_grip, config.jaw_opening_m
+    if not see(rig, cam_T_grip, opening_m).enough:
+        return None
+    return promise(foresee_frame(rig, cam_T_grip, opening_m).protection, config.settings.monitor.policy)
+
+
+def limits_warning(config: Config) -> str | None:
+    """What to say at the start when no transform of the configured view can be valid; None otherwise."""
+    found = promise_of(config)
+    if found is None or found.reachable:
+        return None
+    return f"{config.path}: no transform of this view can be valid: valid needs {found.needed} (monitor.policy)"
+
+
+def _bounds(found: Promise) -> Bounds:
+    return Bounds(found.protection.position_m, found.protection.rotation_rad, found.protection.risk)
+
+
+def _camera(config: Config) -> CameraValues:
+    camera = config.camera
+    across = 2.0 * math.atan(0.5 * camera.width_px / camera.fx_px)
+    down = 2.0 * math.atan(0.5 * camera.height_px / camera.fy_px)
+    model = type(config.settings.camera).__struct_config__.tag
+    return CameraValues(str(model), camera.width_px, camera.height_px, camera.fx_px, camera.fy_px, (across, down))
+
+
+def _reference(config: Config) -> ReferenceValues:
+    reference, cam_T_grip = config.reference, config.cam_T_grip
+    return ReferenceValues(
+        id=reference.reference_id,
+        translation_m=reference.cam_T_grip.translation_m,
+        rotation_xyzw=reference.cam_T_grip.rotation_xyzw,
+        distance_m=float(np.linalg.norm(cam_T_grip[:3, 3])),
+        turn_rad=rotation_angle(cam_T_grip[:3, :3]),
+        metres_per_px=float(cam_T_grip[2, 3]) / config.camera.fx_px,
+        tilt_rad=Mount.of(cam_T_grip).tilt_rad,
+        camera_ahead_m=float(invert(cam_T_grip)[2, 3]),
+        sound_as_wxyz=_sound_as_wxyz(config),
+    )
+
+
+def _sound_as_wxyz(config: Config) -> bool:
+    """Whether the reference's quaternion, read in the order w, x, y, z, puts the camera behind the fingertips and in
+    view of them.
+    """
+    w, x, y, z = config.reference.cam_T_grip.rotation_xyzw
+    cam_T_grip = make_transform(rotation_from_xyzw((x, y, z, w)), config.cam_T_grip[:3, 3])
+    behind = float(invert(cam_T_grip)[2, 3]) < 0.0
+    return behind and see(rig_of(config), cam_T_grip, config.jaw_opening_m).enough
+
+
+def _taught(config: Config) -> TaughtValues | None:
+    taught = config.taught
+    if taught is None:
+        return None
+    edge = max(taught.edges, key=lambda name: max(map(abs, taught.edges[name].offset_m)))
+    offset_m = max(taught.edges[edge].offset_m, key=abs)
+    largest = FarthestEdge(edge, offset_m, offset_m * config.camera.fx_px / float(config.cam_T_grip[2, 3]))
+    made = taught.provenance
+    return TaughtValues(str(config.taught_path), made.time, len(made.images), tuple(taught.edges), largest)
+
+
+def _corners(config: Config) -> tuple[CornerView, ...]:
+    view = config.view()
+    return tuple(
+        CornerView(
+            id=name,
+            uv_px=tuple(uv.round(2).tolist()) if np.isfinite(uv).all() else None,
+            distance_m=round(float(np.linalg.norm(point)), 6),
+            visible=bool(visible),
+            reason=None if visible else "outside" if not inside else "self_hidden",
+        )
+        for name, uv, point, visible, inside in zip(
+            config.gripper.corner_ids, view.corners_px, view.corners_cam_m, view.visible, view.in_image, strict=True
+        )
+    )
+
+
+def _accuracy(config: Config) -> Accuracy:
+    settings = config.settings.monitor
+    outlook = expect(
+        config.camera, config.gripper, settings, config.reference, config.jaw_opening_m, config.taught_edges
+    )
+    enough, jaw = outlook.enough, outlook.jaw
+    return Accuracy(
+        measurement=settings.measurement,
+        edges=outlook.edges,
+        edges_needed=FEWEST_EDGES,
+        edge_point_sigma_px=EDGE_POINT_SIGMA_PX,
+        recalibration=_recalibration(config, outlook),
+        expected=PoseValues.of(outlook.sigma) if enough else None,
+        weakest=PoseValues.of(outlook.weakest) if enough else None,
+        jaw=None if jaw is None or not enough else _jaw_accuracy(jaw, outlook.lever_m, settings.jaw_sigma_m),
+        drift=_drift(config, outlook) if enough else None,
+    )
+
+
+def _jaw_accuracy(jaw: JawOutlook, lever_m: float, reported_sigma_m: float) -> JawAccuracy:
+    per_m = [abs(v) * (1.0 if k < 3 else lever_m) for k, v in enumerate(jaw.pose_per_m.tolist())]
+    unknown = PoseValues.of(jaw.sigma)
+    return JawAccuracy(
+        reported_sigma_m=reported_sigma_m,
+        unknown=UnknownJaw(unknown.tcp_m, unknown.rotation_rad, jaw.sigma_m),
+        pose_per_jaw_m=PoseValues.of(jaw.pose_per_m),
+        like=_DIRECTIONS[per_m.index(max(per_m))],
+        correlation=float(jaw.correlation),
+        growth=jaw.growth,
+    )
+
+
+def _drift(config: Config, outlook: Outlook) -> DriftForecast:
+    settings = config.settings.monitor.drift
+    foresight = foresee(outlook.covariance, settings)
+    delays: Any = {f"{m:g}": tuple(foresight.delay_frames(m, axis) for axis in range(3)) for m in _STEPS_M}
+    return DriftForecast(
+        settings.false_alarms_per_day,
+        settings.frames_per_s,
+        CORRELATION_FRAMES,
+        PoseValues.of(foresight.smallest),
+        delays,
+    )
+
+
+def _recalibration(config: Config, outlook: Outlook) -> RecalibrationForecast:
+    """One frame's certainty counts: what is averaged over frames whose errors last is hardly more certain."""
+    gripper, settings = config.gripper, config.settings.monitor
+    taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[settings.recalibrate_corners])
+    points_grip_m = gripper.points_grip_m(config.jaw_opening_m)[gripper.corner_points][taken]
+    reason = refusal(points_grip_m)
+    return RecalibrationForecast(
+        corners=len(points_grip_m),
+        coplanar=bool(len(points_grip_m) >= 3 and coplanar(points_grip_m)),
+        possible=reason is None,
+        reason=reason,
+        sigma_m=float(max(outlook.sigma[:3])) if outlook.enough else None,
+        sure_sigma_m=settings.recalibration.sure_sigma_m,
+        mode=settings.recalibration.mode,
+    )
+
+
+def _in_view(config: Config) -> InView:
+    rig, cam_T_grip = rig_of(config), config.cam_T_grip
+    sight = see(rig, cam_T_grip, config.jaw_opening_m)
+    near = border(rig, sight)
+    return InView(
+        corners=sight.corners,
+        edges=sight.edges,
+        corners_needed=FEWEST_CORNERS,
+        edges_needed=FEWEST_EDGES,
+        enough=sight.enough,
+        reason=sight.reason,
+        behind_another_finger=tuple(
+            name for name, behind in zip(rig.gripper.corner_ids, sight.behind, strict=True) if behind
+        ),
+        border=None
+        if near is None
+        else BorderValues(**near.by_side_px, smallest_px=near.smallest_px, corner=near.corner, side=near.side),
+        camera_may_move=_freedom(config, rig) if sight.enough else None,
+        limit_m=config.settings.monitor.policy.limit_m,
+        jaw_travel=_jaw_travel(config, rig),
+    )
+
+
+def _freedom(config: Config, rig: Rig) -> CameraFreedom:
+    free = freedom(rig, config.cam_T_grip, config.jaw_opening_m)
+    amounts: Any = [tuple(map(_or_none, pair)) for pair in free.limits.tolist()]
+    return CameraFreedom(
+        shift_m=dict(zip(_AXES, amounts[:3], strict=True)),
+        turn_rad=dict(zip(_AXES, amounts[3:], strict=True)),
+        shift_reason=dict(zip(_AXES, free.reasons[:3], strict=True)),
+        turn_reason=dict(zip(_AXES, free.reasons[3:], strict=True)),
+        sought_m=SOUGHT_M,
+        sought_rad=SOUGHT_RAD,
+    )
+
+
+def _jaw_travel(config: Config, rig: Rig) -> JawTravelForecast | None:
+    travel = over_jaw(rig, config.cam_T_grip)
+    if travel is None:
+        return None
+    certain = certainty(rig, config.cam_T_grip)
+    policy = config.settings.monitor.policy
+    bounds = [None if each is None else each.protection for each in certain.promises]
+    return JawTravelForecast(
+        share=travel.share,
+        gaps=tuple(GapValues(*gap) for gap in travel.gaps),
+        corners=(int(travel.corners.min()), int(travel.corners.max())),
+        edges=(int(travel.edges.min()), int(travel.edges.max())),
+        from_m=config.gripper.jaw_min_m,
+        to_m=config.gripper.jaw_max_m,
+        certainty=OpeningCertainty(
+            opening_m=tuple(certain.openings_m.tolist()),
+            worst_sigma_m=tuple(map(_or_none, certain.sigma_m.tolist())),
+            protection_m=tuple(None if b is None else b.position_m for b in bounds),
+            protection_rad=tuple(None if b is None else b.rotation_rad for b in bounds),
+            alert_limit_m=policy.alert_limit_m,
+            alert_limit_rad=policy.alert_limit_rad,
+        ),
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value

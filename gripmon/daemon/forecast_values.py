@@ -1,0 +1,269 @@
+"""What a forecast consists of: frozen values, plain enough for JSON."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta
+
+from gripmon.model.records import Array
+
+Vector = tuple[float, float, float]
+Both = tuple[float | None, float | None]
+"""To the negative and to the positive side, as amounts; None: farther than was sought."""
+
+
+class PoseValues(msgspec.Struct, frozen=True):
+    """Six numbers about a pose: of the TCP's position in camera axes (m), of the rotation about them (rad)."""
+
+    tcp_m: Vector
+    rotation_rad: Vector
+
+    @classmethod
+    def of(cls, values: Array) -> PoseValues:
+        """From an array (6,)."""
+        return msgspec.convert({"tcp_m": values[:3].tolist(), "rotation_rad": values[3:].tolist()}, cls)
+
+
+class CameraValues(msgspec.Struct, frozen=True):
+    """The lens, and how wide it sees (rad)."""
+
+    model: str
+    width_px: int
+    height_px: int
+    fx_px: float
+    fy_px: float
+    field_of_view_rad: tuple[float, float]
+
+
+class GripperValues(msgspec.Struct, frozen=True):
+    """The gripper file and how many of what it has; ``jaw_m``: the jaw's travel, None without a jaw."""
+
+    file: str
+    name: str
+    corners: int
+    edges: int
+    faces: int
+    notes: tuple[str, ...]
+    jaw_m: tuple[float, float] | None
+
+
+class ReferenceValues(msgspec.Struct, frozen=True):
+    """The reference calibration, and what shows that it can't be meant so."""
+
+    id: str
+    translation_m: Vector
+    rotation_xyzw: tuple[float, float, float, float]
+    distance_m: float
+    turn_rad: float
+    metres_per_px: float
+    tilt_rad: Annotated[float, Meta(description="of the optical axis against the fingers")]
+    camera_ahead_m: Annotated[float, Meta(description="of the TCP, along the gripper's z axis")]
+    sound_as_wxyz: Annotated[bool, Meta(description="read as w, x, y, z it would be behind the fingertips, in view")]
+
+
+class FarthestEdge(msgspec.Struct, frozen=True):
+    """The taught edge that lies farthest from the sharp model."""
+
+    edge: str
+    offset_m: float
+    offset_px: float
+
+
+class TaughtValues(msgspec.Struct, frozen=True):
+    """What was taught."""
+
+    file: str
+    time: str
+    images: int
+    edges: tuple[str, ...]
+    largest: FarthestEdge
+
+
+class JawValues(msgspec.Struct, frozen=True):
+    """Where the opening comes from, and the one that all is foreseen at (m)."""
+
+    source: str
+    opening_m: float | None
+    nominal: bool
+
+
+class CornerView(msgspec.Struct, frozen=True):
+    """A corner as the calibration predicts it."""
+
+    id: str
+    uv_px: tuple[float, float] | None
+    distance_m: float
+    visible: bool
+    reason: str | None
+
+
+class EdgeView(msgspec.Struct, frozen=True):
+    """Whether an edge is visible."""
+
+    id: str
+    visible: bool
+
+
+class UnknownJaw(msgspec.Struct, frozen=True):
+    """Standard deviations if the jaw opening were unknown (m, rad)."""
+
+    tcp_m: Vector
+    rotation_rad: Vector
+    jaw_m: float
+
+
+class JawAccuracy(msgspec.Struct, frozen=True):
+    """What the opening is known to, and what the image tells of it by itself."""
+
+    reported_sigma_m: float
+    unknown: UnknownJaw
+    pose_per_jaw_m: PoseValues
+    like: str
+    correlation: float
+    growth: Annotated[float, Meta(description="so many times less certain is the pose without the opening")]
+
+
+class DriftForecast(msgspec.Struct, frozen=True):
+    """The smallest step that the drift test notices, and after how many frames it notices others."""
+
+    false_alarms_per_day: float
+    frames_per_s: float
+    correlation_frames: float
+    smallest: PoseValues
+    delay_frames: Annotated[
+        dict[str, tuple[int | None, int | None, int | None]],
+        Meta(description="by the size of the TCP's step (m): along x, y, z; null: never"),
+    ]
+
+
+class RecalibrationForecast(msgspec.Struct, frozen=True):
+    """Whether the corners in view give a pose by themselves, and how certain one frame's is (m)."""
+
+    corners: int
+    coplanar: bool
+    possible: bool
+    reason: str | None
+    sigma_m: float | None
+    sure_sigma_m: float
+    mode: str
+
+
+class Accuracy(msgspec.Struct, frozen=True):
+    """How exact one frame will be; None where too few edges are in view."""
+
+    measurement: str
+    edges: int
+    edges_needed: int
+    edge_point_sigma_px: float
+    recalibration: RecalibrationForecast
+    expected: Annotated[PoseValues | None, Meta(description="standard deviations")]
+    weakest: Annotated[PoseValues | None, Meta(description="the least certain direction, one standard deviation long")]
+    jaw: JawAccuracy | None
+    drift: DriftForecast | None
+
+
+class Bounds(msgspec.Struct, frozen=True):
+    """Protection levels: bounds on the error of a transform, and the risk that it lies beyond."""
+
+    position_m: float
+    rotation_rad: float
+    risk: float
+
+
+class BorderValues(msgspec.Struct, frozen=True):
+    """The smallest distance of a visible corner from each side of the image, and the smallest of all (px)."""
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+    smallest_px: float
+    corner: str
+    side: str
+
+
+class CameraFreedom(msgspec.Struct, frozen=True):
+    """How far the camera may move alone along each axis (m, rad) until too little is in view, and what then misses."""
+
+    shift_m: dict[str, Both]
+    turn_rad: dict[str, Both]
+    shift_reason: dict[str, tuple[str | None, str | None]]
+    turn_reason: dict[str, tuple[str | None, str | None]]
+    sought_m: float
+    sought_rad: float
+
+
+class GapValues(msgspec.Struct, frozen=True):
+    """Openings at which nothing can be measured (m)."""
+
+    from_m: float
+    to_m: float
+    reason: str
+
+
+class OpeningCertainty(msgspec.Struct, frozen=True):
+    """How certain the TCP is at which opening, and the bounds that are held against the alert limits."""
+
+    opening_m: tuple[float, ...]
+    worst_sigma_m: tuple[float | None, ...]
+    protection_m: tuple[float | None, ...]
+    protection_rad: tuple[float | None, ...]
+    alert_limit_m: float
+    alert_limit_rad: float
+
+
+class JawTravelForecast(msgspec.Struct, frozen=True):
+    """In which part of the jaw's travel enough is visible; corners and edges: the fewest and the most."""
+
+    share: float
+    gaps: tuple[GapValues, ...]
+    corners: tuple[int, int]
+    edges: tuple[int, int]
+    from_m: float
+    to_m: float
+    certainty: OpeningCertainty
+
+
+class InView(msgspec.Struct, frozen=True):
+    """What is seen, how far it is from the border, and how far camera and jaws may move."""
+
+    corners: int
+    edges: int
+    corners_needed: int
+    edges_needed: int
+    enough: bool
+    reason: str | None
+    behind_another_finger: tuple[str, ...]
+    border: BorderValues | None
+    camera_may_move: CameraFreedom | None
+    limit_m: float
+    jaw_travel: JawTravelForecast | None
+
+
+class Forecast(msgspec.Struct, frozen=True):
+    """What the calibration expects to see: metres, radians, px; positions in the camera frame.
+
+    ``protection``: what one frame may promise; ``needed``: the alert limits that this view could keep, where no
+    transform of it can be valid.
+    """
+
+    config: str
+    robot: str
+    camera_name: str
+    camera: CameraValues
+    gripper: GripperValues
+    reference: ReferenceValues
+    taught: TaughtValues | None
+    jaw: JawValues
+    corners: tuple[CornerView, ...]
+    edges: tuple[EdgeView, ...]
+    accuracy: Accuracy
+    protection: Bounds | None
+    alert_limit_m: float
+    alert_limit_rad: float
+    reachable: bool
+    needed: str | None
+    promise: str
+    in_view: InView

@@ -1,0 +1,187 @@
+"""The live monitor: newest frame in, transform out, everything supervised, a clean stop.
+
+One thread does all of it; the source reads ahead, Zenoh sends and the
+recording writes in threads and processes of their own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import logging
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.keeping import StateKeeper
+from gripmon.daemon.loop import Daemon
+from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFeed, Reports
+from gripmon.daemon.second import SecondCamera
+from gripmon.daemon.settings import DaemonSettings
+from gripmon.daemon.snapshots import Snapshots
+from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
+from gripmon.io.sources import Source
+from gripmon.laser.pulses.told import Told
+from gripmon.laser.pulses.watching import PulsedWatch
+from gripmon.model.records import Alert
+from gripmon.model.stopping import StopRequest, signals_request
+from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
+
+_UNHURRIED_S = 10.0  # for the recording, when nobody asked for a stop
+_SHORTEST_CLOSE_S = 0.5
+_SWITCH_INTERVAL_S = 0.0005
+
+
+def run(
+    monitor: MonitorLike,
+    source: Source,
+    publisher: Publisher,
+    recorder: Recorder,
+    settings: DaemonSettings,
+    *,
+    robot: str,
+    camera: str,
+    estimates: Path | None = None,
+    jaw: JawFeed | None = None,
+    keeper: StateKeeper | None = None,
+    commands: CommandFeed | None = None,
+    reports: Reports | None = None,
+    notices: Sequence[Alert] = (),
+    duration_s: float | None = None,
+    stop: StopRequest | None = None,
+) -> int:
+    """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
+
+    In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
+    frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
+    the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
+    from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`).  The logger
+    ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
+
+    Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
+    or internal errors persisted; 130 SIGINT.
+    """
+    with _closing(source, publisher, recorder, settings, estimates, stop, keeper) as opened:
+        own = _faults(jaw, recorder, opened.lines, keeper)
+        reports = reports or Reports()
+        daemon = Daemon(
+            monitor, source, publisher, recorder, settings, opened.stop,
+            robot=robot, camera=camera, estimates=opened.lines, jaw=jaw, keeper=keeper, commands=commands,
+            snapshots=opened.snapshots, reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
+        )  # fmt: skip
+        with _steady_interpreter():
+            return daemon.run(duration_s)
+
+
+def run_second(
+    pulsed: PulsedWatch,
+    source: Source,
+    publisher: SpotPublisher,
+    recorder: SpotRecorder,
+    settings: DaemonSettings,
+    *,
+    robot: str,
+    camera: str,
+    lines: Path | None = None,
+    table: Sequence[Told] = (),
+    feed: PulseFeed | None = None,
+    no_spot_alert_after_s: float | None = None,
+    commands: CommandFeed | None = None,
+    reports: Reports | None = None,
+    notices: Sequence[Alert] = (),
+    duration_s: float | None = None,
+    stop: StopRequest | None = None,
+) -> int:
+    """The same for a second camera: see :class:`SecondCamera`.  ``lines`` is a file that gets one JSON line a pulse.
+
+    Returns the exit code: also 3 if there were pulses and none showed its spot.
+    """
+    with _closing(source, publisher, recorder, settings, lines, stop) as opened:
+        own = _faults(None, recorder, opened.lines, None)
+        reports = reports or Reports()
+        daemon = SecondCamera(
+            pulsed, source, publisher, recorder, settings, opened.stop,
+            robot=robot, camera=camera, lines=opened.lines, table=table, feed=feed,
+            no_spot_alert_after_s=no_spot_alert_after_s, commands=commands, snapshots=opened.snapshots,
+            reports=replace(reports, faults=(*own, *reports.faults)), notices=notices,
+        )  # fmt: skip
+        with _steady_interpreter():
+            return daemon.run(duration_s)
+
+
+class _Opened(NamedTuple):
+    """What a loop has for as long as it runs."""
+
+    stop: StopRequest
+    lines: EstimatesFile
+    snapshots: Snapshots
+
+
+@contextlib.contextmanager
+def _closing(
+    source: Source,
+    publisher: StatePublisher,
+    recorder: EventRecorder,
+    settings: DaemonSettings,
+    lines: Path | None,
+    stop: StopRequest | None,
+    keeper: StateKeeper | None = None,
+) -> Iterator[_Opened]:
+    """Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that."""
+    stop = stop or StopRequest()
+    with signals_request(stop), contextlib.ExitStack() as closing:
+        # All of these run, the last one first.
+        if keeper is not None:
+            closing.callback(keeper.close)
+        closing.callback(publisher.close)
+        closing.callback(lambda: recorder.close(timeout_s=_time_to_close_s(stop, settings)))
+        closing.callback(source.close)
+        file = closing.enter_context(contextlib.closing(EstimatesFile(lines, settings.estimates_budget_bytes)))
+        snapshots = closing.enter_context(contextlib.closing(Snapshots()))
+        yield _Opened(stop, file, snapshots)
+
+
+def _faults(
+    jaw: JawFeed | None, recorder: EventRecorder, lines: EstimatesFile, keeper: StateKeeper | None
+) -> list[Callable[[], str | None]]:
+    """Whom to ask what is wrong, in the order in which it is said."""
+    faults: list[Callable[[], str | None]] = [] if jaw is None else [jaw.fault]
+    faults += [lambda: recorder.failure, lambda: lines.failure]
+    return faults if keeper is None else [*faults, lambda: keeper.failure]
+
+
+def log_to_stderr(*, verbose: bool = False) -> None:
+    """Let the ``gripmon`` loggers write lines for people on stderr; ``verbose`` adds tracebacks of survived errors."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    logger = logging.getLogger("gripmon")
+    logger.handlers = [handler]
+    logger.setLevel(logging.DEBUG if verbose else logging.INFO)
+    logger.propagate = False
+
+
+def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
+    if stop.requested_s is None:
+        return _UNHURRIED_S
+    return max(_SHORTEST_CLOSE_S, stop.requested_s + settings.stop_within_s - time.monotonic())
+
+
+@contextlib.contextmanager
+def _steady_interpreter() -> Iterator[None]:
+    """No pauses that the loop doesn't choose: it collects garbage itself, and other threads give way sooner."""
+    interval_s, collected = sys.getswitchinterval(), gc.isenabled()
+    gc.collect()
+    gc.freeze()  # what start-up has built stays: no later collection walks through it
+    gc.disable()
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval_s)
+        gc.unfreeze()
+        if collected:
+            gc.enable()

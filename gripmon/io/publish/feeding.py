@@ -1,0 +1,81 @@
+"""A recorded or live source put on the network in real time, as a camera's driver would."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import zenoh
+
+from gripmon.io.publish.frames import FrameFormat, FramePublisher
+from gripmon.io.sources import Source
+from gripmon.io.wire import Link
+from gripmon.model.records import Frame
+
+_LOOK_AGAIN_S = 0.05
+_LAST_WORD_S = 0.2
+_USUAL_FPS = 25.0
+
+
+class Feeder:
+    """Sends frames when they are due; ``sent`` of them so far, ``unsent`` not, ``reason`` why the last one wasn't."""
+
+    def __init__(
+        self, link: Link, key: str, frame_format: FrameFormat = "raw", *, jpeg_quality: int = 90, recorded_stamps: bool
+    ) -> None:
+        """``recorded_stamps``: send the frames' own time stamps instead of the time of sending."""
+        self.sent = self.unsent = 0
+        self.reason = ""
+        self._link, self._recorded_stamps = link, recorded_stamps
+        self._publisher: FramePublisher | None = None
+
+        def declare(session: zenoh.Session) -> None:
+            self._publisher = FramePublisher(session, key, frame_format, jpeg_quality=jpeg_quality)
+
+        link.attach(declare)
+
+    def run(self, begin: Callable[[], Source], *, fps: float | None = None, loop: bool = False) -> None:
+        """Send a source's frames at the times of their stamps, or ``fps`` a second, those of a camera at once; with
+        ``loop`` from the beginning again, for ever.  ``begin`` opens it, each time; it is closed here.
+
+        It waits until there is a monitor or a router: nothing is lost while that starts.
+        """
+        while self._link.fault():
+            time.sleep(_LOOK_AGAIN_S)
+        for frame, due_s in _paced(begin, fps, loop):
+            time.sleep(max(due_s - time.monotonic(), 0.0))
+            self._send(frame)
+        time.sleep(_LAST_WORD_S)  # what was put last is still on its way
+
+    def _send(self, frame: Frame) -> None:
+        assert self._publisher is not None
+        try:
+            if frame.image is None:
+                raise ValueError(frame.fault)
+            stamp_ns = frame.stamp_ns if self._recorded_stamps else time.time_ns()
+            self._publisher.put(frame.image, stamp_ns=stamp_ns, jaw_opening_m=frame.jaw_opening_m)
+        except ValueError as error:
+            self.unsent, self.reason = self.unsent + 1, f"{frame.name}: {error}"
+            return
+        self.sent += 1
+
+
+def _paced(begin: Callable[[], Source], fps: float | None, loop: bool) -> Iterator[tuple[Frame, float]]:
+    """Frames, and when each is due (monotonic s)."""
+    start_s, passed_s = time.monotonic(), 0.0
+    while True:
+        source, first_ns, count, since_s = begin(), None, 0, 0.0
+        try:
+            while (item := source.read()) is not None:
+                if not isinstance(item, Frame):
+                    continue
+                first_ns = item.stamp_ns if first_ns is None else first_ns
+                since_s = 1e-9 * (item.stamp_ns - first_ns) if fps is None else count / fps
+                yield item, start_s if source.live else start_s + passed_s + since_s
+                count += 1
+        finally:
+            source.close()
+        if not loop or source.live or count == 0:
+            return
+        # The last frame lasts as long as the others do.
+        passed_s += since_s * count / max(count - 1, 1) if count > 1 else 1.0 / (fps or _USUAL_FPS)
