@@ -13,7 +13,7 @@ from support.stand_ins import ScriptedMonitor
 
 from gripmon.cli import fleet_table
 from gripmon.client import MonitorName, MonitorStatus
-from gripmon.model.records import AlertKind, MonitorState, Severity, StandingAlert
+from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, MonitorState, Severity, StandingAlert
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = "gripmon send accept recalibration-4-1f0c9a2b --robot arm --camera wrist"
@@ -42,6 +42,21 @@ def test_the_state_and_the_log_say_what_to_type(caplog: pytest.LogCaptureFixture
     assert waiting[-1] == ("", False)
     said = [record.getMessage() for record in caplog.records if COMMAND in record.getMessage()]
     assert said == [f"a new reference waits for an operator: {COMMAND} (or reject)"]
+
+
+def test_its_alert_says_what_to_type_until_it_is_cleared():
+    """The monitor writes the text, and doesn't know the robot's name."""
+    about = Alert(
+        AlertKind.PROPOSED, Cause.CAMERA_MOUNT, Severity.WARNING, "it waits to be accepted", AlertEvent.RAISED
+    )
+    over = msgspec.structs.replace(about, event=AlertEvent.CLEARED, text="the proposal was rejected")
+    other = msgspec.structs.replace(about, kind=AlertKind.DRIFT, text="a drift")
+    alerts = {2: (about, other), 4: (over,)}
+    bench = Bench(range(6), Proposing(lambda seq: {"alerts": alerts.get(seq, ())}))
+    bench.run()
+    texts = [alert.text for alert in bench.network.alerts]
+    assert texts == [f"{about.text}; to let it in: {COMMAND}", other.text, over.text]
+    assert bench.network.transforms[2].alerts == (about, other), "the monitor's own, as a replay has it"
 
 
 def status(**changes: object) -> MonitorStatus:

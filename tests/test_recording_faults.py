@@ -332,3 +332,11 @@ def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytes
     writer.close(10.0)
     assert writer.dropped == 35 and "no truth here" in str(writer.failure)
     assert "gripmon-images" not in Path("/proc/self/maps").read_text()
+
+
+def test_the_recording_process_finds_the_package_where_the_daemon_has_it_from() -> None:
+    """A checkout that isn't installed: neither the working directory nor the rooms themselves are searched."""
+    import gripmon
+    from gripmon.record.write import process
+
+    assert Path(process._HOME) == Path(gripmon.__file__).resolve().parents[1]

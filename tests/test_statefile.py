@@ -130,6 +130,31 @@ def test_a_damaged_file_is_set_aside_and_told(path: Path, what: str):
     assert read_once(path).state == STATE
 
 
+@pytest.mark.parametrize("kept", [0, 1, len(DATA) // 3, len(DATA) - 2])
+def test_after_a_state_that_was_cut_off_no_revision_is_used_again(path: Path, kept: int):
+    """The newest references stand at the file's end: what is left of it doesn't tell how many there were."""
+    file = opened(path)
+    assert file.write(STATE)
+    file.close()
+    os.truncate(path, kept)
+    file = opened(path)
+    assert file.state is None and file.configured == configured(4)
+    assert file.notices[0].endswith("started from the configured reference, as revision 4")
+    assert file.write(MonitorState((file.configured,)))
+    file.close()
+    again = read_once(path)
+    assert again.state == MonitorState((configured(4),)) and not again.notices
+
+
+@pytest.mark.parametrize("note", [b"", b"17\n", b"17 x\n", b"17 " + b"9" * 80, b"\0" * 20, b"\xff 3 \xb2\n"])
+def test_a_lock_that_tells_no_revision_is_no_fault(path: Path, note: bytes):
+    write(path, DATA[:-40])
+    path.with_name("arm.json.lock").write_bytes(note)
+    file = read_once(path)
+    assert file.state is None and not file.failure
+    assert file.configured.revision in (0, 4)
+
+
 def packed(**changes: object) -> bytes:
     """A file whose checksum is right, whatever it holds."""
     content = json.loads(DATA)["content"]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common, viewing
 from gripmon.model.errors import InputError
+from gripmon.model.stopping import signals_exit
 
 if TYPE_CHECKING:
     from gripmon.analyse.comparison import Distribution, EventReport, TcpErrors
@@ -76,9 +77,11 @@ def run(arguments: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     view = viewing.LiveView(settings.view, arguments.view, str(config.path)) if viewed else None
-    with common.progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
+    bar = common.progress_bar(demo.frame_count, "frame")
+    with signals_exit() as stop, bar as step, ExitStack() as messages:
         code, summary = demo.run(
             out,
+            stop=stop,
             step=step,
             on_network=lambda: messages.enter_context(common.messages_above_bar("gripmon")),
             view=view,

@@ -40,11 +40,11 @@ def add_parser(commands: Any) -> None:
 
 def route(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon router``."""
-    from gripmon.daemon import sigterm_exits
     from gripmon.io.wire import Router, ZenohFileError
     from gripmon.model.errors import InputError
+    from gripmon.model.stopping import signals_exit
 
-    with sigterm_exits():
+    with signals_exit():
         try:
             router = Router(Path(arguments.config))
         except ZenohFileError as error:

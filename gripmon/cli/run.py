@@ -8,6 +8,7 @@ from typing import Any
 
 from gripmon.cli import common, second_run, viewing
 from gripmon.model.errors import InputError
+from gripmon.model.stopping import StopRequest, signals_exit
 
 _DESCRIPTION = """\
 Watch a camera: correct cam_T_grip in every frame, publish it over Zenoh and record it, until
@@ -71,6 +72,11 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon run``."""
+    with signals_exit() as stop:
+        return _run(arguments, stop)
+
+
+def _run(arguments: argparse.Namespace, stop: StopRequest) -> int:
     second = second_run.load(arguments.config)
     if second is not None:
         if arguments.fresh_state:
@@ -84,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             verbose=arguments.verbose,
             view=arguments.view,
             take_over=arguments.take_over,
+            stop=stop,
         )
     from gripmon.daemon.camera_source import look_ahead
     from gripmon.daemon.starting import run_monitor
@@ -104,4 +111,5 @@ def run(arguments: argparse.Namespace) -> int:
         fresh_state=arguments.fresh_state,
         view=view,
         take_over=arguments.take_over,
+        stop=stop,
     )

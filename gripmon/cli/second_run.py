@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli import common
 from gripmon.cli.viewing import LiveView
+from gripmon.model.stopping import StopRequest
 
 if TYPE_CHECKING:
     from gripmon.daemon import Reports
@@ -51,6 +52,7 @@ def run_second(
     verbose: bool,
     view: str | None = None,
     take_over: bool = False,
+    stop: StopRequest,
 ) -> int:
     """Open everything that the configuration names and run the daemon on it; returns the exit code."""
     import cv2
@@ -67,7 +69,7 @@ def run_second(
     cv2.setNumThreads(1)
     daemon.log_to_stderr(verbose=verbose)
     live = None if view is None else LiveView(settings.view, view, str(config.path))
-    with daemon.sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         pulsed = config.pulsed_watch()
         network = _open_network(config, take_over=take_over)
         opened.callback(network.publisher.close)
@@ -95,6 +97,7 @@ def run_second(
             commands=network.commands,
             reports=with_source(network.reports, source),
             duration_s=duration_s,
+            stop=stop,
         )
 
 

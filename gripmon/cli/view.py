@@ -47,7 +47,7 @@ def add_parser(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
-    from gripmon.daemon import sigterm_exits
+    from gripmon.model.stopping import signals_exit
     from gripmon.record.read import is_rrd, recording_files
     from gripmon.record.write.files_page import serve_files
     from gripmon.record.write.viewer import NativeViewer, ViewerError, free_port, has_display, is_free
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"--port {arguments.port}: is in use on 127.0.0.1; another port, or none for any", common.EXIT_USAGE
         )
     try:
-        with sigterm_exits(), ExitStack() as opened:
+        with signals_exit(), ExitStack() as opened:
             if arguments.native or (has_display() and not arguments.web):
                 viewer = NativeViewer([str(path) for path in files], tied=True)
                 opened.callback(viewer.close)

@@ -14,13 +14,14 @@ if TYPE_CHECKING:
     from gripmon.daemon.keeping import StateKeeper
     from gripmon.daemon.loop import Daemon
     from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFeed, Reports
-    from gripmon.daemon.running import EXIT_INTERRUPTED, log_to_stderr, run, run_second, sigterm_exits
+    from gripmon.daemon.running import log_to_stderr, run, run_second
     from gripmon.daemon.second import SecondCamera
     from gripmon.daemon.settings import DaemonSettings
-    from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, StopRequest
+    from gripmon.daemon.supervised import EXIT_FAILED
+    from gripmon.model.stopping import EXIT_DONE, EXIT_INTERRUPTED, StopRequest
 
 _WHERE = {
-    "EXIT_DONE": "supervised",
+    "EXIT_DONE": "running",
     "EXIT_FAILED": "supervised",
     "EXIT_INTERRUPTED": "running",
     "CommandFeed": "neighbours",
@@ -33,11 +34,10 @@ _WHERE = {
     "Reports": "neighbours",
     "SecondCamera": "second",
     "StateKeeper": "keeping",
-    "StopRequest": "supervised",
+    "StopRequest": "running",
     "log_to_stderr": "running",
     "run": "running",
     "run_second": "running",
-    "sigterm_exits": "running",
 }
 
 __all__ = [
@@ -58,7 +58,6 @@ __all__ = [
     "log_to_stderr",
     "run",
     "run_second",
-    "sigterm_exits",
 ]
 
 

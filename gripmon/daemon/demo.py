@@ -20,6 +20,7 @@ from gripmon.daemon.starting import LiveView, run_monitor
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Array, FrameRecord
+from gripmon.model.stopping import StopRequest
 from gripmon.record.write.viewer import free_port
 from gripmon.simulate import Simulator
 
@@ -86,11 +87,18 @@ class Demo:
         return self._simulator.frame_count
 
     def run(
-        self, out: Path, *, step: Callable[[], None], on_network: Callable[[], object], view: LiveView | None = None
+        self,
+        out: Path,
+        *,
+        stop: StopRequest,
+        step: Callable[[], None],
+        on_network: Callable[[], object],
+        view: LiveView | None = None,
     ) -> tuple[int, DemoSummary | None]:
         """The daemon's exit code, and the summary, which is also written to ``out``; None if no frame was processed.
 
-        ``step`` is called for each transform that arrives, ``on_network`` when the client has joined.
+        ``stop``: see :func:`run_monitor`.  ``step`` is called for each transform that arrives, ``on_network`` when the
+        client has joined.
         """
 
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:
@@ -104,7 +112,13 @@ class Demo:
                 on_network()
 
             code = run_monitor(
-                self._config, out=out, recording_name="demo", truth_tcp_m=truth_tcp_m, on_network=joined, view=view
+                self._config,
+                out=out,
+                stop=stop,
+                recording_name="demo",
+                truth_tcp_m=truth_tcp_m,
+                on_network=joined,
+                view=view,
             )
         return code, _summarise(out, self._simulator, receiver.count)
 

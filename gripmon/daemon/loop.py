@@ -13,7 +13,7 @@ from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import Loop, StopRequest, in_short
+from gripmon.daemon.supervised import Loop, in_short
 from gripmon.io.publish import Publisher
 from gripmon.io.sources import Source
 from gripmon.model.records import (
@@ -26,6 +26,7 @@ from gripmon.model.records import (
     unmeasured_record,
     withheld,
 )
+from gripmon.model.stopping import StopRequest
 from gripmon.record.write import Recorder
 
 KEEP_LAST_EVERY_S = 60.0

@@ -9,14 +9,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import NamedTuple
 
 from gripmon.daemon.estimates import EstimatesFile
@@ -26,15 +23,14 @@ from gripmon.daemon.neighbours import CommandFeed, JawFeed, MonitorLike, PulseFe
 from gripmon.daemon.second import SecondCamera
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
-from gripmon.daemon.supervised import EXIT_DONE, StopRequest
 from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
 from gripmon.laser.pulses.told import Told
 from gripmon.laser.pulses.watching import PulsedWatch
 from gripmon.model.records import Alert
+from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
 
-EXIT_INTERRUPTED = 130
 _UNHURRIED_S = 10.0  # for the recording, when nobody asked for a stop
 _SHORTEST_CLOSE_S = 0.5
 _SWITCH_INTERVAL_S = 0.0005
@@ -56,18 +52,20 @@ def run(
     reports: Reports | None = None,
     notices: Sequence[Alert] = (),
     duration_s: float | None = None,
+    stop: StopRequest | None = None,
 ) -> int:
     """Run until the source ends, ``duration_s`` is over, or a signal comes; then close everything that was passed in.
 
     In the main thread it handles SIGINT and SIGTERM while it runs.  ``estimates`` is a file that gets one JSON line a
     frame; OSError if it can't be opened.  ``jaw``, where given, replaces the frames' own jaw opening.  ``keeper`` keeps
     the monitor's state for a restart; ``reports``: what the state message says beyond all this; ``notices`` are alerts
-    from the start-up.  The logger ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
+    from the start-up, ``stop`` a request to end from then (:func:`gripmon.model.stopping.signals_exit`).  The logger
+    ``gripmon`` is left as the caller set it up (see :func:`log_to_stderr`).
 
     Returns the exit code: 0 the source ended, the time was over, or SIGTERM; 3 no usable frame came, the source broke,
     or internal errors persisted; 130 SIGINT.
     """
-    with _closing(source, publisher, recorder, settings, estimates, keeper) as opened:
+    with _closing(source, publisher, recorder, settings, estimates, stop, keeper) as opened:
         own = _faults(jaw, recorder, opened.lines, keeper)
         reports = reports or Reports()
         daemon = Daemon(
@@ -96,12 +94,13 @@ def run_second(
     reports: Reports | None = None,
     notices: Sequence[Alert] = (),
     duration_s: float | None = None,
+    stop: StopRequest | None = None,
 ) -> int:
     """The same for a second camera: see :class:`SecondCamera`.  ``lines`` is a file that gets one JSON line a pulse.
 
     Returns the exit code: also 3 if there were pulses and none showed its spot.
     """
-    with _closing(source, publisher, recorder, settings, lines) as opened:
+    with _closing(source, publisher, recorder, settings, lines, stop) as opened:
         own = _faults(None, recorder, opened.lines, None)
         reports = reports or Reports()
         daemon = SecondCamera(
@@ -129,11 +128,12 @@ def _closing(
     recorder: EventRecorder,
     settings: DaemonSettings,
     lines: Path | None,
+    stop: StopRequest | None,
     keeper: StateKeeper | None = None,
 ) -> Iterator[_Opened]:
     """Signals ask for a stop.  Whatever happens, all is closed; a second signal no longer disturbs that."""
-    stop = StopRequest()
-    with _signals(stop), contextlib.ExitStack() as closing:
+    stop = stop or StopRequest()
+    with signals_request(stop), contextlib.ExitStack() as closing:
         # All of these run, the last one first.
         if keeper is not None:
             closing.callback(keeper.close)
@@ -164,46 +164,10 @@ def log_to_stderr(*, verbose: bool = False) -> None:
     logger.propagate = False
 
 
-@contextlib.contextmanager
-def sigterm_exits() -> Iterator[None]:
-    """Around the start-up before :func:`run`: SIGTERM then closes what is open, as Ctrl-C does, with exit code 0."""
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        raise SystemExit(EXIT_DONE)
-
-    with _handling({signal.SIGTERM: handle}):
-        yield
-
-
 def _time_to_close_s(stop: StopRequest, settings: DaemonSettings) -> float:
     if stop.requested_s is None:
         return _UNHURRIED_S
     return max(_SHORTEST_CLOSE_S, stop.requested_s + settings.stop_within_s - time.monotonic())
-
-
-@contextlib.contextmanager
-def _signals(stop: StopRequest) -> Iterator[None]:
-    """SIGINT and SIGTERM ask for a stop."""
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        stop.request(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_DONE)
-
-    with _handling({signal.SIGINT: handle, signal.SIGTERM: handle}):
-        yield
-
-
-@contextlib.contextmanager
-def _handling(handlers: dict[signal.Signals, Callable[[int, FrameType | None], None]]) -> Iterator[None]:
-    """Handlers for a while.  Python allows that in the main thread only; elsewhere signals are left alone."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
-    try:
-        yield
-    finally:
-        for number, former in before.items():
-            signal.signal(number, former)
 
 
 @contextlib.contextmanager

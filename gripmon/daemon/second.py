@@ -13,7 +13,7 @@ from gripmon.daemon.estimates import EstimatesFile
 from gripmon.daemon.neighbours import CommandFeed, PulseFeed, Reports
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Newest, Snapshots
-from gripmon.daemon.supervised import EXIT_DONE, EXIT_FAILED, Loop, StopRequest, in_short
+from gripmon.daemon.supervised import EXIT_FAILED, Loop, in_short
 from gripmon.daemon.watch import Judged
 from gripmon.io.publish import SpotPublisher
 from gripmon.io.sources import Source
@@ -37,6 +37,7 @@ from gripmon.model.records import (
     State,
     Verdict,
 )
+from gripmon.model.stopping import EXIT_DONE, StopRequest
 from gripmon.record.write import SpotRecorder
 
 _log = logging.getLogger(__name__)

@@ -18,10 +18,11 @@ from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.keeping import StateKeeper
 from gripmon.daemon.network import open_network, with_metrics, with_source
-from gripmon.daemon.running import log_to_stderr, run, sigterm_exits
+from gripmon.daemon.running import log_to_stderr, run
 from gripmon.judge.statefile import StateFile, StateFileError
 from gripmon.model.errors import InputError
 from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
+from gripmon.model.stopping import StopRequest
 from gripmon.record.write import Recorder, ViewSettings, open_recorder
 
 _log = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ def run_monitor(
     config: Config,
     *,
     out: Path | None,
+    stop: StopRequest,
     duration_s: float | None = None,
     verbose: bool = False,
     recording_name: str | None = None,
@@ -55,6 +57,7 @@ def run_monitor(
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
+    ``stop``: from :func:`gripmon.model.stopping.signals_exit`, in which this is called.
     ``out`` is a folder for ``estimates.jsonl`` and the recording.  ``truth_tcp_m``, which a simulation has, gives the
     TCP's true position in the camera frame for a frame's ``seq``; it goes into the recording.  ``on_network`` is called
     when the publisher is open, before the camera is.  ``warns``: it is logged when the view can't keep the alert
@@ -70,7 +73,7 @@ def run_monitor(
     log_to_stderr(verbose=verbose)
     if warns and (text := limits_warning(config)) is not None:
         _log.warning("%s", text)
-    with sigterm_exits(), contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
+    with contextlib.ExitStack() as viewed, contextlib.ExitStack() as opened:
         kept = _open_state(config, fresh=fresh_state) if keep_state else None
         if kept is not None:
             opened.callback(kept.close)
@@ -110,6 +113,7 @@ def run_monitor(
             ),
             notices=_notices(kept),
             duration_s=duration_s,
+            stop=stop,
         )
 
 

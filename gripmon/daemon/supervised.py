@@ -40,13 +40,14 @@ from gripmon.model.records import (
     Verdict,
     accepting,
 )
+from gripmon.model.stopping import EXIT_DONE, StopRequest
 from gripmon.record.write import EventRecorder
 
 _log = logging.getLogger(__name__)
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
-EXIT_DONE, EXIT_FAILED = 0, 3
+EXIT_FAILED = 3
 _RESTS_FOR = 3.0
 """After a command the next one waits for so many times as long as that took: a quarter of the time is for commands."""
 
@@ -54,19 +55,6 @@ _ROOM_POLL_S = 0.002
 """Pause of a source that can wait for the recording."""
 
 _LEVELS = {Severity.INFO: logging.INFO, Severity.WARNING: logging.WARNING, Severity.ERROR: logging.ERROR}
-
-
-class StopRequest:
-    """Asks the loop to end; a signal handler or any thread may do so.  The first request counts."""
-
-    def __init__(self) -> None:
-        self.exit_code: int | None = None
-        self.requested_s: float | None = None
-
-    def request(self, exit_code: int) -> None:
-        if self.exit_code is None:
-            self.requested_s = time.monotonic()
-            self.exit_code = exit_code
 
 
 class Loop(ABC):
@@ -252,6 +240,7 @@ class Loop(ABC):
         carries it into the recording.
         """
         about = alert.kind.value if alert.event is AlertEvent.NOTED else f"{alert.kind} {alert.event}"
+        alert = self._with_what_to_type(alert)
         _log.log(_LEVELS[alert.severity], "%s: %s", about, alert.text)
         message = AlertRecord(
             robot=self._robot,
@@ -280,6 +269,13 @@ class Loop(ABC):
         if not self._proposal_id:
             return ""
         return f"a new reference waits for an operator: {accepting(self._proposal_id, self._robot, self._camera)}"
+
+    def _with_what_to_type(self, alert: Alert) -> Alert:
+        """The command in a proposal's alert: the monitor, whose text it is, doesn't know its robot's name."""
+        if alert.kind is not AlertKind.PROPOSED or not self._proposal_id or alert.event is AlertEvent.CLEARED:
+            return alert
+        typed = accepting(self._proposal_id, self._robot, self._camera)
+        return msgspec.structs.replace(alert, text=f"{alert.text}; to let it in: {typed}")
 
     def _say_state(self, now_s: float) -> None:
         """Publish the state when it is due or has changed."""

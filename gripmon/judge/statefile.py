@@ -36,6 +36,8 @@ LARGEST_BYTES = 64 << 20
 
 AUTO = "auto"
 
+_MOST_DIGITS = 18  # of a number in the lock's file: what is longer fits no revision
+
 
 class StateSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Where ``gripmon run`` keeps what survives a restart."""
@@ -172,6 +174,7 @@ class StateFile:
         # A link leads to where the file shall be; renaming would replace the link itself.
         self._path, self._owner = path.resolve(), owner
         self._usable = True
+        self._newest_revision: int | None = None  # that was ever kept here, where it is known
         self._lock = self._take_lock()
         try:
             self._read(fresh)
@@ -198,6 +201,9 @@ class StateFile:
         if self.failure:
             _log.info("%s is written again", self._path)
         self.failure = ""
+        if self._lock is not None and self._newest_revision != (newest := state.references[-1].revision):
+            self._newest_revision = newest
+            self._note(self._lock)
         return True
 
     def close(self) -> None:
@@ -214,14 +220,13 @@ class StateFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only nobody can say whose
-                os.ftruncate(descriptor, 0)
-                os.write(descriptor, b"%d\n" % os.getpid())
+            _, self._newest_revision = _noted(descriptor)
+            self._note(descriptor)
         except BlockingIOError:
             assert descriptor is not None
-            holder = os.read(descriptor, 20).decode(errors="replace").strip()
+            holder, _ = _noted(descriptor)
             os.close(descriptor)
-            by = f"process {holder}" if holder.isdecimal() else "another process"
+            by = "another process" if holder is None else f"process {holder}"
             right = "stop that one, or give this monitor a file of its own"
             raise StateFileError(f"{self._path} is in use by {by}; {right}") from None
         except OSError as error:
@@ -230,6 +235,14 @@ class StateFile:
             self._give_up(f"{path} can't be locked: {error.strerror or error}")
             return None
         return descriptor
+
+    def _note(self, descriptor: int) -> None:
+        """Write into the lock's file whose it is, and the newest revision, which a damaged state no longer tells."""
+        revision = b"" if self._newest_revision is None else b" %d" % self._newest_revision
+        note = b"%d%s\n" % (os.getpid(), revision)
+        with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, only nobody can say whose
+            os.pwrite(descriptor, note, 0)
+            os.ftruncate(descriptor, len(note))
 
     def _read(self, fresh: bool) -> None:
         if self._usable:
@@ -247,9 +260,13 @@ class StateFile:
             kept = unpack(data)
         except ValueError as error:
             aside = self._set_aside("damaged")
+            count = "revisions count from the start again"
+            if self._newest_revision is not None:
+                self.configured = msgspec.structs.replace(self.configured, revision=1 + self._newest_revision)
+                count = f"as revision {self.configured.revision}"
             self._notice(
                 f"the state file {self._path} is damaged: {error}; {aside}; started from the configured reference, "
-                "revisions count from the start again"
+                f"{count}"
             )
             return
         if (kept.owner.robot, kept.owner.camera) != (self._owner.robot, self._owner.camera):
@@ -318,6 +335,14 @@ class StateFile:
         if failure != self.failure:
             self.failure = failure
             _log.error("%s", failure)
+
+
+def _noted(descriptor: int) -> tuple[int | None, int | None]:
+    """Process and newest revision that a lock's file names."""
+    words = os.pread(descriptor, 64, 0).split()
+    numbers = [int(word) if word.isdigit() and len(word) <= _MOST_DIGITS else None for word in words]
+    holder, revision, *_ = (*numbers, None, None)
+    return holder, revision
 
 
 def _linked(path: Path, other: Path) -> bool:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
+from gripmon.daemon import DaemonSettings, log_to_stderr, run
 from gripmon.io.wire import PublishSettings
 from gripmon.model.geometry import make_transform, to_record
+from gripmon.model.stopping import signals_exit
 from support.loopback import WAIT_S, state_record
 from support.published import Published
 from support.stand_ins import Listener, ScriptedMonitor, SilentSource, TickingSource
@@ -26,7 +27,7 @@ if __name__ == "__main__":
     endpoint, kind, *rest = sys.argv[1:]
     log_to_stderr()
     transform = to_record(make_transform(ROTATION, np.array(TRANSLATION_M)))
-    with sigterm_exits():
+    with signals_exit() as stop:
         routed = PublishSettings(mode="client", connect=(endpoint,))
         publisher = Published(routed if kind == "routed" else PublishSettings(listen=(endpoint,)), "arm", "wrist")
         if kind == "forgetful":
@@ -44,5 +45,6 @@ if __name__ == "__main__":
                 robot="arm",
                 camera="wrist",
                 estimates=Path(rest[0]) if rest else None,
+                stop=stop,
             )
         )

@@ -17,9 +17,10 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.daemon import DaemonSettings, log_to_stderr, run, sigterm_exits
+from gripmon.daemon import DaemonSettings, log_to_stderr, run
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import FrameRecord
+from gripmon.model.stopping import signals_exit
 from support.published import Published
 from support.stand_ins import Listener, ScriptedMonitor, TickingSource
 
@@ -76,7 +77,7 @@ def _main() -> int:
     kinds = {field.name: field.type for field in msgspec.structs.fields(FrameRecord)}
     answer = {name: msgspec.convert(value, kinds[name]) for name, value in told["answer"].items()}
     log_to_stderr()
-    with sigterm_exits():
+    with signals_exit():
         publisher = Published(msgspec.convert(told["settings"], PublishSettings), told["robot"], told["camera"])
         print("open", flush=True)
         return run(

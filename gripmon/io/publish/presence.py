@@ -84,10 +84,16 @@ class Presence:
         session = self._session
         if session is None:
             return ()
-        replies = session.liveliness().get(self._keys["alive/**"], timeout=_CONNECTED_WITHIN_S)
-        found = {_id_in(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+        if (found := self._ids(session)) == {""}:
+            # Zenoh answers at first without the tokens that our subscriber of ids waits for: look twice
+            time.sleep(_LOOK_EVERY_S)
+            found = self._ids(session)
         # a monitor with an id shows the token without one, too: "" counts only alone
         return tuple(sorted(found - {""} or found))
+
+    def _ids(self, session: zenoh.Session) -> set[str]:
+        replies = session.liveliness().get(self._keys["alive/**"], timeout=_CONNECTED_WITHIN_S)
+        return {_id_in(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def _attach(self, session: zenoh.Session) -> None:
         take = zenoh.handlers.Callback(self._take, indirect=False)

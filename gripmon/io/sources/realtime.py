@@ -197,10 +197,15 @@ class _Renderer:
         return int(self._process.pid)
 
     def await_ready(self) -> None:
-        failure: str | None = f"not ready after {_START_WITHIN_S:g} s"
+        end_s = time.monotonic() + _START_WITHIN_S
+        failure: str | None
         try:
-            if self.announcements.poll(_START_WITHIN_S):
-                failure = self.announcements.recv()
+            # A signal that another thread takes wakes no poll: Python acts on it between two.
+            while not self.announcements.poll(READ_TIMEOUT_S):
+                if time.monotonic() >= end_s:
+                    took = f"the first image takes more than {_START_WITHIN_S:g} s"
+                    raise SourceError(f"scenario: {took}; smaller images, or a machine that is less busy")
+            failure = self.announcements.recv()
         except EOFError:
             failure = self.how_it_ended()
         if failure is not None:

@@ -20,7 +20,7 @@ _BOOTSTRAP = (
     "import sys; home = sys.argv[1]; home in sys.path or sys.path.insert(0, home); "
     "from gripmon.record.write.worker import main; main(int(sys.argv[2]), int(sys.argv[3]))"
 )
-_HOME = str(Path(__file__).resolve().parents[2])
+_HOME = str(Path(__file__).resolve().parents[3])
 _PATIENCE_S = 0.01  # of a batch that is larger than the pipe
 _KILL_GRACE_S = 0.5  # a process that hangs in the disk dies when that answers, perhaps never
 _EXIT_GRACE_S = 0.2  # between a process's last descriptor and its exit code

@@ -1,0 +1,70 @@
+"""Requests to end: SIGINT and SIGTERM, from the first import to the last file that is closed."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+EXIT_DONE, EXIT_INTERRUPTED = 0, 130
+
+_Handler = Callable[[int, FrameType | None], None]
+
+
+class StopRequest:
+    """Asks the loop to end; a signal handler or any thread may do so.  The first request counts."""
+
+    def __init__(self) -> None:
+        self.exit_code: int | None = None
+        self.requested_s: float | None = None
+
+    def request(self, exit_code: int) -> None:
+        if self.exit_code is None:
+            self.requested_s = time.monotonic()
+            self.exit_code = exit_code
+
+
+@contextlib.contextmanager
+def signals_exit() -> Iterator[StopRequest]:
+    """Around a start-up: SIGINT raises KeyboardInterrupt and SIGTERM SystemExit(0), which close what is open.
+
+    Python drops an exception that a handler raises while a destructor or a weak reference's callback runs, as they do
+    during every import.  The request that this gives stands all the same, for the loop that follows.  SIGINT is heard
+    also where a shell's background job began with ignoring it, as in the loop itself.
+    """
+    stop = StopRequest()
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        _take(stop, number)
+        raise KeyboardInterrupt if number == signal.SIGINT else SystemExit(EXIT_DONE)
+
+    with _handling(handle):
+        yield stop
+
+
+@contextlib.contextmanager
+def signals_request(stop: StopRequest) -> Iterator[None]:
+    """Around a loop that looks at ``stop``: nothing is raised."""
+    with _handling(lambda number, _frame: _take(stop, number)):
+        yield
+
+
+def _take(stop: StopRequest, number: int) -> None:
+    stop.request(EXIT_INTERRUPTED if number == signal.SIGINT else EXIT_DONE)
+
+
+@contextlib.contextmanager
+def _handling(handler: _Handler) -> Iterator[None]:
+    """A handler for a while.  Python allows that in the main thread only; elsewhere signals are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, former in before.items():
+            signal.signal(number, former)
