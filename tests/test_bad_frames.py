@@ -127,6 +127,7 @@ def test_a_bad_frame_is_a_record_with_a_reason_and_leaves_nothing_behind(spoil: 
         assert msgspec.structs.replace(seen, verdict=told.verdict, smoothed=told.smoothed) == told
 
 
+@pytest.mark.slow("10 s; the same frames in the middle of a stream are in the default run")
 @pytest.mark.parametrize(("spoil", "reason"), BAD.values(), ids=list(BAD))
 def test_a_bad_first_frame_is_survived(spoil: Callable[[Frame], Frame], reason: str):
     frames, _ = frames_of("static")

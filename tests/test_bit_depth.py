@@ -14,6 +14,7 @@ from support.taught_by_hand import make_rig
 from gripmon.cli import main
 
 
+@pytest.mark.slow("3 s: a daemon; ten bits in sixteen are measured in the default run")
 def test_a_run_records_what_it_measured(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """The recording is of 8-bit JPEGs: of ten bits in sixteen they would keep two."""
     rig = make_rig(tmp_path)

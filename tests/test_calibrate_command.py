@@ -95,6 +95,7 @@ def test_a_camera_from_a_folder(folder: Path, tmp_path: Path, capsys: pytest.Cap
     assert drawn.shape[1] > 1000 and len(np.unique(drawn.reshape(-1, 3), axis=0)) > 50
 
 
+@pytest.mark.slow("3 s; the criterion itself is in test_calibrate_intrinsics")
 def test_the_best_model_by_criterion_as_json(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "camera.yaml"
     assert calibrate(*images(folder), "--target", TEXT, "--model", "auto", "--out", str(out), "--json") == 0

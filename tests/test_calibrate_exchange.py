@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import pytest
 import yaml
-from support.plate_fingers import DISCS, OPENING_M, box_gripper, standing
+from support.plate_fingers import DISCS, OPENING_M, standing
 from support.plates import Look
 from support.sample_messages import MEASURED, NOTHING
-from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, simulator
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, plain_scenario, sharp_gripper, simulator
 from urdf_parser_py.urdf import URDF
 
 from gripmon.calibrate.documents import (
@@ -71,7 +71,7 @@ def hand_eye_file(path: Path, xi: np.ndarray | None = None, sigmas: np.ndarray =
         path,
         HandEyeCalibration(
             camera=PAPER_LENS,
-            gripper=CalibratedGripper(name=box_gripper().name, sha256=gripper_digest(box_gripper())),
+            gripper=CalibratedGripper(name=sharp_gripper().name, sha256=gripper_digest(sharp_gripper())),
             jaw_opening_m=OPENING_M,
             cam_T_grip=to_record(TRUE if xi is None else perturb(TRUE, xi)),
             covariance=tuple(np.diag(sigmas**2).ravel().tolist()),
@@ -91,7 +91,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert view.truth(0).jaw_opening_m == OPENING_M
         cv2.imwrite(str(folder / f"free{seed}.png"), view.render(0))
     cv2.imwrite(str(folder / "empty.png"), np.full((576, 768), 128, np.uint8))
-    write(folder / "gripper.yaml", contents_of(box_gripper().model))
+    write(folder / "gripper.yaml", contents_of(sharp_gripper().model))
     hand_eye_file(folder / "hand_eye.yaml")
     camera_file(folder / "camera.yaml", BROWN, {"fx_px": 0.4, "fy_px": 0.4, "coefficients.0": 1e-3})
     write(folder / "config.yaml", {**CONFIG, "camera": msgspec.to_builtins(PAPER_LENS)})

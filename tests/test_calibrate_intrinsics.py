@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +18,9 @@ from gripmon.calibrate.intrinsics import (
     lens_vector,
     plate_pose,
 )
+from gripmon.calibrate.intrinsics_result import doubts_of
 from gripmon.calibrate.lens_models import MODELS
-from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import exp_rotation, log_rotation
 
@@ -219,3 +221,29 @@ def test_too_few_points():
         plate_pose(BROWN, flat)
     with pytest.raises(CalibrationError, match="no view shows the target"):
         calibrate([], "paper")
+
+
+@pytest.mark.parametrize(
+    ("reach", "lost", "rms_share", "said"),
+    [
+        (0.62, 9, 0.0006, []),
+        (0.58, 9, 0.0006, ["no point lies farther than 58 %"]),
+        (0.62, 11, 0.0006, ["11 of 100 points don't fit"]),
+        (0.62, 9, 0.0008, ["residuals of 0.51 px are large"]),
+    ],
+)
+def test_views_are_doubted_from_stated_limits_on(reach: float, lost: int, rms_share: float, said: list[str]):
+    """Reach in parts of the half diagonal, 400 px; residuals in parts of the width."""
+    uv_px = np.array([320.0, 240.0]) + np.linspace(0.0, 400.0 * reach, 100)[:, None] * [0.8, 0.6]
+    sighting = Sighting(uv_px, np.zeros((100, 3)), np.tile(np.eye(2), (100, 1, 1)), np.arange(100), (640, 480))
+    result = SimpleNamespace(
+        camera=SimpleNamespace(width_px=640, height_px=480, fx_px=700.0),
+        values={},
+        parameters=(),
+        covariance=np.zeros((0, 0)),
+        used=[np.arange(100) >= lost],
+        rms_px=640.0 * rms_share,
+        view_rms_px=[0.05],
+    )
+    doubts = doubts_of(result, [sighting])
+    assert len(doubts) == len(said) and all(d.startswith(s) for d, s in zip(doubts, said, strict=True))

@@ -38,7 +38,16 @@ def test_derivatives_are_those_of_central_differences(name: ModelName):
         np.testing.assert_allclose(by_point[:, :, k], numeric, atol=1e-5 * np.abs(numeric).max())
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        MODELS[0],
+        *(
+            pytest.param(n, marks=pytest.mark.slow("3 s each: sampled; the first model is in the default run"))
+            for n in MODELS[1:]
+        ),
+    ],
+)
 def test_the_stated_covariance_holds(name: ModelName):
     """Normalised squared errors follow the chi-square distribution that the covariance claims, gross errors and all."""
     rng, truth, squares, gross = np.random.default_rng(7), lens_vector(CAMERAS[name]), [], 0

@@ -10,9 +10,9 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.stats import chi2
-from support.plate_fingers import DISCS, OPENING_M, box_gripper, outline_pixels, rough, standing, true_corners
+from support.plate_fingers import DISCS, OPENING_M, outline_pixels, rough, standing, true_corners
 from support.plates import Look
-from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals, HandEyeCalibration
 from gripmon.cli import main
@@ -56,7 +56,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         provenance=provenance_of("by hand"),
     )
     write(folder / "camera.yaml", camera)
-    write(folder / "gripper.yaml", contents_of(box_gripper().model))
+    write(folder / "gripper.yaml", contents_of(sharp_gripper().model))
     corners = {name: uv for name, uv in true_corners(TRUE).items() if not name.endswith("out_far")}
     write(folder / "rough.yaml", {"corners": rough(corners, 1)})
     write(folder / "outline.yaml", {"corners": rough(outline_pixels(TRUE), 2)})
@@ -97,7 +97,7 @@ def test_a_known_gripper_from_two_images(here: Path, capsys: pytest.CaptureFixtu
     found = hand_eye(here / "he.yaml")
     check_truth(found)
     assert found.camera == PAPER_LENS and found.jaw_opening_m == OPENING_M
-    assert found.gripper.sha256 == gripper_digest(box_gripper())
+    assert found.gripper.sha256 == gripper_digest(sharp_gripper())
     assert (found.residuals.images, found.residuals.corners) == (2, 12)
     assert 0.0 < found.residuals.rms_m < 2e-5 and 0.0 < found.residuals.rms_px < 0.2
     # The camera's focal length is uncertain by 0.2 px of 962: so is the distance.

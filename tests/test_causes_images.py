@@ -174,6 +174,7 @@ def test_one_covered_finger_is_not_called_bent():
     assert "finger left is not seen" in explanation.text
 
 
+@pytest.mark.slow("3 s: one rare case of a cause; each cause is in the default run")
 def test_images_that_come_again_do_not_tell_that_the_jaw_is_elsewhere():
     """The robot goes on reporting openings that the old images don't show."""
     scenario = Scenario(name="frozen", fps=FPS, duration_s=1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 
@@ -11,12 +10,13 @@ import msgspec
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.laser_images import spot_image
+from support.laser_scenes import write_csv
 from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.simulate.laser import spot_image
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
 
@@ -33,20 +33,12 @@ def pose_columns(base_T_ee):
     return dict(zip(POSE, map(float, values), strict=True))
 
 
-def write_table(path, rows):
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
-
-
 def table(path, world, count=10, seed=1):
     rows = []
     for seen in pulses(world, poses(), count, np.random.default_rng(seed)):
         u, v = map(float, seen.candidates[0].uv_px)
         rows.append({"u_px": u, "v_px": v, **pose_columns(seen.base_T_ee)})
-    return write_table(path, rows)
+    return write_csv(path, rows)
 
 
 def test_without_spots_it_says_what_would_be_noticed(laser, capsys):
@@ -121,7 +113,7 @@ def test_spots_are_found_in_images_too(laser, tmp_path, capsys):
         image = spot_image(uv, rng) if k != 2 else np.full((480, 640), 20, np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
         rows.append({"image": f"{k}.png", **pose_columns(pose)})
-    spots = write_table(tmp_path / "fresh.csv", rows)
+    spots = write_csv(tmp_path / "fresh.csv", rows)
     assert main(["check", "--laser", str(laser), str(spots), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert [row["used"] for row in report["spots_judged"]] == [True, True, False, True, True]
@@ -146,8 +138,8 @@ def test_spots_are_found_in_images_too(laser, tmp_path, capsys):
 )
 def test_bad_input_is_one_line(laser, tmp_path, capsys, arguments, said):
     (tmp_path / "other.yaml").write_text("a: 1\n")
-    write_table(tmp_path / "bad.csv", [{"u_px": 3.0, "v_px": 4.0}])
-    write_table(tmp_path / "outside.csv", [{"u_px": 3.0, "v_px": 4000.0, **pose_columns(poses()[0])}])
+    write_csv(tmp_path / "bad.csv", [{"u_px": 3.0, "v_px": 4.0}])
+    write_csv(tmp_path / "outside.csv", [{"u_px": 3.0, "v_px": 4000.0, **pose_columns(poses()[0])}])
     names = {"laser": laser, "nothing": tmp_path / "nothing.csv", "other": tmp_path / "other.yaml"}
     names |= {"bad": tmp_path / "bad.csv", "outside": tmp_path / "outside.csv"}
     assert main(["check", *(word.format(**names) for word in arguments)]) == 2

@@ -59,7 +59,9 @@ def test_a_session_that_cannot_be_opened(
     assert said in refused(written(tmp_path, publish=publish), capsys)
 
 
-@pytest.mark.parametrize("package", ["rosbags", "xxhash"])
+@pytest.mark.parametrize(
+    "package", ["rosbags", pytest.param("xxhash", marks=pytest.mark.slow("the other package is in the default run"))]
+)
 @pytest.mark.parametrize(
     ("sections", "key"),
     [
@@ -86,6 +88,7 @@ def test_packages_that_are_missing(
     typestore.cache_clear()
 
 
+@pytest.mark.slow("6 s: words; what cannot be joined is in the default run")
 def test_how_the_network_would_be_joined_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     def said(publish: dict[str, object]) -> str:
         path = written(tmp_path, publish=publish)

@@ -13,7 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.spatial.transform import Rotation
 
+from gripmon.analyse.api import correct
 from gripmon.cli import main
+from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Drift, FrameRecord, Origin, Smoothed, State, Transform, Verdict, to_json
 
 PERIOD_NS = 16_666_667
@@ -160,6 +162,25 @@ def test_given_instants(estimates: Path, tmp_path: Path, capsys):
         (-1, wanted[1], "between"),
     ]
     assert "1 of 3 capture times lie in no recording" in capsys.readouterr().err
+
+
+def test_as_a_function_it_gives_the_values_that_the_command_writes(estimates: Path, tmp_path: Path):
+    done = correct([estimates])
+    (run,) = done.runs
+    assert (done.written, done.faults) == ((), ()) and list(tmp_path.iterdir()) == [estimates]
+    out = tmp_path / "c.parquet"
+    assert main(["correct", str(estimates), "--out", str(out)]) == 0
+    table = pq.read_table(out)
+    np.testing.assert_array_equal(run.correction.cam_T_grip[:, 1, 3], table["translation_y_m"].to_numpy())
+    stamps = tmp_path / "shots.csv"
+    stamps.write_text(f"stamp_ns\n{START_NS + 1}\n")
+    (asked,) = correct([estimates], stamps=stamps).runs
+    assert asked.wanted_ns is not None and asked.wanted_ns.tolist() == [START_NS + 1]
+    with pytest.raises(InputError, match="there is no such file"):
+        correct([tmp_path / "none.rrd"])
+    stamps.write_text("stamp_ns\n5\n")
+    with pytest.raises(NoResultError, match="none of the capture times"):
+        correct([estimates], stamps=stamps)
 
 
 def failed(arguments: list[str], capsys) -> tuple[int, str]:

@@ -95,7 +95,10 @@ def test_a_killed_daemon_is_seen_to_be_gone(endpoint: str):
     wait_until(lambda: can_bind(endpoint), "the port to be free")
 
 
-@pytest.mark.parametrize("kind", ["ticking", "silent"])
+@pytest.mark.parametrize(
+    "kind",
+    ["ticking", pytest.param("silent", marks=pytest.mark.slow("2 s each; with frames it is in the default run"))],
+)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 0)])
 def test_a_signal_ends_it_with_everything_closed(
     endpoint: str, tmp_path: Path, kind: str, number: signal.Signals, code: int

@@ -31,7 +31,7 @@ def test_the_demo_keeps_what_it_promises(tmp_path: Path):
         msgspec.json.decode(line, type=FrameRecord) for line in (out / "estimates.jsonl").read_bytes().splitlines()
     ]
     assert len(list(out.glob("*.rrd"))) == 1 and summary["recordings"] == ["demo-0001.rrd"]
-    assert summary["frames"] == len(records) > 60
+    assert summary["frames"] == len(records) > 20
     assert summary["transforms_received"] == summary["frames"]
     comparison = summary["comparison"]
     assert comparison["without_correction"]["across_mm"]["max"] > 4.0

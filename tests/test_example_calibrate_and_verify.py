@@ -2,27 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
-import yaml
-from support import new_user
-from support.simulated import PAPER_LENS, nominal_cam_T_grip
+
+from gripmon.cli import main
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "docs" / "examples" / "calibrate_and_verify.py"
 
 
 def test_it_finds_camera_and_gripper(tmp_path: Path):
-    new_user.make_plates(tmp_path)
-    rough = new_user.corners_px(np.random.default_rng(4), off_px=3.0)
-    (tmp_path / "rough.yaml").write_text(yaml.safe_dump({"corners": {k: v.tolist() for k, v in rough.items()}}))
+    for kind in ("plate", "standing"):
+        assert main(["simulate", kind, "--out", str(tmp_path / kind)]) == 0
+    shutil.copy(tmp_path / "standing" / "rough.yaml", tmp_path)
+    true = json.loads((tmp_path / "standing" / "truth.json").read_text())
     done = subprocess.run([sys.executable, EXAMPLE, tmp_path], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     focal, sigma = map(float, re.findall(r"focal length ([0-9.]+) ± ([0-9.]+)", done.stdout)[0])
-    assert abs(focal - PAPER_LENS.fx_px) < 5.0 * sigma < 5.0
+    assert abs(focal - true["camera"]["fx_px"]) < 5.0 * sigma < 5.0
     x, y, z = map(float, re.findall(r"\(([-0-9.]+), ([-0-9.]+), ([-0-9.]+)\) mm", done.stdout)[0])
-    assert np.abs(np.array([x, y, z]) - 1e3 * nominal_cam_T_grip()[:3, 3]).max() < 0.15
+    assert np.abs(np.array([x, y, z]) - 1e3 * np.array(true["cam_T_grip"])[:3, 3]).max() < 0.15
     assert "the other image says the same" in done.stdout

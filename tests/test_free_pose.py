@@ -8,10 +8,10 @@ import cv2
 import msgspec
 import numpy as np
 from scipy.stats import chi2
-from support.plate_fingers import DISCS, OPENING_M, box_gripper, rough, standing, true_corners
+from support.plate_fingers import DISCS, OPENING_M, rough, standing, true_corners
 from support.plate_views import LENS, solved, trial
 from support.plates import Look
-from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import GivenCamera
@@ -72,7 +72,7 @@ def test_a_tenth_of_a_degree_is_noticed_in_an_image():
         image = standing(DISCS, look=Look(supersampling=4, noise=1.0), grip_T_standing=leaning)
         sight = detect(image, DISCS, "leaning.png")
         assert isinstance(sight, Sighting)
-        method = KnownGripper(GivenCamera(PAPER_LENS), box_gripper(), OPENING_M)
+        method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
         found.append(method.look(image, sight, guess).coincidence)
     flat, tilted = found
     assert flat.apart_p is not None and tilted.apart_p is not None and tilted.tilt_rad is not None

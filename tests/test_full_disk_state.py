@@ -49,6 +49,7 @@ def killed_at_the_end(config: Path) -> Iterator[None]:
         process.wait()
 
 
+@pytest.mark.slow("17 s: a daemon on a full disk; the same without one is in the default run")
 def test_on_a_full_disk_nothing_gets_into_force_and_no_revision_is_used_twice(tmp_path: Path, disk: Path):
     endpoint = free_endpoint()
     pictures = make_pictures(tmp_path / "pictures", 4000, knocked_every=40)

@@ -171,6 +171,7 @@ def test_whatever_shows_the_covariance_covers_the_error(mask: Mask, measurement:
             assert (covariance_of(record).diagonal()[:3] > covariance_of(records[WHOLE - 1]).diagonal()[:3]).any()
 
 
+@pytest.mark.slow("5 s: by corners; by edges, as it comes, is in the default run")
 @pytest.mark.parametrize(("mask", "corners"), [(far_parts, 2), (tips, 4)], ids=["two corners", "four on a line"])
 def test_corners_that_do_not_determine_the_motion_leave_it_to_the_edges(mask: Mask, corners: int):
     by_corners, by_edges = (run(mask, measurement)[WHOLE:] for measurement in ("corners", "edges"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 
@@ -12,8 +11,7 @@ import pytest
 import yaml
 from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
-from support.laser_images import spot_image
-from support.laser_scenes import PAPER_LENS, paper_setup, sampled
+from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
@@ -21,6 +19,7 @@ from gripmon.daemon.config.yaml_file import as_yaml
 from gripmon.laser.pointer.document import NAMES, pose_jacobian
 from gripmon.model.geometry import invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
+from gripmon.simulate.laser import spot_image
 
 
 @pytest.fixture
@@ -52,14 +51,6 @@ def rows_of(data, uv):
         dict(zip(("u_px", "v_px", "tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw"), map(float, values), strict=True))
         for values in np.concatenate([uv, data.base_T_ee[:, :3, 3], quaternions], axis=1)
     ]
-
-
-def write_csv(path, rows):
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    return path
 
 
 def calibrate(*arguments):

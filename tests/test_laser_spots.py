@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from support.laser_images import cluttered, spot_image
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.pointer.spots import find_spots
+from gripmon.simulate.laser import cluttered, spot_image
 
 
 def errors(trials=30, *, off=False, **options):

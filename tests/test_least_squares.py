@@ -164,7 +164,7 @@ def test_columns_of_very_different_units_don_t_matter():
     np.testing.assert_allclose(found.state * units, TRUE, rtol=1e-9)
 
 
-def test_running_out_of_iterations_is_said():
+def test_running_out_of_iterations_is_reported():
     seen = decay(TRUE)
     assert not fit(np.array([1.0, 0.5, 0.0]), linearised(seen, 1e-3), np.add, iterations=2).converged
 

@@ -71,6 +71,7 @@ def server() -> Iterator[tuple[MetricsServer, int]]:
         yield server, port
 
 
+@pytest.mark.slow("13 s: a daemon; each figure of the page is in the default run")
 def test_a_daemon_tells_prometheus_what_it_tells_the_network(tmp_path: Path):
     endpoint, port = free_endpoint(), free_port()
     config = configured(tmp_path, f'{{listen: ["{endpoint}"]}}', f"metrics: {{enabled: true, port: {port}}}")

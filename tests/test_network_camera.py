@@ -102,6 +102,7 @@ def test_lossless_frames_give_the_transforms_of_the_files(
     assert "0 refused, 0 dropped" in daemon.said() and "malformed" not in daemon.said()
 
 
+@pytest.mark.slow("7 s; lossless frames over the network are in the default run")
 def test_jpeg_is_close(sequence: Path, replayed: Lines, tmp_path: Path):
     lines, _ = fed(sequence, tmp_path, "jpeg")
     assert len(lines) == len(replayed)
@@ -134,6 +135,7 @@ def state_of(endpoint: str) -> dict[str, Any]:
     return states[0] if states else {}
 
 
+@pytest.mark.slow("7 s; lossless frames over the network are in the default run")
 def test_a_driver_that_is_killed_is_missed_and_welcome_again(sequence: Path, tmp_path: Path):
     endpoint = free_endpoint()
     config = network_config(sequence, f"{{listen: [{endpoint}]}}", name="killed")
@@ -151,6 +153,7 @@ def test_a_driver_that_is_killed_is_missed_and_welcome_again(sequence: Path, tmp
         assert "Traceback" not in daemon.said()
 
 
+@pytest.mark.slow("9 s; a driver that is killed and comes back is in the default run")
 def test_a_router_may_restart_in_the_middle(sequence: Path, tmp_path: Path):
     """Driver and daemon are its clients.  Nobody is helped: both find it again."""
     endpoint = free_endpoint()

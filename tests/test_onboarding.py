@@ -13,7 +13,6 @@ from support.plate_fingers import (
     CHEQUERBOARD,
     DISCS,
     OPENING_M,
-    box_gripper,
     outline_pixels,
     rough,
     standing,
@@ -21,7 +20,7 @@ from support.plate_fingers import (
     true_name,
 )
 from support.plates import Look
-from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip
+from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, sharp_gripper
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.plane import Coincidence, GivenCamera
@@ -62,14 +61,18 @@ def true_of(found: Coincidence, lens: LensSettings) -> np.ndarray:
 
 
 @pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    "known", [pytest.param(True, marks=pytest.mark.slow("2 s each; inferred ones are in the default run")), False]
+)
 def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
     """To reach: 0.02 mm across the line of sight and 0.05 mm along it."""
     camera = GivenCamera(PAPER_LENS)
     for seed in range(3):
         if known:
             guess = rough({name: true_corners(TRUE)[name] for name in NEAR}, seed)
-            found = KnownGripper(camera, box_gripper(), OPENING_M).look(image(target), sight(target), guess).coincidence
+            found = (
+                KnownGripper(camera, sharp_gripper(), OPENING_M).look(image(target), sight(target), guess).coincidence
+            )
         else:
             guess = rough(outline_pixels(TRUE), seed)
             found = UnknownGripper(camera, TARGETS[target]).look(image(target), sight(target), guess).coincidence
@@ -81,6 +84,7 @@ def test_the_tcp_from_one_image_and_rough_corners(target: str, known: bool):
         assert average([found], not known).warnings == ()
 
 
+@pytest.mark.slow("5 s: one hard case; chequerboards are in the test of the TCP")
 def test_a_chequerboards_lines_beside_a_finger_arent_taken_for_its_edges():
     """The board's lines run along the fingers' edges, some pixels beside them."""
     frame = standing(CHEQUERBOARD, turn_rad=0.0, shift_m=(0.0, 0.0), look=Look(supersampling=3))
@@ -94,7 +98,7 @@ def test_a_chequerboards_lines_beside_a_finger_arent_taken_for_its_edges():
 
 def test_a_strong_lens_bends_edges_and_they_are_still_lines():
     for method, guess in (
-        (KnownGripper(GivenCamera(STRONG_LENS), box_gripper(), OPENING_M), true_corners(TRUE, STRONG_LENS)),
+        (KnownGripper(GivenCamera(STRONG_LENS), sharp_gripper(), OPENING_M), true_corners(TRUE, STRONG_LENS)),
         (UnknownGripper(GivenCamera(STRONG_LENS)), outline_pixels(TRUE, STRONG_LENS)),
     ):
         taken = {name: uv for name, uv in guess.items() if not name.endswith("out_far")}
@@ -139,7 +143,7 @@ def test_the_inferred_gripper_is_the_true_one_and_a_monitor_takes_it():
     look = UnknownGripper(GivenCamera(PAPER_LENS)).look(image("discs"), sight("discs"), rough(outline_pixels(TRUE), 4))
     result = average([look.coincidence], True)
     model = UnknownGripper(GivenCamera(PAPER_LENS)).model("new", [look], result, (0.0, 0.06), None)
-    gripper, true = Gripper(model), box_gripper()
+    gripper, true = Gripper(model), sharp_gripper()
     assert outline.names == tuple(model.points)
     for name in gripper.corner_ids:
         want = true.model.points[true_name(name)].xyz_m
@@ -161,7 +165,7 @@ def test_the_inferred_gripper_is_the_true_one_and_a_monitor_takes_it():
 def test_points_of_an_outline_in_the_grippers_frame():
     outline = outlines_of({name: (float(u), float(v)) for name, (u, v) in outline_pixels(TRUE).items()})
     points_m = points_in_gripper(make_camera(PAPER_LENS), outline, outline.points, TRUE)
-    true = box_gripper().model.points
+    true = sharp_gripper().model.points
     for name, point in zip(outline.names, points_m, strict=True):
         finger, kind, side = name.split("_")
         foot = f"{finger}_{'inner' if side == 'far' else 'outer'}_{side}" if kind == "rise" else name
@@ -237,14 +241,14 @@ def test_corners_that_arent_there(name: str, to: tuple[float, float], reason: st
 
 
 def test_a_known_gripper_that_isnt_there():
-    method = KnownGripper(GivenCamera(PAPER_LENS), box_gripper(), OPENING_M)
+    method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
     empty = np.full_like(image("discs"), 150)
     with pytest.raises(CalibrationError, match="the gripper isn't seen where it should be"):
         method.look(empty, sight("discs"), rough({n: true_corners(TRUE)[n] for n in NEAR}, 6))
 
 
 def test_only_the_corners_that_were_named_are_taken():
-    method = KnownGripper(GivenCamera(PAPER_LENS), box_gripper(), OPENING_M)
+    method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
     guess = rough({name: true_corners(TRUE)[name] for name in ("L_in_near", "R_in_far")}, 7)
     look = method.look(image("discs"), sight("discs"), guess)
     assert look.coincidence.corners.names == ("L_in_near", "R_in_far")
@@ -257,6 +261,6 @@ def test_a_gripper_the_other_way_round_is_refused_beside_a_rough_calibration():
     true = true_corners(TRUE)
     other = {"L_in_near": "R_in_far", "L_in_far": "R_in_near", "R_in_near": "L_in_far", "R_in_far": "L_in_near"}
     guess = {name: tuple(map(float, true[place])) for name, place in other.items()}
-    method = KnownGripper(GivenCamera(PAPER_LENS), box_gripper(), OPENING_M, TRUE)
+    method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M, TRUE)
     with pytest.raises(CalibrationError, match=r"turned by 180 degrees"):
         method.look(image("discs"), sight("discs"), guess)

@@ -37,7 +37,11 @@ def box_model() -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("lens", [PAPER_LENS, STRONG_LENS, FISHEYE_LENS], ids=["paper", "brown_conrady", "fisheye"])
-@pytest.mark.parametrize("reported", [True, False], ids=["opening reported", "opening unknown"])
+@pytest.mark.parametrize(
+    "reported",
+    [True, pytest.param(False, marks=pytest.mark.slow("5 s each: sampled; a reported opening is in the default run"))],
+    ids=["opening reported", "opening unknown"],
+)
 def test_expected_sigmas_are_the_spread_of_sampled_measurements(lens: LensSettings, reported: bool):
     """A camera that stands, a robot that reports its jaws with the stated error or not at all."""
     rng, samples = np.random.default_rng(2), 250

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import binom, chi2
 from support.plate_views import CORNERS_M, EXACT, LENS, NAMES, Trial, moved, seen_by, solved, transform, trial
 
+from gripmon.calibrate import plane
 from gripmon.calibrate.plane import FingerCorners, GivenCamera, corners_of, lengths_of
 from gripmon.calibrate.plane_equations import back_project, coincide_linear, infer_rectangle, stand
 from gripmon.calibrate.plate_pose import plate_pose
@@ -114,7 +117,10 @@ def errors(known: bool, print_m: float) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.array(out), np.array(sizes), np.array(p_values)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    "known",
+    [pytest.param(True, marks=pytest.mark.slow("6 s: sampled; inferred corners are in the default run")), False],
+)
 @pytest.mark.parametrize(
     "print_m",
     [pytest.param(0.0, marks=pytest.mark.slow("9 s: sampled; with an uneven print it is in the default run")), 5e-5],
@@ -274,3 +280,13 @@ def test_the_projection_of_these_tests_is_the_papers():
         distorted * (1.0 + LENS.kappa_per_px2 * radius), LENS.fx_px * points[:, :2] / points[:, 2:], atol=1e-9
     )
     assert EXACT.covariance is None
+
+
+@pytest.mark.parametrize(("rms_share", "fits"), [(0.0045, True), (0.0055, False)])
+def test_a_plate_fits_the_camera_up_to_residuals_of_half_a_per_cent_of_the_width(
+    rms_share: float, fits: bool, monkeypatch: pytest.MonkeyPatch
+):
+    bundle = SimpleNamespace(rms_px=rms_share * LENS.width_px, scale=1.0)
+    monkeypatch.setattr(plane, "plate_pose", lambda *_: (np.eye(4), np.eye(6), bundle))
+    with nullcontext() if fits else pytest.raises(CalibrationError, match="the plate doesn't fit the camera"):
+        plane._plate(LENS, SimpleNamespace(disc_radius_m=0.002))

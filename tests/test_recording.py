@@ -90,7 +90,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
             text="unplugged",
         )
     )
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.dropped, writer.images_dropped, writer.failure) == (0, 0, None)
     assert writer.frames_written == COUNT
     (path,) = directory.glob("*.rrd")
@@ -261,7 +261,7 @@ def test_images_come_at_the_rate_and_at_events(tmp_path: Path) -> None:
     for i in range(60):
         state = State.DRIFTING if i in (31, 32) else State.TRACKING
         writer.offer(frame(i), record(i, state, alerts=(JUMP,) if i == 43 else ()), partial(trace, i))
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     assert told.seqs() == list(range(60))
@@ -275,7 +275,7 @@ def test_input_that_can_wait_is_recorded_completely(tmp_path: Path) -> None:
     writer = recorder(tmp_path, patience_s=20.0, queue_frames=16, queue_images=2, image_rate_hz=1000.0)
     for i in range(150):
         writer.offer(frame(i), record(i), partial(trace, i))
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped, writer.images_dropped) == (150, 0, 0)
     (path,) = tmp_path.glob("*.rrd")
     assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(150))
@@ -287,7 +287,7 @@ def test_a_new_reference_holds_from_the_frame_that_names_it(tmp_path: Path) -> N
     for i in range(12):
         writer.offer(frame(i), record(i, **({"reference_id": "second", "revision": 2} if i >= 7 else {})), lambda: None)
     writer.reference(moved)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     assert [cell.seq for cell in told.timed("rig/reference")] == [0, 7]
@@ -317,7 +317,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
             text="years later",
         )
     )
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     stamps = {cell.stamp_ns for cells in Recorded(path).cells.values() for cell in cells if cell.stamp_ns is not None}
     assert stamps == {START_NS + i * INTERVAL_NS for i in range(3)}
@@ -326,7 +326,7 @@ def test_alerts_of_another_clock_don_t_stretch_the_timeline(tmp_path: Path) -> N
 def test_the_daemon_s_process_never_imports_rerun(tmp_path: Path) -> None:
     script = (
         "import sys; from pathlib import Path; from support.recorded import *; w = recorder(Path(sys.argv[1]));"
-        "w.offer(frame(0), record(0), lambda: trace(0)); w.close(10.0);"
+        "w.offer(frame(0), record(0), lambda: trace(0)); w.close(60.0);"
         "assert w.frames_written == 1, w.failure; assert 'rerun' not in sys.modules"
     )
     here = Path(__file__).parent
@@ -357,5 +357,5 @@ def test_an_old_file_is_never_overwritten(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     wait_until(lambda: writer.path is not None)
     assert writer.path == tmp_path / "run-0002.rrd"
-    writer.close(10.0)
+    writer.close(60.0)
     assert (tmp_path / "run-0001.rrd").read_bytes() == b"precious"

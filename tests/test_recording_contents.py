@@ -112,7 +112,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     writer.command(COMMAND)
     writer.state(state(COUNT - 1, State.STALE))
     writer.alert(SILENT)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = directory.glob("*.rrd")
     return Recorded(path)
 
@@ -261,7 +261,7 @@ def test_a_later_file_stands_alone(tmp_path: Path) -> None:
         said = msgspec.structs.replace(told_of(i % 7), seq=i, **of_second)
         writer.offer(frame(i), said, partial(trace, 3), partial(notes, 9))
         i += 1
-    writer.close(20.0)
+    writer.close(60.0)
     alone = Recorded(tmp_path / "run-0002.rrd")
     assert alone.recording_ids == Recorded(tmp_path / "run-0001.rrd").recording_ids
     meta = json_of(alone, "meta", Meta)[None]

@@ -94,7 +94,7 @@ def test_a_full_disk(small_disk: Path) -> None:
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 5000, 10)
     second = writer.path
-    writer.close(20.0)
+    writer.close(60.0)
     assert second is not None and second != first
     assert Recorded(second).seqs() == list(range(5000, 5010))
     # The first file ends with a whole message, or readers would refuse all of it.
@@ -118,7 +118,7 @@ def test_a_disk_that_is_read_only(small_disk: Path) -> None:
     command("mount", "-o", "remount,rw", str(small_disk))
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 10, 10)
-    writer.close(20.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped) == (10, 10)
     (path,) = small_disk.glob("*.rrd")
     told = Recorded(path)
@@ -147,7 +147,7 @@ def test_a_disk_that_doesn_t_answer(freezable_disk: Path) -> None:
     wait_until(lambda: writer.frames_written + writer.dropped == count, LONG_S)
     offer_and_wait(writer, count, 10)
     assert writer.path == first, "it waited, and nothing was cut off"
-    writer.close(20.0)
+    writer.close(60.0)
     assert first is not None
     seqs = Recorded(first).seqs()
     assert seqs[:20] == list(range(20)) and seqs[-10:] == list(range(count, count + 10))
@@ -181,7 +181,7 @@ def test_a_process_that_is_stopped_is_noticed_and_frames_are_counted(tmp_path: P
     os.kill(worker, signal.SIGCONT)
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 10, 10)
-    writer.close(20.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped) == (20, 0)
 
 
@@ -245,6 +245,7 @@ def test_another_reason_is_told_and_other_figures_are_not() -> None:
     assert standing.text == updated.text
 
 
+@pytest.mark.slow("3 s; a directory that vanishes is in test_recording_faults")
 def test_a_directory_that_was_removed_is_made_again(tmp_path: Path) -> None:
     folder = tmp_path / "deep" / "recordings"
     writer = recorder(folder)
@@ -254,7 +255,7 @@ def test_a_directory_that_was_removed_is_made_again(tmp_path: Path) -> None:
     wait_until(lambda: writer.failure is None, LONG_S)
     offer_and_wait(writer, 200, 5)
     path = writer.path
-    writer.close(20.0)
+    writer.close(60.0)
     assert path is not None and path.parent == folder and Recorded(path).seqs()[-5:] == list(range(200, 205))
 
 

@@ -107,7 +107,7 @@ def test_a_killed_recording_process_is_replaced(tmp_path: Path) -> None:
     assert running_worker(writer) != worker
     offer_and_wait(writer, 30, 5)
     wait_until(lambda: writer.failure is None)
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped) == (35, 0)
     first, second = sorted(tmp_path.glob("*.rrd"))
     assert (first.name, second.name) == ("run-0001.rrd", "run-0002.rrd")
@@ -130,7 +130,7 @@ def test_frames_that_a_killed_process_took_with_it_are_counted(tmp_path: Path) -
     os.kill(worker, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
     assert writer.dropped == 20
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped) == (0, 20)
 
 
@@ -146,7 +146,7 @@ def test_a_stalled_process_costs_frames_not_memory(tmp_path: Path) -> None:
     assert 0 < writer.dropped < count + 100
     assert writer.images_dropped > 0
     os.kill(worker, signal.SIGCONT)
-    writer.close(10.0)
+    writer.close(60.0)
     assert writer.failure is None
     assert writer.frames_written + writer.dropped == count + 200
     (path,) = tmp_path.glob("*.rrd")
@@ -174,7 +174,7 @@ def test_signals_for_the_daemon_s_group_don_t_end_the_recording(tmp_path: Path) 
         os.kill(worker, number)
     offer_and_wait(writer, 0, 5)
     assert writer.process_id == worker
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.failure, writer.dropped) == (None, 0)
 
 
@@ -196,7 +196,7 @@ def test_a_full_disk_is_reported_and_recording_goes_on_afterwards(tmp_path: Path
     assert writer.path is not None and writer.path != first
     offer_and_wait(writer, 70, 10)
     last = writer.path
-    writer.close(10.0)
+    writer.close(60.0)
     assert (writer.frames_written, writer.dropped, writer.failure) == (20, 60, None)
     told = Recorded(last)
     assert told.seqs() == list(range(70, 80))
@@ -245,11 +245,12 @@ def test_a_directory_that_vanishes_is_reported(tmp_path: Path) -> None:
     directory.mkdir()
     wait_until(lambda: writer.failure is None)
     offer_and_wait(writer, 6, 3)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = directory.glob("*.rrd")
     assert Recorded(path).seqs() == [6, 7, 8]
 
 
+@pytest.mark.slow("3 s; that files roll over is in test_recording_kept")
 def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -> None:
     writer = recorder(tmp_path, max_file_bytes=150_000, flush_period_s=0.05, image_rate_hz=1000.0)
     running_worker(writer)
@@ -258,7 +259,7 @@ def test_long_recordings_roll_over_and_every_file_stands_alone(tmp_path: Path) -
             noise = np.random.default_rng(k).integers(0, 256, PICTURE.shape, np.uint8)
             writer.offer(frame(k, noise), record(k), partial(trace, k))
         wait_until(lambda count=i + 4: writer.frames_written == count)
-    writer.close(10.0)
+    writer.close(60.0)
     paths = sorted(tmp_path.glob("*.rrd"))
     assert len(paths) > 3
     assert [path.name for path in paths] == [f"run-{k:04d}.rrd" for k in range(1, len(paths) + 1)]
@@ -288,7 +289,7 @@ def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> No
     wait_until(lambda: writer.failure is not None)
     writer.offer(frame(8), record(8, reference_id="second", revision=2), partial(trace, 8))
     wait_until(lambda: writer.frames_written == 9)
-    writer.close(10.0)
+    writer.close(60.0)
     told = Recorded(tmp_path / "run-0002.rrd")
     (cell,) = told.timed("rig/reference")
     assert cell.values["translation"][0] == pytest.approx([0.002, 0.003, 0.2], rel=1e-6)
@@ -297,15 +298,15 @@ def test_a_new_reference_is_recorded_and_is_in_later_files(tmp_path: Path) -> No
 
 def test_close_releases_everything(tmp_path: Path) -> None:
     process = psutil.Process()
-    recorder(tmp_path / "warm").close(10.0)
+    recorder(tmp_path / "warm").close(60.0)
     descriptors, threads = open_files(), threading.active_count()
     children = {child.pid for child in process.children()}  # other tests may have left some
     writer = recorder(tmp_path / "run")
     offer(writer, 0, 10)
     assert {child.pid for child in process.children()} > children
     assert "gripmon-images" in Path("/proc/self/maps").read_text()
-    writer.close(10.0)
-    writer.close(10.0)
+    writer.close(60.0)
+    writer.close(60.0)
     assert open_files() == descriptors
     assert threading.active_count() == threads
     assert {child.pid for child in process.children()} <= children
@@ -315,7 +316,7 @@ def test_close_releases_everything(tmp_path: Path) -> None:
 def test_a_recorder_that_is_closed_at_once_still_leaves_a_complete_file(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     offer(writer, 0, 3)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     assert Recorded(path).seqs() == [0, 1, 2]
 
@@ -329,7 +330,7 @@ def test_a_broken_recorder_does_not_break_the_loop(tmp_path: Path, caplog: pytes
     wait_until(lambda: writer.failure is not None)
     assert "no truth here" in str(writer.failure) and "recording stopped" in caplog.text
     offer(writer, 5, 30)
-    writer.close(10.0)
+    writer.close(60.0)
     assert writer.dropped == 35 and "no truth here" in str(writer.failure)
     assert "gripmon-images" not in Path("/proc/self/maps").read_text()
 

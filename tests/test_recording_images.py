@@ -31,7 +31,7 @@ from gripmon.model.records import (
 def test_jpeg_looks_like_the_frame(tmp_path: Path) -> None:
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0), lambda: None)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     (cell,) = told.timed(OVERLAY)
@@ -55,7 +55,7 @@ def test_what_is_no_image_is_recorded_without_one(tmp_path: Path, picture: np.nd
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0), partial(trace, 0))
     writer.offer(frame(1, picture), refused, lambda: None)
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = tmp_path.glob("*.rrd")
     told = Recorded(path)
     assert (told.seqs(), set(told.by_seq(OVERLAY, "blob"))) == ([0, 1], {0})
@@ -68,7 +68,7 @@ def test_an_empty_trace_is_recorded(tmp_path: Path) -> None:
     empty = MeasurementTrace(none, np.empty(0, bool), np.empty(0, np.intp), np.empty(0), (), np.full((8, 2), np.nan))
     writer = recorder(tmp_path)
     writer.offer(frame(0), record(0, corners=()), lambda: empty)
-    writer.close(10.0)
+    writer.close(60.0)
     assert writer.failure is None and writer.dropped == 0
     (path,) = tmp_path.glob("*.rrd")
     assert Recorded(path).by_seq("quality/edge_points", "scalars") == {0: [0.0, 0.0]}

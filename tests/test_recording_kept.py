@@ -73,7 +73,7 @@ def test_every_image_around_an_alert_is_kept_and_few_elsewhere(tmp_path: Path) -
     writer = recorder(tmp_path, image_rate_hz=2.0, around_alert_s=0.5, image_format="png", queue_images=64)
     bump, around_it = 80, SECOND // 2
     run_through(writer, 0, 160, {bump: BUMP})
-    writer.close(20.0)
+    writer.close(60.0)
     assert (writer.dropped, writer.images_dropped) == (0, 0)
     (path,) = files_in(tmp_path)
     told = Recorded(path)
@@ -96,7 +96,7 @@ def test_an_alert_of_the_daemon_s_own_keeps_the_images_before_it(tmp_path: Path)
     run_through(writer, 0, 100, {})
     wait_until(lambda: writer.frames_written == 100)
     writer.alert(own(Alert(AlertKind.SOURCE, Cause.NO_CAMERA, Severity.ERROR, "no frame for 5 s"), 99))
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = files_in(tmp_path)
     # The first frame's image is there because the state was new with it.
     assert set(Recorded(path).by_seq(OVERLAY, "blob")) == {0, *range(100 - SECOND // 2, 100)}
@@ -106,7 +106,7 @@ def test_an_alert_of_the_daemon_s_own_keeps_the_images_before_it(tmp_path: Path)
 def test_every_nth_image(tmp_path: Path) -> None:
     writer = recorder(tmp_path, image_rate_hz=0.0, image_every=7, around_alert_s=0.0, queue_images=64)
     run_through(writer, 0, 60, {})
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = files_in(tmp_path)
     assert set(Recorded(path).by_seq(OVERLAY, "blob")) == set(range(0, 60, 7))
 
@@ -114,7 +114,7 @@ def test_every_nth_image(tmp_path: Path) -> None:
 def test_every_image_for_exact_replay(tmp_path: Path) -> None:
     writer = recorder(tmp_path, image_rate_hz=0.0, image_every=1, image_format="png", queue_images=64)
     run_through(writer, 0, 60, {})
-    writer.close(10.0)
+    writer.close(60.0)
     (path,) = files_in(tmp_path)
     told = Recorded(path).by_seq(OVERLAY, "blob")
     assert set(told) == set(range(60))

@@ -147,11 +147,11 @@ def test_a_killed_recorders_file_is_told_with_the_command_that_makes_it_whole(
     killed = writer.path
     os.kill(writer.process_id, signal.SIGKILL)
     wait_until(lambda: writer.failure is not None)
-    writer.close(10.0)
+    writer.close(60.0)
     with caplog.at_level(logging.INFO, "gripmon.record.write"):
         again = recorder(tmp_path)
         wait_until(lambda: "no footer" in caplog.text)
-        again.close(10.0)
+        again.close(60.0)
     (line,) = (text for text in caplog.messages if "no footer" in text)
     assert line.startswith(f"1 earlier recordings have no footer, as their recorder was killed, the newest {killed};")
     assert line.endswith("rerun rrd optimize FILE.rrd -o WHOLE.rrd")

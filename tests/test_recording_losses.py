@@ -72,7 +72,7 @@ def test_images_that_have_no_room_are_counted_and_said(tmp_path: Path, caplog: p
             writer.offer(frame(i, PICTURE), record(i), partial(trace, i))
         wait_until(lambda: "missing in the recording so far: 0 frames" in caplog.text)
         os.kill(process, signal.SIGCONT)
-        writer.close(20.0)
+        writer.close(60.0)
     assert (writer.dropped, writer.frames_written) == (0, 30)
     assert 0 < writer.images_dropped == 30 - len(pictures(tmp_path))
     assert f"missing in the recording so far: 0 frames; {writer.images_dropped} images of others" in caplog.text
@@ -89,7 +89,7 @@ def test_images_around_an_alert_that_had_no_room_are_counted_when_it_comes(tmp_p
     assert writer.images_dropped == 0
     writer.offer(frame(30, PICTURE), record(30, alerts=(DRIFT,)), partial(trace, 30))
     wait_until(lambda: writer.frames_written == 31)
-    writer.close(20.0)
+    writer.close(60.0)
     assert 0 < writer.images_dropped == 31 - len(pictures(tmp_path))
 
 

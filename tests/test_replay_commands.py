@@ -102,6 +102,7 @@ def jaw_on_network(session: zenoh.Session) -> Iterator[None]:
         thread.join()
 
 
+@pytest.mark.slow("24 s; a folder is replayed to the byte in the default run, without commands")
 def test_a_run_with_commands_and_a_kept_state_is_decided_again_to_the_byte(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

@@ -268,6 +268,7 @@ def test_both_runs_are_overlaid_in_a_new_recording(sequence: Path, tmp_path: Pat
     assert capsys.readouterr().err.splitlines() == [f"--recording {then}: is what is replayed; another file"]
 
 
+@pytest.mark.slow("4 s; other limits on the same recording are in the default run")
 def test_another_calibration_begins_with_its_own_reference(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):

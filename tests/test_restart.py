@@ -252,6 +252,7 @@ def cell(tmp_path: Path, pictures: Path) -> Iterator[Cell]:
         yield Cell(tmp_path, pictures, session, endpoint)
 
 
+@pytest.mark.slow("10 s; killed at any moment is in test_killed, what is kept in the default run")
 def test_undone_killed_and_started_again_it_goes_on(cell: Cell):
     kept = keep(cell.config, 2e-5, -1e-5)
     second, third = kept.references[1:]

@@ -88,6 +88,7 @@ def test_a_bad_zenoh_configuration_is_said_in_one_line(tmp_path: Path, file: str
     assert line.startswith(f"{config}: {said}") and file in line and ".rs:" not in line
 
 
+@pytest.mark.slow("6 s; late joiners are in test_publish")
 def test_a_router_that_comes_later_hears_what_was_missed(tmp_path: Path, endpoint: str):
     config = configured(tmp_path, f"{{mode: client, connect: [{endpoint}], retry_longest_s: 0.5}}")
     with running(config) as process:

@@ -40,7 +40,14 @@ def is_true(found: Measurement, cam_T_grip: np.ndarray) -> bool:
     return bool(np.abs(error[:2]).max() < 1.5e-4 and abs(error[2]) < 6e-4)
 
 
-@pytest.mark.parametrize(("scene", "least"), [("static", 29), ("bump", 29), ("clutter", 27)])
+@pytest.mark.parametrize(
+    ("scene", "least"),
+    [
+        pytest.param("static", 29, marks=pytest.mark.slow("clutter is in the default run")),
+        pytest.param("bump", 29, marks=pytest.mark.slow("clutter is in the default run")),
+        ("clutter", 27),
+    ],
+)
 def test_random_jumps_are_found_and_never_a_wrong_place_is_trusted(scene: str, least: int):
     """Of 30 jumps, in one frame; the third scene is full of straight edges."""
     rng, true = np.random.default_rng(11), nominal_cam_T_grip()

@@ -282,6 +282,7 @@ def test_renderers_end_when_their_parent_is_killed(started: tuple[subprocess.Pop
 # --- the simulator behind it ---
 
 
+@pytest.mark.slow("16 s; a simulated sequence, frame by frame, is in the default run")
 def test_the_live_camera_shows_what_the_simulator_renders(cameras: list[SimulatedCamera], scene: SimulatedScene):
     settings = SimulatedSettings(scenario="jaw_cycle", fps=25.0, seed=3)
     camera = open_source(settings, scene=scene)

@@ -126,6 +126,7 @@ def test_what_is_no_calibrated_lens_is_said_in_one_line(tmp_path: Path, capsys: 
         assert said.startswith(f"--lens {path}") and said.count("\n") == 1
 
 
+@pytest.mark.slow("3 s: how a sweep is shown; what it finds is in the default run")
 def test_table_and_picture(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "sweep.jpg"
     options = ["--distance", "0.06:0.3:4", "--tilt", "10:60:3", "--picture", str(path)]

@@ -168,6 +168,7 @@ def test_what_is_expected_is_what_check_says(rig: Rig, bench: Bench):
     assert (found.prospects.smallest > 0.0).all() and found.prospects.edges == outlook.edges
 
 
+@pytest.mark.slow("11 s: sampled; the corners' spread is in the default run")
 def test_the_pose_is_as_good_as_its_covariance_says():
     """Over poses, openings that are reported wrongly, and cameras that are calibrated wrongly, by what is stated."""
     gripper, rng = sharp_gripper(), np.random.default_rng(8)

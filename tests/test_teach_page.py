@@ -120,6 +120,7 @@ def test_from_four_dragged_corners_to_a_configuration(rig: Rig, driver: Any, tmp
     assert "sound" in capsys.readouterr().out
 
 
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
 def test_a_live_camera_and_two_pages(rig: Rig, driver: Any, tmp_path: Path):
     class Camera(MjpegServer):
         def stream(self, send: Any) -> None:
@@ -165,6 +166,7 @@ def test_a_live_camera_and_two_pages(rig: Rig, driver: Any, tmp_path: Path):
     assert (tmp_path / "teaching" / "live-000.png").is_file()
 
 
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
 def test_a_configuration_that_is_there_gets_its_line(rig: Rig, driver: Any, tmp_path: Path):
     given = yaml.safe_load((rig.folder / "sim" / "config.yaml").read_text())
     given["gripper"] = str(rig.folder / "gripper.yaml")
@@ -187,6 +189,7 @@ def test_a_configuration_that_is_there_gets_its_line(rig: Rig, driver: Any, tmp_
     assert load_config(tmp_path / "mine.yaml").taught is not None
 
 
+@pytest.mark.slow("a browser for each; from four corners to a configuration is in the default run")
 def test_rough_corners_without_a_gripper(rig: Rig, driver: Any, tmp_path: Path):
     """How they become a gripper is tested with the whole way."""
     with page(rig.image_path, "--camera", rig.options[1], "--out", tmp_path) as running:

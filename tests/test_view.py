@@ -191,8 +191,8 @@ def test_what_cannot_be_shown_is_said_in_one_line(
     (tmp_path / "text.rrd").write_text("no recording")
     (tmp_path / "right.rrd").write_bytes(b"RRF2 and more")
     for arguments, code, said in (
-        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run"),
-        (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run"),
+        (("none.rrd",), 2, f"{tmp_path}/none.rrd: there is no such file; recordings of gripmon run, or their folder"),
+        (("empty",), 2, f"{tmp_path}/empty: no .rrd file in it; recordings of gripmon run, or their folder"),
         (("text.rrd",), 2, f"{tmp_path}/text.rrd: is no recording; an .rrd file of gripmon's"),
         (("right.rrd", "--native"), 3, "view: there is no display for a window; the web viewer needs none"),
     ):

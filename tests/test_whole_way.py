@@ -1,6 +1,6 @@
 """The whole way of a new user, by the commands that the README names: a camera and a gripper of which nobody has a file
-become a monitor that notices a knock.  Commands and pages write every file: the tests write none.  Truth comes from the
-simulator.
+become a monitor that notices a knock.  Commands and pages write every file: the tests write none.  Truth comes from
+the simulator.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support import new_user
+from support.simulated import BOX_FINGERS, PAPER_LENS
 from support.teach_page_browser import DEADLINE_S, ROOT, Visitor, browser, page
 
 from gripmon.calibrate.documents import CameraCalibration, HandEyeCalibration
@@ -35,7 +36,7 @@ PORT = 7447
 """Where a configuration that nobody has edited listens."""
 CHI2_999 = 22.5
 """Of six degrees of freedom."""
-STEP = round(new_user.STEP_S * new_user.FPS)
+STEP = new_user.STEP
 
 
 @pytest.fixture(scope="module")
@@ -61,15 +62,15 @@ def calibrated(user: new_user.NewUser, driver: Any) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(user.folder)
         assert gripmon(f"calibrate intrinsics plate --target {new_user.TARGET} --model paper --out camera.yaml") == 0
-        _rough_corners(driver)
+        _rough_corners(user, driver)
         standing = "calibrate plane standing --target camera.yaml --camera camera.yaml --corners rough.yaml"
         assert gripmon(f"{standing} --infer --jaw-range 0:0.06 --gripper-out gripper.yaml --out hand_eye.yaml") == 0
     return user.folder
 
 
-def _rough_corners(driver: Any) -> None:
+def _rough_corners(user: new_user.NewUser, driver: Any) -> None:
     """Put on the page, some pixels off, with the mouse; without a browser its save request is sent by itself."""
-    clicks = {name: at.tolist() for name, at in new_user.corners_px(np.random.default_rng(4), off_px=4.0).items()}
+    clicks = {name: at.tolist() for name, at in user.rough_px(np.random.default_rng(4), off_px=4.0).items()}
     with page("standing/0.png", "--camera", "camera.yaml") as running:
         if driver is None:
             order = {"put": {"corners": clicks}, "robot": "robot", "camera_name": "camera"}
@@ -93,7 +94,7 @@ def gripmon(words: str) -> int:
 @pytest.mark.slow("17 s: each calibration has tests of its own; from teaching to a knock is in the default run")
 def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, calibrated: Path):
     camera = to_settings(read_yaml(calibrated / "camera.yaml"), CameraCalibration)
-    lens = new_user.PAPER_LENS
+    lens = PAPER_LENS
     true = {"fx_px": lens.fx_px, "fy_px": lens.fy_px, "cx_px": lens.cx_px, "cy_px": lens.cy_px}
     true |= {"kappa_per_px2": lens.kappa_per_px2}
     off = np.array([getattr(camera.camera, name) - true[name] for name in camera.parameters])
@@ -104,7 +105,7 @@ def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, cal
     error = perturbation_between(from_record(hand_eye.cam_T_grip), user.cam_T_grip[0])
     assert (np.abs(error[:3]) < [2e-5, 2e-5, 5e-5]).all()
     assert error @ np.linalg.solve(np.reshape(hand_eye.covariance, (6, 6)), error) < CHI2_999
-    found, true_gripper = load_gripper(calibrated / "gripper.yaml"), load_gripper(new_user.BOX_FINGERS)
+    found, true_gripper = load_gripper(calibrated / "gripper.yaml"), load_gripper(BOX_FINGERS)
     corners, real = (g.points_grip_m(new_user.OPENING_M) for g in (found, true_gripper))
     for name in INNER:
         twin = f"{name[0].upper()}_{name.split('_', 1)[1].replace('inner', 'in')}"
@@ -115,12 +116,13 @@ def test_camera_gripper_and_hand_eye_are_as_they_say(user: new_user.NewUser, cal
     assert closed[0] == pytest.approx(0.005, abs=3e-5)
 
 
+@pytest.mark.slow("a browser; without one it is in the default run")
 def test_taught_in_the_browser_the_monitor_notices_a_knock(
     user: new_user.NewUser, calibrated: Path, driver: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     if driver is None:
         pytest.skip("no headless browser")
-    clicks = new_user.corners_px(np.random.default_rng(3), off_px=4.0)
+    clicks = user.rough_px(np.random.default_rng(3), off_px=4.0)
     first = calibrated / "work" / "000000.png"
     with page(first, *_given(calibrated), "--out", tmp_path, "--robot", "arm1") as running:
         visitor = Visitor(driver, running.url)
@@ -152,7 +154,7 @@ def test_taught_without_a_page_the_running_monitor_notices_a_knock(
         capture_output=True, text=True, timeout=4 * DEADLINE_S, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=False,
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr
-    assert "drift raised" in ran.stderr and "the camera moved against the gripper" in ran.stderr
+    assert "step raised" in ran.stderr and "the camera moved against the gripper" in ran.stderr
     # The daemon decides what the replay decides, frame by frame.
     live = _lines(tmp_path / "run" / "estimates.jsonl")
     assert [_decided(r) for r in live] == [_decided(r) for r in records]
@@ -208,7 +210,7 @@ def _decided(record: dict[str, Any]) -> dict[str, Any]:
 def _held_against_the_truth(user: new_user.NewUser, records: list[dict[str, Any]]) -> None:
     """No alert before the knock, one after it with the right size; the TCP within what is stated, before and after."""
     assert len(records) == len(user.cam_T_grip)
-    raised = [k for k, record in enumerate(records) if any(a["kind"] == "drift" for a in record["alerts"])]
+    raised = [k for k, record in enumerate(records) if any(a["kind"] == "step" for a in record["alerts"])]
     assert raised and STEP <= raised[0] <= STEP + 25, raised
     assert records[STEP - 1]["state"] == "tracking" and records[-1]["state"] == "drifting"
     errors, sizes = [], []

@@ -3,7 +3,7 @@
     python calibrate_and_verify.py FOLDER
 
 FOLDER holds ``plate/`` (images of the plate, tilted to all sides), ``standing/`` (the gripper stands on the plate, put
-down anew for each image) and ``rough.yaml`` (about where the fingertips' corners are in these, see ``gripmon calibrate
+down again for each image) and ``rough.yaml`` (about where the fingertips' corners are in these, see ``gripmon calibrate
 plane --help``).
 """
 

@@ -127,9 +127,9 @@ def correct(
 
 def _check_target(out: Path, recordings: Sequence[Path]) -> None:
     if out.suffix.lower() not in _SUFFIXES:
-        raise InputError(f"{out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}")
+        raise InputError(f"--out {out}: its suffix says nothing; one of {', '.join(_SUFFIXES)}")
     if out.exists() and any(path.is_file() and path.samefile(out) for path in recordings):
-        raise InputError(f"{out}: is a recording to correct; another file")
+        raise InputError(f"--out {out}: is a recording to correct; another file")
 
 
 def _targets(out: Path, runs: int) -> list[Path]:
@@ -140,7 +140,7 @@ def _targets(out: Path, runs: int) -> list[Path]:
     there = next((target for target in targets if target.exists()), None)
     if there is not None:
         raise InputError(
-            f"{out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
+            f"--out {out}: each of {runs} runs gets a file of its own, and {there} is there already; another name"
         )
     return targets
 
@@ -152,18 +152,18 @@ def _stamps(path: Path) -> NDArray[np.int64]:
         texts = csv.read_csv(path, convert_options=options)["stamp_ns"].to_pylist()
     except KeyError:
         right = "a first line with the columns' names, capture times in Unix ns"
-        raise InputError(f"{path}: has no column stamp_ns; {right}") from None
+        raise InputError(f"--stamps {path}: has no column stamp_ns; {right}") from None
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
+        raise InputError(f"--stamps {path}: can't be read ({getattr(error, 'strerror', None) or error})") from None
     stamps = []
     for number, text in enumerate(texts, 2):
         try:
             stamps.append(np.int64(int(text)))
         except (ValueError, OverflowError):
             wrong = f"line {number}: '{text}' is not a capture time; a whole number, Unix ns"
-            raise InputError(f"{path}: {wrong}") from None
+            raise InputError(f"--stamps {path}: {wrong}") from None
     if not stamps:
-        raise InputError(f"{path}: holds no capture times")
+        raise InputError(f"--stamps {path}: holds no capture times")
     return np.array(stamps, np.int64)
 
 
@@ -197,7 +197,7 @@ def _distributed(runs: Sequence[CorrectedRun], wanted_ns: NDArray[np.int64]) -> 
         known |= inside
         out.append(dataclasses.replace(each, wanted_ns=wanted_ns[inside]))
     if not known.any():
-        raise NoResultError("none of the capture times lies in the recordings")
+        raise NoResultError("--stamps: none of the capture times lies in the recordings")
     if not known.all():
         faults.append(f"{(~known).sum()} of {len(known)} capture times lie in no recording")
     return out, faults

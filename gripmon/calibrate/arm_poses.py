@@ -90,7 +90,7 @@ def _take(found: _Found, table: Path, row: Row, place: str, camera: LensSettings
         if not row.get("image"):
             raise ValueError(f"{place}: has neither cam_tx_m … nor image; the target's pose, or an image of it")
         if camera is None or target is None:
-            raise InputError("images need a camera and a target (--camera, --target); both of them")
+            raise InputError("images need --camera and --target; both of them")
         path = table.parent / str(row["image"])
         found.images.append(path)
         image = image_in(path)

@@ -17,14 +17,14 @@ from gripmon.model.camera import LensSettings
 from gripmon.model.records import Array
 
 DOUBTFUL_FOCAL = 0.01
-"""Relative standard deviation of the focal length from which the views are said not to support it; and the one from
-which there is no calibration."""
+"""Relative standard deviation of the focal length from which a warning names it; and the one from which there is no
+calibration."""
 USELESS_FOCAL = 0.2
 COVERED = 0.6
 """Part of the image's half diagonal that points should reach: beyond them the lens is extrapolated."""
 LARGE_RMS_SHARE = 0.0007
-"""Root mean square residual over the image's width from which it is said to be large; and the one from which no camera
-of the model fits at all."""
+"""Root mean square residual over the image's width from which a warning calls it large; and the one from which no
+camera of the model fits at all."""
 LARGEST_RMS_SHARE = 0.003
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
 Plane Coincidence Constraint of the self-viewing method): the contact plane of its fingertips is the
-plate.  The fingers may hide part of the pattern.  Several images, the gripper put down anew for each,
+plate.  The fingers may hide part of the pattern.  Several images, the gripper put down again for each,
 are averaged.
 
 The gripper is known (--gripper), or it is inferred from the same images (--infer): the four innermost

@@ -77,14 +77,13 @@ def run(arguments: argparse.Namespace) -> int:
         file=sys.stderr,
     )
     view = viewing.LiveView(settings.view, arguments.view, str(config.path)) if viewed else None
-    bar = common.progress_bar(demo.frame_count, "frame")
-    with signals_exit() as stop, bar as step, ExitStack() as messages:
+    with signals_exit() as stop, common.progress_bar(demo.frame_count, "frame") as step, ExitStack() as messages:
         code, summary = demo.run(
             out,
-            stop=stop,
             step=step,
             on_network=lambda: messages.enter_context(common.messages_above_bar("gripmon")),
             view=view,
+            stop=stop,
         )
     if summary is None:
         print("demo: no frame was processed", file=sys.stderr)

@@ -21,23 +21,23 @@ if TYPE_CHECKING:
     from gripmon.model.stopping import EXIT_DONE, EXIT_INTERRUPTED, StopRequest
 
 _WHERE = {
-    "EXIT_DONE": "running",
-    "EXIT_FAILED": "supervised",
-    "EXIT_INTERRUPTED": "running",
-    "CommandFeed": "neighbours",
-    "Daemon": "loop",
-    "DaemonSettings": "settings",
-    "EstimatesFile": "estimates",
-    "JawFeed": "neighbours",
-    "MonitorLike": "neighbours",
-    "PulseFeed": "neighbours",
-    "Reports": "neighbours",
-    "SecondCamera": "second",
-    "StateKeeper": "keeping",
-    "StopRequest": "running",
-    "log_to_stderr": "running",
-    "run": "running",
-    "run_second": "running",
+    "EXIT_DONE": "gripmon.model.stopping",
+    "EXIT_FAILED": "gripmon.daemon.supervised",
+    "EXIT_INTERRUPTED": "gripmon.model.stopping",
+    "CommandFeed": "gripmon.daemon.neighbours",
+    "Daemon": "gripmon.daemon.loop",
+    "DaemonSettings": "gripmon.daemon.settings",
+    "EstimatesFile": "gripmon.daemon.estimates",
+    "JawFeed": "gripmon.daemon.neighbours",
+    "MonitorLike": "gripmon.daemon.neighbours",
+    "PulseFeed": "gripmon.daemon.neighbours",
+    "Reports": "gripmon.daemon.neighbours",
+    "SecondCamera": "gripmon.daemon.second",
+    "StateKeeper": "gripmon.daemon.keeping",
+    "StopRequest": "gripmon.model.stopping",
+    "log_to_stderr": "gripmon.daemon.running",
+    "run": "gripmon.daemon.running",
+    "run_second": "gripmon.daemon.running",
 }
 
 __all__ = [
@@ -64,4 +64,4 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'gripmon.daemon' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"gripmon.daemon.{_WHERE[name]}"), name)
+    return getattr(importlib.import_module(_WHERE[name]), name)

@@ -90,15 +90,15 @@ class Demo:
         self,
         out: Path,
         *,
-        stop: StopRequest,
         step: Callable[[], None],
         on_network: Callable[[], object],
         view: LiveView | None = None,
+        stop: StopRequest | None = None,
     ) -> tuple[int, DemoSummary | None]:
         """The daemon's exit code, and the summary, which is also written to ``out``; None if no frame was processed.
 
-        ``stop``: see :func:`run_monitor`.  ``step`` is called for each transform that arrives, ``on_network`` when the
-        client has joined.
+        ``step`` is called for each transform that arrives, ``on_network`` when the client has joined; ``stop``: see
+        :func:`gripmon.daemon.starting.run_monitor`.
         """
 
         def truth_tcp_m(seq: int) -> tuple[float, float, float]:

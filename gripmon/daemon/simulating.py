@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from collections.abc import Callable
@@ -13,14 +14,24 @@ import msgspec
 from gripmon import __version__
 from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
 from gripmon.model.errors import InputError
-from gripmon.simulate import Scenario, Simulator, make_scenario, write_sequence
+from gripmon.simulate import (
+    CALIBRATION_KINDS,
+    SCENARIO_NAMES,
+    Rig,
+    Scenario,
+    Simulator,
+    image_count,
+    make_scenario,
+    write_calibration_images,
+    write_sequence,
+)
 
 
 class SimulatedImages(NamedTuple):
-    """The folder, a configuration that fits, and how many frames there are."""
+    """The folder, a configuration that fits (None where calibrations come first), and how many images there are."""
 
     folder: Path
-    config: Path
+    config: Path | None
     frames: int
 
 
@@ -38,19 +49,25 @@ def simulate_images(
     ``config.yaml`` with ``gripper.yaml`` to a new or empty folder.
 
     ``scenario`` is a built-in name (:data:`gripmon.simulate.SCENARIO_NAMES`), which ``duration_s`` (s) and ``fps``
-    (1/s) stretch, or a YAML file.  ``config`` has camera, gripper and calibration; None: those of the demo.  ``step``
-    is called after each frame with how many are done, of how many.  The same seed gives the same images.
+    (1/s) stretch, or a YAML file; or what a calibration starts from (:data:`gripmon.simulate.CALIBRATION_KINDS`):
+    single images with ``truth.json``.  "work" and these come without a configuration: the calibrations make it.
+    ``config`` has camera, gripper and calibration; None: those of the demo.  ``step`` is called after each image with
+    how many are done, of how many.  The same seed gives the same images.
 
     Raises :class:`InputError`: an unknown scenario, one that doesn't fit the configuration, a folder that isn't empty.
     """
     out = Path(out)
     config = load_config(builtin_config("demo.yaml"), check_source=False) if config is None else config
+    if scenario in CALIBRATION_KINDS:
+        return _calibration_images(str(scenario), out, config, seed, (duration_s, fps), step)
     made = _scenario(scenario, config, duration_s, fps)
     try:
         simulator = Simulator(config.camera, config.gripper, config.cam_T_grip, made, seed)
     except ValueError as error:
         raise InputError(f"{scenario}: {error}") from None
     _make_empty(out)
+    if scenario == "work":
+        return SimulatedImages(out, None, write_sequence(simulator, out, step))
     shutil.copyfile(config.gripper_path, out / "gripper.yaml")
     (out / "config.yaml").write_text(_config_text(config, made, seed), encoding="utf-8")
     return SimulatedImages(out, out / "config.yaml", write_sequence(simulator, out, step))
@@ -62,10 +79,41 @@ def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: f
         if duration_s is not None or fps is not None:
             raise InputError(f"{name}: --seconds and --fps are for built-in scenarios; duration_s and fps in the file")
         return load_scenario(path)
+    if name not in SCENARIO_NAMES:
+        raise InputError(f"simulate: there is no '{name}'; one of {', '.join((*SCENARIO_NAMES, *CALIBRATION_KINDS))}")
     try:
-        return make_scenario(str(name), duration_s=duration_s, fps=fps, finger=config.gripper.finger_ids[0])
+        return make_scenario(
+            str(name),
+            duration_s=duration_s,
+            fps=fps,
+            finger=config.gripper.finger_ids[0],
+            jaw_opening_m=_rig(config).jaw_opening_m,
+        )
     except ValueError as error:
         raise InputError(f"simulate: {error}") from None
+
+
+def _rig(config: Config) -> Rig:
+    return Rig(config.camera, config.gripper, config.cam_T_grip)
+
+
+def _calibration_images(
+    kind: str,
+    out: Path,
+    config: Config,
+    seed: int,
+    stretched: tuple[float | None, float | None],
+    step: Callable[[int, int], None],
+) -> SimulatedImages:
+    if stretched != (None, None):
+        raise InputError(f"simulate: {kind} is single images; neither --seconds nor --fps")
+    _make_empty(out)
+    count, done = image_count(kind), itertools.count(1)
+    try:
+        write_calibration_images(kind, _rig(config), out, seed, lambda: step(next(done), count))
+    except ValueError as error:
+        raise InputError(f"simulate {kind}: {error}") from None
+    return SimulatedImages(out, None, count)
 
 
 def _make_empty(path: Path) -> None:

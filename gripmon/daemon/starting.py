@@ -43,7 +43,7 @@ def run_monitor(
     config: Config,
     *,
     out: Path | None,
-    stop: StopRequest,
+    stop: StopRequest | None = None,
     duration_s: float | None = None,
     verbose: bool = False,
     recording_name: str | None = None,
@@ -57,12 +57,12 @@ def run_monitor(
 ) -> int:
     """Open everything that a configuration names and run the daemon on it; returns the exit code.
 
-    ``stop``: from :func:`gripmon.model.stopping.signals_exit`, in which this is called.
-    ``out`` is a folder for ``estimates.jsonl`` and the recording.  ``truth_tcp_m``, which a simulation has, gives the
-    TCP's true position in the camera frame for a frame's ``seq``; it goes into the recording.  ``on_network`` is called
-    when the publisher is open, before the camera is.  ``warns``: it is logged when the view can't keep the alert
-    limits.  ``keep_state``: what survives a restart is read from the configuration's state file, unless
-    ``fresh_state``, and kept there.  ``view`` shows it live; ``take_over``: see
+    ``out`` is a folder for ``estimates.jsonl`` and the recording.  ``stop``: from
+    :func:`gripmon.model.stopping.signals_exit`, in which a program with a terminal calls this.  ``truth_tcp_m``, which
+    a simulation has, gives the TCP's true position in the camera frame for a frame's ``seq``; it goes into the
+    recording.  ``on_network`` is called when the publisher is open, before the camera is.  ``warns``: it is logged when
+    the view can't keep the alert limits.  ``keep_state``: what survives a restart is read from the configuration's
+    state file, unless ``fresh_state``, and kept there.  ``view`` shows it live; ``take_over``: see
     :func:`gripmon.daemon.network.open_network`.
 
     Raises :class:`InputError` for what can't be opened as configured or written to ``out``.

@@ -87,8 +87,7 @@ def check_size(name: str, image: Image, width_px: int, height_px: int) -> None:
     height, width = image.shape[:2]
     if (width, height) != (width_px, height_px):
         raise InputError(
-            f"{name}: is {width} x {height} px, the camera {width_px} x {height_px}; images of this camera, as it was "
-            "calibrated"
+            f"{name}: {width} x {height} px; the camera's {width_px} x {height_px} px, as it was calibrated"
         )
 
 

@@ -20,7 +20,7 @@ from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
 from gripmon.track.edges import Measurement
-from gripmon.track.look import GripperLook, LookRefused
+from gripmon.track.look import FingerStrips, GripperLook, LookRefused
 
 PROOF_EVERY = 4
 """While the gripper is where it was, its ends are looked at in one of so many frames."""
@@ -71,6 +71,7 @@ class Integrity:
         self._tracker, self._policy = tracker, settings.policy
         self._weigher = Weigher(tracker, gripper, settings, reference)
         self._look = GripperLook(camera, gripper, tracker.finger_axis if tracker.finger_axis.any() else ALONG_Z)
+        self._strips = FingerStrips(camera, gripper, tracker.along)
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
         self._frames = 0
@@ -137,12 +138,31 @@ class Integrity:
         here = _Candidate(measurement, cam_T_grip, covariance, trust)
         if not trust.displaced or (trust.proven and self._beside_px(measurement, cam_T_grip) < ONE_EDGE_PX):
             return self._conclude(frame, here, now_s)
+        here = self._slid_back(frame, here, now_s)
+        measurement, cam_T_grip, _, trust = here
+        if not trust.displaced:
+            return self._conclude(frame, here, now_s)
         if trust.proven:
             ends = self._tracker.ends(frame, measurement, strict=True)
             strictly = weigh(measurement, cam_T_grip, ends, now_s)
             proven = strictly.proven and not self._look_contradicts(frame, measurement, cam_T_grip)
             here = here._replace(trust=replace(strictly, proven=proven))
         return self._against_its_place(frame, here, trust, now_s)
+
+    def _slid_back(self, frame: Frame, here: _Candidate, now_s: float) -> _Candidate:
+        """A displaced pose, or where the fingers show that it has slid from along them: something else was taken for
+        their ends.  If the gripper isn't measured there either, the same without the ends.
+        """
+        slide_m = self._slide_m(frame, here)
+        if slide_m is None:
+            return here
+        weigher, (measurement, cam_T_grip, _, trust) = self._weigher, here
+        slid_T = cam_T_grip.copy()
+        slid_T[:3, 3] += cam_T_grip[:3, :3] @ slide_m
+        again = self._measured(frame, slid_T, weigher.sigma(now_s), now_s)
+        if again is None or self._slide_m(frame, again) is not None:
+            return here._replace(trust=weigher.weigh(measurement, cam_T_grip, trust.ends, now_s, slid=True))
+        return again
 
     def _beside_px(self, measurement: Measurement, cam_T_grip: Array) -> float:
         """How far the edges show from where the gripper is expected, px."""
@@ -178,13 +198,21 @@ class Integrity:
         look like their ends elsewhere.
         """
         weigher = self._weigher
-        measurement = self._tracker.measure_held(frame, weigher.expected[0], weigher.sigma(now_s))
+        there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
+        return None if there is None or there.trust.displaced else there
+
+    def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
+        """The measurement at a pose (4, 4) with what lies within the standard deviations (6,) of it; None where nothing
+        is seen.
+        """
+        measurement = self._tracker.measure_held(frame, cam_T_grip, sigma)
         if measurement.consensus.share == 0.0:
             return None
         measurement.trusted = True
         cam_T_grip, covariance = self._tracker.update(measurement)
-        trust = weigher.weigh(measurement, cam_T_grip, self._tracker.ends(frame, measurement), now_s)
-        return None if trust.displaced else _Candidate(measurement, cam_T_grip, covariance, trust)
+        ends = self._tracker.ends(frame, measurement)
+        trust = self._weigher.weigh(measurement, cam_T_grip, ends, now_s)
+        return _Candidate(measurement, cam_T_grip, covariance, trust)
 
     def _conclude(self, frame: Frame, candidate: _Candidate, now_s: float) -> Standing:
         """What to publish of a place, and whether it becomes the anchor."""
@@ -197,6 +225,7 @@ class Integrity:
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if frame.image is not None and not moved:
                 self._look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
+                self._strips.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
 
@@ -224,6 +253,15 @@ class Integrity:
             return False
         poses = np.stack([cam_T_grip, self._weigher.expected[0]])
         return self._look.compare(frame.image, poses, measurement.jaw_opening_m).contradicts(LOOK_RISK)
+
+    def _slide_m(self, frame: Frame, here: _Candidate) -> Array | None:
+        """By how much (3,), gripper frame, the fingers are seen to stand along themselves from a candidate's pose; None
+        where they don't.
+        """
+        if frame.image is None:
+            return None
+        opening_m = here.measurement.jaw_opening_m
+        return self._strips.slide_m(frame.image, here.cam_T_grip, opening_m, LOOK_RISK)
 
     def _look_supports(self, frame: Frame, measurement: Measurement, cam_T_grip: Array) -> bool:
         """Whether the gripper's look is seen at a pose (4, 4)."""

@@ -112,11 +112,14 @@ class Weigher:
         now_s: float,
         explained: int | None = None,
         look_seen: bool = False,
+        slid: bool = False,
     ) -> Trust:
         """What is known of the error of ``cam_T_grip`` (4, 4), which was made of the measurement.
 
         ``ends``: what is seen of the fingers' ends; None where that wasn't looked at.  ``explained``: number of the
-        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there.
+        hypothesis under which the pose follows from the anchor; ``look_seen``: the gripper's look is seen there;
+        ``slid``: the fingers are seen elsewhere along themselves, so that what was taken for their ends is something
+        else.
         """
         risk, edges = self._policy.integrity_risk, measurement.normal.edge
         if not len(edges):
@@ -128,9 +131,9 @@ class Weigher:
         holds = anchored.surprise <= DISPLACED
         displaced = not holds[0] and explained is None
         again = bool(anchored.surprise[0] <= UNUSUAL) and (self.anchor is None or self.anchor.confirmed)
-        proven = _proven(ends, displaced, again)
+        proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
-        misread = 0.0 if proven else MISREAD_END ** self.confirmations(measurement, ends, kept)
+        misread = 0.0 if proven else 1.0 if slid else MISREAD_END ** self.confirmations(measurement, ends, kept)
         prior = hypotheses.prior.copy()
         prior[hypotheses.ends] = misread * (LOOK_RISK if look_seen else 1.0)
         if self.anchor is None:

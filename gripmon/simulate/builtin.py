@@ -113,6 +113,17 @@ def _lighting(t: float, fps: float) -> Scenario:
     return Scenario(name="lighting", duration_s=t, fps=fps, light=light, sensor=Sensor(jpeg_quality=80))
 
 
+def _work(t: float, fps: float, jaw_opening_m: float | None) -> Scenario:
+    """The robot wanders over a table; then something hits the camera."""
+    return Scenario(
+        name="work",
+        duration_s=t,
+        fps=fps,
+        mount=(Bump(at_s=_between_frames(0.5 * t, fps), tcp_shift_m=(0.0, 0.0009)),),
+        jaw=JawScript(knots=() if jaw_opening_m is None else ((0.0, jaw_opening_m),)),
+    )
+
+
 def _series(name: str, tcp_shift_m: tuple[float, float], sigma_m: float) -> Scenario:
     """As in the paper the gripper is parked on the calibration plate, in both images of a pair."""
     plate = Background(
@@ -139,16 +150,22 @@ _TIMED: dict[str, tuple[Callable[[float, float], Scenario], float]] = {
     "hand": (_hand, 12.0),
     "lighting": (_lighting, 12.0),
 }
-SCENARIO_NAMES = (*_TIMED, "bent_finger", "series1", "series2")
+SCENARIO_NAMES = (*_TIMED, "work", "bent_finger", "series1", "series2")
 DEFAULT_FPS = 30.0
 
 
 def make_scenario(
-    name: str, *, duration_s: float | None = None, fps: float | None = None, finger: str = "left"
+    name: str,
+    *,
+    duration_s: float | None = None,
+    fps: float | None = None,
+    finger: str = "left",
+    jaw_opening_m: float | None = None,
 ) -> Scenario:
     """A named scenario, its times scaled to a duration (its own if None).
 
-    ``finger`` is the one that ``bent_finger`` bends.  The series are the paper's: twenty pairs of images, without a
+    ``finger`` is the one that ``bent_finger`` bends, ``jaw_opening_m`` where the jaws stand in ``work`` (nominal if
+    None).  The series are the paper's: twenty pairs of images, without a
     time scale, so a duration or a frame rate is refused.  ValueError for an unknown name.
     """
     if name in ("series1", "series2"):
@@ -159,6 +176,8 @@ def make_scenario(
     rate = DEFAULT_FPS if fps is None else fps
     if name == "bent_finger":
         return _bent_finger(10.0 if duration_s is None else duration_s, rate, finger)
+    if name == "work":
+        return _work(3.0 if duration_s is None else duration_s, rate, jaw_opening_m)
     if name not in _TIMED:
         raise ValueError(f"scenario: there is no '{name}'; one of {', '.join(SCENARIO_NAMES)}")
     make, default_s = _TIMED[name]

@@ -9,7 +9,7 @@ import cv2
 
 from gripmon.simulate.sequence import Simulator
 
-_PNG_COMPRESSION = 1  # noise doesn't compress; time matters more
+PNG_COMPRESSION = 1  # noise doesn't compress; time matters more
 
 
 def write_sequence(simulator: Simulator, out_dir: Path, progress: Callable[[int, int], None] | None = None) -> int:
@@ -29,7 +29,7 @@ def write_sequence(simulator: Simulator, out_dir: Path, progress: Callable[[int,
         for index in range(total):
             file = f"{index:0{digits}d}.png"
             image, truth = simulator.render(index), simulator.truth(index)
-            if not cv2.imwrite(str(out_dir / file), image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_COMPRESSION]):
+            if not cv2.imwrite(str(out_dir / file), image, [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]):
                 raise OSError(f"can't write {out_dir / file}")
             opening = "" if truth.jaw_reported_m is None else repr(truth.jaw_reported_m)
             stamps.write(f"{file},{truth.stamp_ns},{opening}\n")

@@ -172,13 +172,13 @@ def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamer
 def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
     if not gripper.has_jaw:
         if opening_m is not None:
-            raise InputError(f"jaw opening: {gripper.name} has no jaw; leave it out")
+            raise InputError(f"--jaw-opening: {gripper.name} has no jaw; leave it out")
         return None
     if opening_m is None:
         return gripper.jaw_nominal_m
     if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
         raise InputError(
-            f"jaw opening {opening_m:g} m: the gripper's is {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+            f"--jaw-opening {opening_m:g}: the gripper's is {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
         )
     return opening_m
 

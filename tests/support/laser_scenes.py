@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import sys
 from pathlib import Path
 
@@ -23,6 +24,7 @@ __all__ = [
     "scene",
     "sides",
     "translation_error",
+    "write_csv",
 ]
 
 STEP = 1e-6
@@ -54,3 +56,11 @@ def assert_same(found, truth, tolerance=1e-9):
 def translation_error(setup, truth):
     found, right = invert(setup.cam_T_base)[:3, 3], invert(truth.cam_T_base)[:3, 3]
     return np.linalg.norm(found - right) / np.linalg.norm(right)
+
+
+def write_csv(path, rows):
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    return path

@@ -13,6 +13,7 @@ LONGEST = (
     "test_restart",
     "test_killed",
     "test_whole_way",
+    "test_first_run",
     "test_replay_recording",
     "test_plane",
     "test_sampling",

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
-import yaml
 
 from gripmon.model.camera import LensSettings, make_camera
-from gripmon.model.gripper import Gripper, GripperModel
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
 from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
 from support.plates import Look, render
-from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
 CHEQUERBOARD = Chequerboard(14, 12, 0.006)
 CHARUCO = Charuco(14, 12, 0.006, 0.0044, "DICT_4X4_250")
@@ -22,15 +19,6 @@ DISCS = CircleGrid(12, 10, 0.008, 0.004)
 OPENING_M = 0.034
 LOOK = Look(supersampling=4)
 FACE_GREYS = (60.0, 110.0, 90.0, 75.0, 100.0, 120.0)
-
-
-@functools.lru_cache(maxsize=1)
-def box_gripper() -> Gripper:
-    """The box fingers without bevels."""
-    model = yaml.safe_load(BOX_FINGERS.read_text())
-    for edge in model["edges"].values():
-        edge.pop("bevel_m", None)
-    return Gripper(msgspec.convert(model, GripperModel))
 
 
 @dataclass(frozen=True)
@@ -81,7 +69,7 @@ def standing(
     centre = 0.5 * middle[2] * np.array(middle[:2]) + (middle[2] if isinstance(target, Charuco) else 0.0) * 0.5
     standing_T_plate[:2, 3] = np.array(shift_m) - standing_T_plate[:2, :2] @ centre
     lifted = np.eye(4) if grip_T_standing is None else grip_T_standing
-    faces = Faces(box_gripper(), cam_T_grip, jaw_opening_m)
+    faces = Faces(sharp_gripper(), cam_T_grip, jaw_opening_m)
     return render(lens, cam_T_grip @ lifted @ standing_T_plate, target, look, solid=faces, seed=seed)
 
 
@@ -89,7 +77,7 @@ def true_corners(
     cam_T_grip: np.ndarray, lens: LensSettings = PAPER_LENS, jaw_opening_m: float = OPENING_M
 ) -> dict[str, np.ndarray]:
     """Pixels of all corners by name."""
-    gripper = box_gripper()
+    gripper = sharp_gripper()
     points = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points]
     uv = make_camera(lens).project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
     return dict(zip(gripper.corner_ids, uv, strict=True))
@@ -104,7 +92,7 @@ def outline_pixels(
     """Pixels of the two fingertips' outlines in view, by the names for a gripper that isn't known; the true corners'
     names are those of :func:`true_name`.
     """
-    gripper, camera = box_gripper(), make_camera(lens)
+    gripper, camera = sharp_gripper(), make_camera(lens)
     points_m = gripper.points_grip_m(jaw_opening_m)
     out = {}
     for finger in ("left", "right"):

@@ -23,7 +23,7 @@ from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
 from gripmon.model.geometry import perturb
 from gripmon.model.provenance import provenance_of
 from gripmon.model.records import Array, Image
-from support.laser_images import spot_image
+from gripmon.simulate.laser import spot_image
 from support.laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
 
 PREFIX = "gripmon/cell/second"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import msgspec
@@ -48,6 +49,7 @@ def nominal_cam_T_grip(
     return cam_T_grip
 
 
+@functools.lru_cache(maxsize=1)
 def sharp_gripper() -> Gripper:
     """The box fingers without bevels."""
     model = yaml.safe_load(BOX_FINGERS.read_text())

@@ -1,8 +1,4 @@
-"""Laser set-ups with known truth: the laser-pointer paper's, and poses that keep the spot in view.
-
-The paper doesn't say how far the hand may be from the plane, how slanted the beam, nor how long the shifts: here the
-laser is 15 to 35 cm from its spot, up to 50 degrees off the plane's normal, shifts are up to 12 cm.
-"""
+"""Laser set-ups with known truth: the laser-pointer paper's, and poses that keep the spot in view."""
 
 from __future__ import annotations
 
@@ -11,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
+from gripmon.laser.pointer.setup import LaserSetup
 from gripmon.model.camera import BrownConradyLens, Camera, make_camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
+from gripmon.simulate.laser import LaserCell, paper_cell, pixels_of, poses_on_plane
 
 PAPER_LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=543.0, fy_px=543.0, cx_px=320.0, cy_px=240.0)
 
@@ -29,13 +26,8 @@ class LaserData:
 
 
 def paper_setup(rng: np.random.Generator) -> LaserSetup:
-    """The paper's simulation: base_T_cam, laser, and a plane 550 mm away that is tilted by up to 5 degrees twice."""
-    rotation = Rotation.from_euler("ZYX", [-90.0, -10.0, -170.0], degrees=True).as_matrix()
-    base_T_cam = make_transform(rotation, np.array([0.510, 0.151, 0.430]))
-    theta, phi = np.radians([-1.80, 53.39])
-    beam = np.array([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)])
-    normal = Rotation.from_euler("xy", rng.uniform(-5.0, 5.0, 2), degrees=True).apply([0.0, 0.0, 1.0])
-    return LaserSetup(invert(base_T_cam), normal, 0.55 * float(normal[2]), np.array([0.0, -0.010, 0.030]), beam)
+    """The paper's simulation."""
+    return LaserSetup(**vars(paper_cell(rng)))
 
 
 REAL_LENS = BrownConradyLens(
@@ -65,49 +57,8 @@ def sampled(
 ) -> LaserData:  # fmt: skip
     """Ten spots an orientation: a first pose and three shifts along each of three random directions."""
     camera = make_camera(lens)
-    base_T_cam = invert(setup.cam_T_base)
-    poses: list[Array] = []
-    while len(poses) < 10 * orientations:
-        target = camera.undistort(rng.uniform([0.1, 0.1], [0.9, 0.9], (1, 2)) * [lens.width_px, lens.height_px])
-        ray = np.array([*target[0], 1.0])
-        spot = ray * setup.distance_m / (setup.normal_cam @ ray)
-        tilt, around = np.radians(tilt_deg) * np.sqrt(rng.uniform()), rng.uniform(0.0, 2.0 * np.pi)
-        lean = Rotation.from_rotvec(tilt * np.array([np.cos(around), np.sin(around), 0.0]))
-        beam = lean.apply(setup.normal_cam)
-        turned = Rotation.align_vectors([beam], [setup.direction_ee])[0]
-        turned = turned * Rotation.from_rotvec(setup.direction_ee * rng.uniform(-np.pi / 3, np.pi / 3))
-        base_R_ee = base_T_cam[:3, :3] @ turned.as_matrix()
-        laser = spot - beam * rng.uniform(*reach_m)
-        first = base_T_cam[:3, :3] @ laser + base_T_cam[:3, 3] - base_R_ee @ setup.point_ee_m
-        group = _shifted(setup, camera, base_R_ee, first, shift_m, rng)
-        if group is not None:
-            poses += group
-    base_T_ee = np.stack(poses)
-    uv_px = camera.project(spots_on_plane(setup, base_T_ee)[0])
-    return LaserData(camera, setup, base_T_ee, uv_px, np.repeat(np.arange(orientations), 10))
-
-
-def _shifted(
-    setup: LaserSetup, camera: Camera, base_R_ee: Array, first: Array, shift_m: float, rng: np.random.Generator
-) -> list[Array] | None:
-    directions = np.linalg.qr(rng.normal(size=(3, 3)))[0] + 0.3 * rng.uniform(-1.0, 1.0, (3, 3))
-    shifts = [np.zeros(3)]
-    for direction in directions:
-        for _ in range(3):
-            for _ in range(20):
-                shift = direction / np.linalg.norm(direction) * rng.uniform(-shift_m, shift_m)
-                pose = make_transform(base_R_ee, first + shift)[None]
-                spot = spots_on_plane(setup, pose)[0]
-                uv = camera.project(spot)
-                size = np.array([camera.width_px, camera.height_px])
-                if (
-                    abs(np.linalg.norm(shift)) > 0.25 * shift_m
-                    and np.isfinite(uv).all()
-                    and (uv > 2).all()
-                    and (uv < size - 3).all()
-                ):
-                    shifts.append(shift)
-                    break
-            else:
-                return None
-    return [make_transform(base_R_ee, first + shift) for shift in shifts]
+    cell = LaserCell(setup.cam_T_base, setup.normal_cam, setup.distance_m, setup.point_ee_m, setup.direction_ee)
+    base_T_ee, group = poses_on_plane(
+        cell, camera, rng, orientations=orientations, reach_m=reach_m, tilt_deg=tilt_deg, shift_m=shift_m
+    )
+    return LaserData(camera, setup, base_T_ee, pixels_of(cell, camera, base_T_ee), group)

@@ -1,15 +1,10 @@
-"""Images for ``tools/bench offline``: calibration plates behind the simulator's fingers, and plates alone.
-
-Edges of the plate are ramps as wide as a sample, so that an outline is at its true place to first order whatever the
-sampling; blur, vignetting and noise are the simulator's.
-"""
+"""Images for ``tools/bench offline``: calibration plates behind the simulator's fingers, and plates alone."""
 
 from __future__ import annotations
 
 import functools
 from dataclasses import dataclass
 
-import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +16,7 @@ from gripmon.model.gripper import Gripper, load_gripper
 from gripmon.model.records import Array
 from gripmon.model.targets import Chequerboard, CircleGrid
 from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.plates import Plate, PlateBackdrop, Print
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
 
 PAPER_LENS = PaperLens(
@@ -32,92 +28,6 @@ OPENING_M = 0.05
 TILT_RAD = np.radians(32.0)
 DISTANCE_M = 0.115
 _GRIPPER = ROOT / "configs" / "grippers" / "two_box_fingers.yaml"
-_SAMPLES = 2
-_DARK, _LIGHT = 40.0, 200.0
-_MARGIN = 1.5
-
-Grey = NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class Plate:
-    """A flat target at ``cam_T_plate`` (4, 4); ``errors_m`` (rows, columns, 2): by which its discs are off."""
-
-    target: CircleGrid | Chequerboard
-    cam_T_plate: Array
-    errors_m: Array | None = None
-
-    def light(self, lens: LensSettings, blur_px: float) -> Grey:
-        """Light (height, width) on the sensor, DN."""
-        rays = _rays(lens)
-        to_plate = np.linalg.inv(np.column_stack([self.cam_T_plate[:, :2], self.cam_T_plate[:, 3]])[:3])
-        x, y, w = np.moveaxis(rays @ to_plate.T, -1, 0)
-        x, y = x / w, y / w
-        dark = self._discs(x, y) if isinstance(self.target, CircleGrid) else self._squares(x, y)
-        grey = (_LIGHT + (_DARK - _LIGHT) * dark).astype(np.float32)
-        grey[~np.isfinite(grey)] = _LIGHT
-        blurred = cv2.GaussianBlur(grey, (0, 0), blur_px * _SAMPLES)
-        size = (lens.height_px, _SAMPLES, lens.width_px, _SAMPLES)
-        return np.ascontiguousarray(blurred.reshape(size).mean(axis=(1, 3)))
-
-    def _discs(self, x: Array, y: Array) -> Array:
-        target = self.target
-        assert isinstance(target, CircleGrid)
-        i, j = np.rint(x / target.spacing_m), np.rint(y / target.spacing_m)
-        inside = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows)
-        dx, dy = x - i * target.spacing_m, y - j * target.spacing_m
-        if self.errors_m is not None:
-            off = self.errors_m[np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
-            dx, dy = dx - off[..., 0], dy - off[..., 1]
-        r = np.maximum(np.hypot(dx, dy), 1e-9)
-        return np.where(inside, _covered((0.5 * target.diameter_m - r) / _step(x, y, dx / r, dy / r)), 0.0)
-
-    def _squares(self, x: Array, y: Array) -> Array:
-        target = self.target
-        assert isinstance(target, Chequerboard)
-        one, zero = np.ones_like(x), np.zeros_like(x)
-        steps = _step(x, y, one, zero), _step(x, y, zero, one)
-        signs, inside = [], np.ones_like(x)
-        for value, step, count in zip((x, y), steps, (target.columns, target.rows), strict=True):
-            square = value / target.square_m
-            whole = np.floor(square)
-            to_line = (0.5 - np.abs(square - whole - 0.5)) * np.where(whole % 2 == 0, 1.0, -1.0) * target.square_m
-            signs.append(2.0 * _covered(to_line / step) - 1.0)
-            middle, half = 0.5 * (count - 1) * target.square_m, 0.5 * (count + 1) * target.square_m
-            inside = inside * _covered((half - np.abs(value - middle)) / step)
-        return inside * (0.5 + 0.5 * signs[0] * signs[1])
-
-
-def _covered(samples: Array) -> Array:
-    """Part of a sample that lies on the inner side of an edge which is so many samples away."""
-    return np.clip(0.5 + samples, 0.0, 1.0)
-
-
-def _step(x: Array, y: Array, nx: Array, ny: Array) -> Array:
-    """How far (m) one sample reaches along a direction on the plate."""
-    across = nx * np.gradient(x, axis=1) + ny * np.gradient(y, axis=1)
-    down = nx * np.gradient(x, axis=0) + ny * np.gradient(y, axis=0)
-    return np.maximum(np.hypot(across, down), 1e-12)
-
-
-@functools.lru_cache(maxsize=2)
-def _rays(lens: LensSettings) -> Array:
-    """(rows, columns, 3) of all samples."""
-    u = (np.arange(lens.width_px * _SAMPLES) + 0.5) / _SAMPLES - 0.5
-    v = (np.arange(lens.height_px * _SAMPLES) + 0.5) / _SAMPLES - 0.5
-    grid = np.stack(np.meshgrid(u, v), axis=-1)
-    xy = make_camera(lens).undistort(grid.reshape(-1, 2)).reshape(grid.shape)
-    return np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=2)
-
-
-class _Standing:
-    """The plate as the simulator's backdrop."""
-
-    def __init__(self, plate: Plate, lens: LensSettings, blur_px: float) -> None:
-        self._light = plate.light(lens, blur_px)
-
-    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> Grey:
-        return self._light.copy()
 
 
 @functools.lru_cache(maxsize=1)
@@ -152,8 +62,9 @@ class Setting:
 
     def simulators(self, seed: int, noises_dn: tuple[float, ...]) -> list[Simulator]:
         """The same scene with sensors of so much read noise each, sharing one plate."""
-        plate = Plate(DISCS, self.cam_T_grip @ self.grip_T_plate, self.errors_m)
-        backdrop = _Standing(plate, PAPER_LENS, Sensor().psf_sigma_px)
+        look = Print(margin=np.inf, errors_m=self.errors_m)
+        plate = Plate(DISCS, self.cam_T_grip @ self.grip_T_plate, look)
+        backdrop = PlateBackdrop(plate, PAPER_LENS, Sensor().psf_sigma_px)
         made = []
         for noise in noises_dn:
             scenario = Scenario(
@@ -188,7 +99,7 @@ def views(
             uv = camera.project(corners_m @ rotation.T + cam_T_plate[:3, 3])
             if not ((uv > 4.0) & (uv < np.array([lens.width_px, lens.height_px]) - 5.0)).all():
                 continue
-        light = Plate(target, cam_T_plate).light(lens, Sensor().psf_sigma_px)
+        light = Plate(target, cam_T_plate, Print(margin=np.inf)).light(lens, Sensor().psf_sigma_px)
         noisy = light + rng.normal(0.0, noise_dn, light.shape)
         images.append(np.clip(np.rint(noisy), 0, 255).astype(np.uint8))
     return images

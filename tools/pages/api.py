@@ -15,24 +15,32 @@ _CLIENT = """\
 `gripmon.client` is for programs that use the corrected transform;
 [Write a controller](../howto/client.md) shows it at work.
 """
+_BLOCK = """\
+::: {where}
+    options:
+      heading: {name}
+      toc_label: {name}
+"""
 
 
 def page() -> str:
     """The page in Markdown, with a block for mkdocstrings for each public name."""
-    parts = [_HEAD, *map(_block, public_names("gripmon"))]
-    return "\n".join([*parts, _CLIENT, *map(_block, public_names("gripmon.client"))])
+    package = public_names("gripmon")
+    client = {name: where for name, where in public_names("gripmon.client").items() if where not in package.values()}
+    parts = [_HEAD, *_blocks(package), _CLIENT, *_blocks(client)]
+    return "\n".join(parts)
 
 
-def public_names(package: str) -> list[str]:
-    """Full names of what a package lists in ``__all__``, each by the module that defines it; modules aside."""
+def public_names(package: str) -> dict[str, str]:
+    """What a package lists in ``__all__``: each name, and the full name where it is defined."""
     module = import_module(package)
-    names = [name for name in getattr(module, "__all__", ()) if not name.startswith("__")]
-    found = ((name, getattr(module, name)) for name in sorted(names))
-    return [
-        f"{value.__module__}.{value.__qualname__}" if hasattr(value, "__qualname__") else f"{package}.{name}"
-        for name, value in found
-    ]
+    names = sorted(name for name in getattr(module, "__all__", ()) if not name.startswith("__"))
+    found = {name: getattr(module, name) for name in names}
+    return {
+        name: f"{value.__module__}.{value.__qualname__}" if hasattr(value, "__qualname__") else f"{package}.{name}"
+        for name, value in found.items()
+    }
 
 
-def _block(name: str) -> str:
-    return f"::: {name}\n"
+def _blocks(names: dict[str, str]) -> list[str]:
+    return [_BLOCK.format(name=name, where=where) for name, where in names.items()]

@@ -200,7 +200,7 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
             write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)
         part.replace(path)
     except OSError as error:
-        raise NoResultError(f"{path}: writing failed ({error.strerror or error})") from None
+        raise NoResultError(f"--out {path}: writing failed ({error.strerror or error})") from None
     finally:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)

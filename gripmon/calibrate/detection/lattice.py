@@ -11,7 +11,6 @@ from collections import deque
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from gripmon.model.records import Array
@@ -174,10 +173,3 @@ def _consistent(points: Array, lattice: dict[Index, int]) -> dict[Index, int]:
                 if off > 0.12 * float(np.hypot(*(high - low))):
                     out.pop(at, None)
     return out
-
-
-def as_arrays(lattice: dict[Index, int]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Cells (n, 2), from 0 on, and indices (n,) of a lattice, by rows."""
-    cells = np.array(sorted(lattice, key=lambda cell: (cell[1], cell[0])), dtype=np.intp).reshape(-1, 2)
-    indices = np.array([lattice[int(c), int(r)] for c, r in cells], dtype=np.intp)
-    return cells - (cells.min(axis=0) if len(cells) else 0), indices

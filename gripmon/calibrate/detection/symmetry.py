@@ -7,7 +7,7 @@ about the point gives its place, its covariance from the image's noise, and tell
 That is exact where the target's map to the image is linear.  Perspective and lens bend it: a step and its opposite on
 the target lead to ``p + d + q(d)`` and ``p - d + q(d)``, with q quadratic.  Left out, it moves corners by some
 hundredths of a pixel, all of them towards where the target looks smaller; so opposite pixels are taken by ``bend``,
-q's coefficients (:mod:`gripmon.calibrate.bending`).
+q's coefficients (:mod:`gripmon.calibrate.detection.bending`).
 """
 
 from __future__ import annotations
@@ -60,6 +60,7 @@ def centres_of_symmetry(
     # What the light's slope adds; its columns don't move with the point.
     odd = np.broadcast_to(2.0 * offsets, (len(start), *offsets.shape))
     at, moving = start.astype(np.float64).copy(), np.full(len(start), True)
+    # All points at once: a minimiser of single problems would be called hundreds of times an image.
     for _ in range(_STEPS):
         difference, gradient, _ = _opposites(levels, slopes, at[:, None] + bent, offsets)
         rows = np.concatenate([gradient, odd], axis=2)

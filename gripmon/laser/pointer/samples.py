@@ -25,11 +25,13 @@ from gripmon.model.records import Array
 
 @dataclass(frozen=True, slots=True)
 class Samples:
-    """``names`` of n samples; ``uv_px`` (n, 2), NaN where an image is to be looked at; ``images`` and ``laser_off``,
-    files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of orientations, or None: the poses tell them.
+    """``names`` of n samples, and the ``places`` where they stand; ``uv_px`` (n, 2), NaN where an image is to be looked
+    at; ``images`` and ``laser_off``, files or None; ``base_T_ee`` (n, 4, 4); ``groups`` (n,) labels of orientations, or
+    None: the poses tell them.
     """
 
     names: tuple[str, ...]
+    places: tuple[str, ...]
     uv_px: Array
     images: tuple[Path | None, ...]
     laser_off: tuple[Path | None, ...]
@@ -45,7 +47,7 @@ class Samples:
         none = (None,) * len(uv_px)
         names = tuple(f"sample {k + 1}" for k in range(len(uv_px)))
         labels = None if groups is None else tuple(groups)
-        return cls(names, np.asarray(uv_px, dtype=float), none, none, base_T_ee, labels)
+        return cls(names, names, np.asarray(uv_px, dtype=float), none, none, base_T_ee, labels)
 
     @property
     def files(self) -> list[Path]:
@@ -58,6 +60,7 @@ class Samples:
         """Those samples only."""
         return Samples(
             names=tuple(self.names[k] for k in kept),
+            places=tuple(self.places[k] for k in kept),
             uv_px=self.uv_px[list(kept)],
             images=tuple(self.images[k] for k in kept),
             laser_off=tuple(self.laser_off[k] for k in kept),
@@ -75,7 +78,7 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     for path in paths:
         rows, places = rows_of(path)
         try:
-            parts.append(_from_rows(rows, places, path.parent))
+            parts.append(_from_rows(rows, places, path))
         except ValueError as error:
             raise InputError(f"{path}: {error}") from None
     if len(parts) == 1:
@@ -86,6 +89,7 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     groups = tuple(f"{k}/{g}" for k, part in enumerate(parts) for g in (part.groups or ()))
     samples = Samples(
         names=tuple(name for part in parts for name in part.names),
+        places=tuple(place for part in parts for place in part.places),
         uv_px=np.concatenate([part.uv_px for part in parts]),
         images=tuple(image for part in parts for image in part.images),
         laser_off=tuple(image for part in parts for image in part.laser_off),
@@ -94,23 +98,25 @@ def read_samples(paths: Sequence[Path]) -> Samples:
     )
     tables = [path for path, part in zip(paths, parts, strict=True) for _ in part.names]
     try:
-        _check_different(samples, [f"{table}: {name}" for table, name in zip(tables, samples.names, strict=True)])
+        _check_different(samples, samples.places)
     except ValueError as error:
         raise InputError(str(error)) from None
     return replace(samples, names=tuple(f"{t.name}, {n}" for t, n in zip(tables, samples.names, strict=True)))
 
 
-def _from_rows(rows: Sequence[Row], places: Sequence[str], folder: Path) -> Samples:
+def _from_rows(rows: Sequence[Row], places: Sequence[str], table: Path) -> Samples:
     """``places`` say where each row stands.  ValueError: "place: what is wrong; what would be right"."""
     if not rows:
         raise ValueError("holds no sample; a row for each spot, better 50 of them")
     named = [row.get("group") not in (None, "") for row in rows]
-    images = [_text(row.get("image")) for row in rows]
+    images, off = ([_text(row.get(key)) for row in rows] for key in ("image", "laser_off"))
+    folder = table.parent
     samples = Samples(
         names=tuple(image or place for image, place in zip(images, places, strict=True)),
+        places=tuple(f"{table}: {image or place}" for image, place in zip(images, places, strict=True)),
         uv_px=np.array([_spot(row, place) for row, place in zip(rows, places, strict=True)]),
         images=tuple(None if image is None else folder / image for image in images),
-        laser_off=tuple(None if off is None else folder / off for off in (_text(row.get("laser_off")) for row in rows)),
+        laser_off=tuple(None if image is None else folder / image for image in off),
         base_T_ee=np.stack([pose_of(row, place) for row, place in zip(rows, places, strict=True)]),
         groups=tuple(str(row["group"]) for row in rows) if all(named) else None,
     )
@@ -162,7 +168,7 @@ def spots_of(samples: Samples, size_px: tuple[int, int], progress: Progress = qu
                 continue
             if not (-0.5 <= u <= size_px[0] - 0.5 and -0.5 <= v <= size_px[1] - 0.5):
                 raise InputError(
-                    f"{samples.names[k]}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
+                    f"{samples.places[k]}: the spot ({u:g}, {v:g}) px is outside of the camera's image of "
                     f"{size_px[0]} x {size_px[1]} px; spots of this camera"
                 )
             out.append([plain_spot(samples.uv_px[k])])

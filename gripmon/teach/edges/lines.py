@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.least_squares import TUKEY, tukey_weights
 from gripmon.model.records import Array
 from gripmon.track.edges.prediction import STRETCH
 
-_TUKEY = 4.685
 _START_PX = 1.0  # half width of a line while it is looked for: two lines closer than this are one to a blurred image
 _FLOOR_PX = 0.05  # the scatter of edge points is never taken to be less: pixels are that coarse
 _GATE_PX = 0.5  # a profile shows the line if it has an edge point so close to it
@@ -90,12 +90,12 @@ def settle_line(points: EdgePoints, start_px: Array, worth: Array | None = None)
     ends_px, width, scale = start_px, _START_PX, _FLOOR_PX
     for _ in range(_ROUNDS):
         residual = root * (points.offset_px - design @ ends_px)
-        weight = np.square(np.maximum(1.0 - np.square(residual / width), 0.0))
+        weight = tukey_weights(np.abs(residual), width)
         near = np.abs(residual) < width
         if np.count_nonzero(near) < _FEWEST:
             return None
         scale = max(1.4826 * float(np.median(np.abs(residual[near]))), _FLOOR_PX)
-        width = min(_TUKEY * scale, _START_PX)
+        width = min(TUKEY * scale, _START_PX)
         weighted = design * (root * weight)[:, None]
         normal = weighted.T @ (design * root[:, None])
         if not np.linalg.cond(normal) < 1e6:

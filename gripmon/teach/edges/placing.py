@@ -17,7 +17,6 @@ from gripmon.judge.recalibrate import RecalibrationRefused, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
-from gripmon.model.least_squares import covariance_of, minimise
 from gripmon.model.records import Array, ReferenceRecord
 
 ROUGH_SHARE = 0.006
@@ -118,21 +117,31 @@ def _starts(points_m: Array, xy: Array, prior: Prior, weight: float) -> Iterator
 
 
 def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prior) -> tuple[Array, Array, float] | None:
-    """The pose near a start with the least weighted image error and distance from the prior, its covariance and cost;
-    None where the start lies behind the camera.
+    """Levenberg-Marquardt on the weighted image error and the prior; None where it leads behind the camera.
+
+    Its damping falls more slowly than :func:`gripmon.model.least_squares.minimise`'s: that one's longer steps take
+    corners which lie anywhere to poses next to the camera's plane, where nothing is determined.
     """
     information = np.linalg.inv(prior.covariance)
-
-    def cost(pose: Array) -> float:
-        return _cost(pose, points_m, xy, weight, prior, information)
-
-    def equations(pose: Array) -> tuple[Array, Array]:
-        return _equations(pose, points_m, xy, weight, prior, information)
-
-    if not math.isfinite(cost(start)):
+    pose, damping = start, 1e-3
+    current = _cost(pose, points_m, xy, weight, prior, information)
+    if not math.isfinite(current):
         return None
-    found = minimise(start, cost, equations, perturb, iterations=_ROUNDS, tolerance=1e-6)
-    return found.state, covariance_of(equations(found.state)[0]), found.cost
+    for _ in range(_ROUNDS):
+        normal, side = _equations(pose, points_m, xy, weight, prior, information)
+        tried = perturb(pose, np.linalg.solve(normal + damping * np.diag(normal.diagonal()), side))
+        cost = _cost(tried, points_m, xy, weight, prior, information)
+        if cost < current:
+            settled = current - cost < 1e-6 * (1.0 + cost)
+            pose, current, damping = tried, cost, 0.2 * damping
+            if settled:
+                break
+        else:
+            damping *= 8.0
+            if damping > 1e8:
+                break
+    normal, _ = _equations(pose, points_m, xy, weight, prior, information)
+    return pose, np.linalg.inv(normal), current
 
 
 def _cost(pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array) -> float:

@@ -2,5 +2,6 @@
 
 from gripmon.track.look.agreement import LookAgreement
 from gripmon.track.look.core import GripperLook, LookRefused
+from gripmon.track.look.strips import FingerStrips
 
-__all__ = ["GripperLook", "LookAgreement", "LookRefused"]
+__all__ = ["FingerStrips", "GripperLook", "LookAgreement", "LookRefused"]

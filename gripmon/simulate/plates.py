@@ -1,0 +1,260 @@
+"""Calibration plates as a camera sees them: light on the sensor, ray by ray, from lens, pose and print.
+
+Every border of the print is a ramp one sample wide across its true place, so that an outline is right to first order
+however few samples a pixel has.  Nothing of the detection is used here.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from gripmon.model.camera import LensSettings, make_camera
+from gripmon.model.geometry import exp_rotation, make_transform
+from gripmon.model.records import Array
+from gripmon.model.targets import Charuco, Chequerboard, CircleGrid, Target
+
+SAMPLES = 2
+"""Samples a pixel has along each axis."""
+_BEHIND_DN = 120.0
+"""Where a ray doesn't meet the plate's plane in front of the camera."""
+_MODULE_TEXELS = 16
+"""Texels along a module of a ChArUco board's marks: their borders are exact, only corners lose some of their tip."""
+
+Grey = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Print:
+    """What a plate looks like.  ``dark`` and ``light`` grey values (DN); ``margin`` of the plate around its pattern, in
+    squares or spacings, inf for a plate without a border; ``clutter`` what lies in its plane beyond that border;
+    ``inverted``: dark and light exchanged; ``errors_m`` (rows, columns, 2): how far each point of the print is off.
+    """
+
+    dark: float = 40.0
+    light: float = 200.0
+    margin: float = 0.7
+    clutter: Literal["waves", "mosaic", "plain"] = "waves"
+    inverted: bool = False
+    errors_m: Array | None = None
+
+
+def points_of(target: Target) -> Array:
+    """All points (n, 3) of a target by rows, in its frame (m)."""
+    if isinstance(target, Charuco):
+        columns, rows, first = target.columns - 1, target.rows - 1, target.square_m
+    else:
+        columns, rows, first = target.columns, target.rows, 0.0
+    step = _spacing_m(target)
+    r, c = np.mgrid[:rows, :columns]
+    return np.stack([first + step * c.ravel(), first + step * r.ravel(), np.zeros(columns * rows)], axis=1)
+
+
+def facing(target: Target, middle_m: Sequence[float], tilt_rad: Sequence[float], roll_rad: float = 0.0) -> Array:
+    """``cam_T_plate`` (4, 4) of a plate whose middle is at ``middle_m`` (3,), camera frame; it is rolled about the
+    optical axis, then tilted about the camera's x and y axes.
+    """
+    rotation = exp_rotation(np.array([*tilt_rad, 0.0])) @ exp_rotation(np.array([0.0, 0.0, roll_rad]))
+    return make_transform(rotation, np.asarray(middle_m) - rotation @ points_of(target).mean(axis=0))
+
+
+@functools.lru_cache(maxsize=3)
+def sample_rays(lens: LensSettings, samples: int = SAMPLES) -> Array:
+    """Ideal coordinates (rows * samples, columns * samples, 2) of all samples; NaN where the lens doesn't see."""
+    u = (np.arange(lens.width_px * samples) + 0.5) / samples - 0.5
+    v = (np.arange(lens.height_px * samples) + 0.5) / samples - 0.5
+    camera = make_camera(lens)
+    with np.errstate(invalid="ignore"):
+        return np.stack([camera.undistort(np.stack([u, np.full(len(u), row)], axis=1)) for row in v])
+
+
+def develop(grey: NDArray[np.floating], samples: int, blur_px: float) -> Grey:
+    """Light (rows, columns) on the sensor from that of all samples, blurred by the lens."""
+    light = np.asarray(grey, np.float32)
+    if blur_px > 0.0:
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), blur_px * samples), np.float32)
+    rows, columns = light.shape
+    shape = (rows // samples, samples, columns // samples, samples)
+    return np.ascontiguousarray(light.reshape(shape).mean(axis=(1, 3)), np.float32)
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A flat target at ``cam_T_plate`` (4, 4)."""
+
+    target: Target
+    cam_T_plate: Array
+    print: Print = Print()
+
+    def light(self, lens: LensSettings, blur_px: float, samples: int = SAMPLES) -> Grey:
+        """Light (rows, columns) on the sensor, DN."""
+        return develop(self.grey(sample_rays(lens, samples)), samples, blur_px)
+
+    def grey(self, xy: Array) -> Array:
+        """Grey values (rows, columns) that rays (rows, columns, 2) in ideal coordinates meet, DN; 0 where NaN."""
+        to_plate = np.linalg.inv(np.column_stack([self.cam_T_plate[:3, :2], self.cam_T_plate[:3, 3]]))
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            x, y, w = np.moveaxis(xy @ to_plate[:, :2].T + to_plate[:, 2], -1, 0)
+            print_ = self._print(_Grid(x / w, y / w))
+            seen = np.where(w > 0.0, np.nan_to_num(print_, nan=_BEHIND_DN), _BEHIND_DN)
+        return np.where(np.isfinite(xy).all(axis=-1), seen, 0.0)
+
+    def _print(self, grid: _Grid) -> Array:
+        look, target, step = self.print, self.target, _spacing_m(self.target)
+        if isinstance(target, CircleGrid):
+            dark, low, high = _discs(target, look.errors_m, grid), -0.5, (target.columns - 0.5, target.rows - 0.5)
+        else:
+            printed = grid if look.errors_m is None else grid.moved(*_shift(target, look.errors_m, grid))
+            if isinstance(target, Charuco):
+                low, high = 0.0, (float(target.columns), float(target.rows))
+                dark = _squares(printed, step, low, high) + _marks(target, printed)
+            else:
+                low, high = -1.0, (float(target.columns), float(target.rows))
+                dark = _squares(printed, step, low, high)
+        if look.inverted:
+            dark = 1.0 - dark
+        plate = look.light + (look.dark - look.light) * dark
+        if not np.isfinite(look.margin):
+            return np.asarray(plate)
+        m = look.margin
+        inside = _box(grid, step * (low - m), (step * (high[0] + m), step * (high[1] + m)))
+        return inside * plate + (1.0 - inside) * _clutter(look.clutter, grid.x, grid.y)
+
+
+class PlateBackdrop:
+    """A plate behind the simulator's gripper; it stands still against the camera."""
+
+    def __init__(self, plate: Plate, lens: LensSettings, blur_px: float) -> None:
+        self._light = plate.light(lens, blur_px)
+
+    def render(self, cam_T_grip: Array, t_s: float, exposure_s: float) -> Grey:
+        """As :class:`gripmon.simulate.render.Backdrop` wants it."""
+        return self._light.copy()
+
+
+class _Grid:
+    """Where the samples' rays meet the plate, x and y (rows, columns), m; and how far one sample reaches there."""
+
+    def __init__(self, x: Array, y: Array) -> None:
+        self.x, self.y = x, y
+        self._slopes = np.gradient(x), np.gradient(y)
+
+    def moved(self, dx: Array, dy: Array) -> _Grid:
+        return _Grid(self.x - dx, self.y - dy)
+
+    def step(self, nx: Array | float, ny: Array | float) -> Array:
+        """Length (m) of a sample along directions (nx, ny) on the plate."""
+        (x_v, x_u), (y_v, y_u) = self._slopes
+        return np.maximum(np.hypot(nx * x_u + ny * y_u, nx * x_v + ny * y_v), 1e-12)
+
+
+def _spacing_m(target: Target) -> float:
+    return target.spacing_m if isinstance(target, CircleGrid) else target.square_m
+
+
+def _covered(samples: Array) -> Array:
+    """Part of a sample on the inner side of a border that is this many samples away."""
+    return np.asarray(np.clip(0.5 + samples, 0.0, 1.0))
+
+
+def _discs(target: CircleGrid, errors_m: Array | None, grid: _Grid) -> Array:
+    i, j = np.rint(grid.x / target.spacing_m), np.rint(grid.y / target.spacing_m)
+    inside = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows)
+    dx, dy = grid.x - i * target.spacing_m, grid.y - j * target.spacing_m
+    if errors_m is not None:
+        off = errors_m[np.where(inside, j, 0).astype(int), np.where(inside, i, 0).astype(int)]
+        dx, dy = dx - off[..., 0], dy - off[..., 1]
+    r = np.maximum(np.hypot(dx, dy), 1e-9)
+    return np.where(inside, _covered((0.5 * target.diameter_m - r) / grid.step(dx / r, dy / r)), 0.0)
+
+
+def _squares(grid: _Grid, square_m: float, low: float, high: tuple[float, float]) -> Array:
+    """Every second square of those from ``low`` to ``high`` (columns, rows), dark where their numbers' sum is even."""
+    signs = []
+    for value, step, end in zip((grid.x, grid.y), (grid.step(1.0, 0.0), grid.step(0.0, 1.0)), high, strict=True):
+        square = value / square_m
+        whole = np.clip(np.floor(square), low, end - 1.0)
+        # Only lines between two squares change the colour, not the pattern's border.
+        before = np.where(whole > low, square - whole, np.inf)
+        behind = np.where(whole < end - 1.0, whole + 1.0 - square, np.inf)
+        to_line = np.minimum(before, behind) * np.where(whole % 2 == 0, 1.0, -1.0) * square_m
+        signs.append(2.0 * _covered(to_line / step) - 1.0)
+    inside = _box(grid, low * square_m, (high[0] * square_m, high[1] * square_m))
+    return np.asarray(inside * (0.5 + 0.5 * signs[0] * signs[1]))
+
+
+def _box(grid: _Grid, low_m: float, high_m: tuple[float, float]) -> Array:
+    """Part of each sample within a rectangle from (``low_m``, ``low_m``) to ``high_m``."""
+    out = np.ones_like(grid.x)
+    for value, step, high in zip((grid.x, grid.y), (grid.step(1.0, 0.0), grid.step(0.0, 1.0)), high_m, strict=True):
+        out *= _covered((0.5 * (high - low_m) - np.abs(value - 0.5 * (high + low_m))) / step)
+    return out
+
+
+def _marks(target: Charuco, grid: _Grid) -> Array:
+    """The marks in the white squares alone: they don't touch the squares' borders."""
+    distances, modules = _mark_distances(target)
+    module_m, tile = target.marker_m / modules, (modules + 2) * _MODULE_TEXELS
+    i, j = np.floor(grid.x / target.square_m), np.floor(grid.y / target.square_m)
+    white = (i >= 0) & (i < target.columns) & (j >= 0) & (j < target.rows) & ((i + j) % 2 == 1)
+    number = np.where(white, (j * target.columns + i) // 2, 0)
+    # From the mark's first module, with one module of white around it.
+    u, v = (
+        np.clip((value - (whole + 0.5) * target.square_m) / module_m + 0.5 * modules, -1.0, modules + 1.0)
+        for value, whole in ((grid.x, i), (grid.y, j))
+    )
+    at_u = np.nan_to_num((u + 1.0) * _MODULE_TEXELS - 0.5).astype(np.float32)
+    at_v = np.nan_to_num(number * tile + (v + 1.0) * _MODULE_TEXELS - 0.5).astype(np.float32)
+    slope_v, slope_u = (np.asarray(slope, np.float32) for slope in np.gradient(distances))
+    distance, nx, ny = (cv2.remap(m, at_u, at_v, cv2.INTER_LINEAR) for m in (distances, slope_u, slope_v))
+    size = np.maximum(np.hypot(nx, ny), 1e-6)
+    depth_m = distance / _MODULE_TEXELS * module_m
+    return np.where(white, _covered(depth_m / grid.step(nx / size, ny / size)), 0.0)
+
+
+@functools.lru_cache(maxsize=2)
+def _mark_distances(target: Charuco) -> tuple[Grey, int]:
+    """Texels from each texel to the nearest border of a mark's dark part, positive inside, the marks one below the
+    other; and how many modules a mark has along a side.
+    """
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    modules = dictionary.markerSize + 2
+    marks = []
+    for number in range(target.columns * target.rows // 2):
+        bits = np.pad(dictionary.generateImageMarker(number, modules) < 128, 1)
+        dark = np.kron(bits, np.ones((_MODULE_TEXELS, _MODULE_TEXELS), np.uint8)).astype(np.uint8)
+        inside, outside = (cv2.distanceTransform(part, cv2.DIST_L2, 5) for part in (dark, 1 - dark))
+        marks.append(np.where(dark > 0, inside - 0.5, 0.5 - outside))
+    return np.concatenate(marks).astype(np.float32), modules
+
+
+def _shift(target: Chequerboard | Charuco, errors_m: Array, grid: _Grid) -> tuple[Array, Array]:
+    """How far the print is off at each sample: linear between the corners."""
+    first = target.square_m if isinstance(target, Charuco) else 0.0
+    at = np.stack([np.nan_to_num((value - first) / target.square_m) for value in (grid.y, grid.x)])
+    dx, dy = (map_coordinates(errors_m[:, :, k], at, order=1, mode="nearest") for k in (0, 1))
+    return dx, dy
+
+
+def _clutter(kind: str, x: Array, y: Array) -> Array:
+    if kind == "plain":
+        return np.full(x.shape, 130.0)
+    waves = 130.0 + 40.0 * np.sin(300.0 * x) * np.cos(170.0 * y)
+    if kind == "waves":
+        return np.asarray(waves)
+    # Two grids of patches with a value of their own each, turned against each other: corners everywhere.
+    out = waves
+    for angle, step in ((0.4, 0.013), (1.1, 0.007)):
+        a = np.floor((x * np.cos(angle) - y * np.sin(angle)) / step)
+        b = np.floor((x * np.sin(angle) + y * np.cos(angle)) / step)
+        value = np.sin(12.9898 * a + 78.233 * b) * 43758.5453
+        value = value - np.floor(value)
+        out = np.where(value > 0.55, 255.0 * (value - 0.55) / 0.45, out)
+    return np.asarray(out)

@@ -1,0 +1,195 @@
+"""What a finger shows along its own direction, inside its outline: how far a pose has slid along the fingers.
+
+Long edges say nothing about a motion along the fingers, and a line round a finger looks like its end.  But the grey
+levels between the end and some millimetres behind it belong to the gripper: a pose that has taken something else for
+the ends has them elsewhere.  They lie inside the outline, so that no other backgrounds have to be waited for.  A line
+parallel to the fingers stays the same line when the gripper is slid along them: read once, it serves for every slide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
+from gripmon.model.gripper import Gripper
+from gripmon.model.records import Array, Image
+
+LENGTH_PX, REACH_PX = 64, 40
+"""How much of a finger behind its end is learnt, and how far off slides are tried, px where it was learnt: 3 to 9 mm
+beside the ends, where what is mistaken for them lies.
+"""
+
+SHORTEST_PX = 16
+"""Of a strip that is learnt: four independent points."""
+
+LINES = 3
+"""Side by side behind each end edge: something partly in front of a finger hides some of them."""
+
+SMOOTH, SLOPE_PX = np.array([[0.25, 0.5, 0.25]], dtype=np.float32), 15
+"""A tenth of a millimetre must do no harm, and light that falls off along the finger says nothing."""
+
+CLIP = 3.0
+"""Root mean squares of what was learnt that a grey level counts at most: a bright thing in front of a finger weighs no
+more than a line on it.
+"""
+
+INDEPENDENT_PX = 4.0
+"""Between points of a strip whose errors have nothing to do with each other: the smoothing and the lens's blur."""
+
+ONE_PLACE_PX = 3
+"""Slides up to this are none: edges are fitted ten times better, and neighbouring ones look alike."""
+
+EXPLAINED = 0.87
+"""Correlation above which a place isn't better for a higher one: three quarters of the variance; the rest is light."""
+
+FEWEST_FRAMES, MOST_FRAMES = 3, 32
+"""Frames learnt before it may judge: seen inside the outline, they differ by noise alone; and remembered."""
+
+RELEARN_S = 1.0
+"""Pause between frames that are learnt when enough are, s: wear and dirt take hours."""
+
+GREY_BGR = np.array([0.114, 0.587, 0.299], dtype=np.float32)
+
+
+class FingerStrips:
+    """Strips along the fingers of one gripper in one camera; ``along`` (e,): which of its edges run along them."""
+
+    def __init__(self, camera: Camera, gripper: Gripper, along: NDArray[np.bool_]):
+        self._camera, self._gripper, self._along = camera, gripper, along
+        self._first = [int(np.argmax(gripper.point_finger == f)) for f in range(len(gripper.finger_ids))]
+        self.frames = 0
+        self._learnt_s = -math.inf
+        self._laid_out_at_m: float | None = None
+        self._points_grip_m: Array = np.zeros((0, 0, 3))
+
+    @property
+    def ready(self) -> bool:
+        """Whether it may judge."""
+        return self.frames >= FEWEST_FRAMES and bool(self._mean.any())
+
+    def learn(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, now_s: float) -> None:
+        """Learn from an image whose pose (4, 4) is trusted; ``now_s``: time of the frame, s."""
+        if self.frames >= FEWEST_FRAMES and now_s - self._learnt_s < RELEARN_S:
+            return
+        if not len(self._points_grip_m):
+            self._lay_out(cam_T_grip, jaw_opening_m)
+        if not len(self._points_grip_m):
+            return
+        strips = self._read(image, cam_T_grip, jaw_opening_m)[:, REACH_PX : REACH_PX + LENGTH_PX]
+        self.frames += 1
+        self._learnt_s = now_s
+        self._mean += (strips - self._mean) * self._within / min(self.frames, MOST_FRAMES)
+
+    def slide_m(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None, risk: float) -> Array | None:
+        """By how much (3,), gripper frame, the gripper stands along its fingers from a pose (4, 4); None where the
+        strips are not seen elsewhere, at odds of 1 to ``risk`` for each slide that was tried, or can't tell.
+        """
+        if not self.ready:
+            return None
+        strips = self._read(image, cam_T_grip, jaw_opening_m)
+        most = CLIP * math.sqrt(float(np.square(self._mean).sum() / self._within.sum()))
+        np.clip(strips, -most, most, out=strips)
+        learnt = np.clip(self._mean, -most, most)
+        # Gain and brightness are free: light changes.
+        energy = cv2.matchTemplate(np.square(strips), self._within, cv2.TM_CCORR).ravel()
+        product = cv2.matchTemplate(strips, learnt, cv2.TM_CCORR).ravel()
+        least = 0.25 * float(energy[REACH_PX])  # where the strips leave the image nothing would differ
+        alike = product / np.sqrt(np.maximum(energy, least) * float(np.square(learnt).sum()) + 1e-12)
+        unexplained = 1.0 - np.square(np.clip(alike, 0.0, EXPLAINED))
+        here = float(unexplained[REACH_PX])
+        unexplained[REACH_PX - ONE_PLACE_PX : REACH_PX + ONE_PLACE_PX + 1] = 1.0
+        best = int(np.argmin(unexplained))
+        independent = float(self._within.sum()) / (LINES * INDEPENDENT_PX)
+        odds = 0.5 * independent * math.log(here / float(unexplained[best]))
+        if odds <= math.log(len(unexplained) / risk):
+            return None
+        return (best - REACH_PX) * self._step_grip_m
+
+    def _read(self, image: Image, cam_T_grip: Array, jaw_opening_m: float | None) -> NDArray[np.float32]:
+        """(n, LENGTH_PX + 2 REACH_PX) grey levels along the strips, without their slow changes."""
+        now = self._gripper.points_grip_m(jaw_opening_m)
+        then = self._gripper.points_grip_m(self._laid_out_at_m)
+        moved = (now[self._first] - then[self._first])[self._finger]
+        points = (self._points_grip_m + moved[:, None]).reshape(-1, 3)
+        uv_px = self._camera.project(points @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+        # A point outside the lens is NaN; OpenCV needs a number for it.
+        shape = self._points_grip_m.shape[:2]
+        u, v = (c.reshape(shape) for c in np.nan_to_num(uv_px, nan=-1.0).astype(np.float32).T)
+        values = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(np.float32)
+        if values.ndim == 3:
+            values = values @ GREY_BGR
+        smooth = cv2.filter2D(values, -1, SMOOTH, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(smooth - cv2.blur(smooth, (SLOPE_PX, 1), borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
+
+    def _lay_out(self, cam_T_grip: Array, jaw_opening_m: float | None) -> None:
+        start, way, length_m, finger = self._strips(cam_T_grip, jaw_opening_m)
+        if not len(start):
+            return
+        tips_px, behind_px = (
+            self._camera.project((start + reach_m * way) @ cam_T_grip[:3, :3].T + cam_T_grip[:3, 3])
+            for reach_m in (0.0, 1e-3)
+        )
+        px_per_m = 1e3 * float(np.median(np.linalg.norm(behind_px - tips_px, axis=1)))
+        if not px_per_m > 0.0:
+            return
+        pitch_m = 1.0 / px_per_m
+        long_enough = length_m >= SHORTEST_PX * pitch_m
+        if not long_enough.any():
+            return
+        reach = np.arange(-REACH_PX, LENGTH_PX + REACH_PX) * pitch_m
+        within = reach[REACH_PX : REACH_PX + LENGTH_PX] < length_m[long_enough, None]
+        self._step_grip_m = pitch_m * way[long_enough].mean(axis=0)
+        self._points_grip_m = start[long_enough, None] + reach[:, None] * way[long_enough, None]
+        self._within, self._finger = within.astype(np.float32), finger[long_enough]
+        self._mean = np.zeros_like(self._within)
+        self._laid_out_at_m = jaw_opening_m
+
+    def _strips(self, cam_T_grip: Array, jaw_opening_m: float | None) -> tuple[Array, Array, Array, NDArray[np.intp]]:
+        """Strips behind the end edges on faces that look at the camera: where they start (n, 3) and the way (n, 3)
+        that they go, gripper frame (z points out of the gripper), for how long (n,), m, and on which finger (n,).
+        """
+        gripper = self._gripper
+        points_m = gripper.points_grip_m(jaw_opening_m)
+        eye_m = invert(cam_T_grip)[:3, 3]
+        rows = []
+        for edge in np.flatnonzero(~self._along & gripper.edge_view(points_m, eye_m).visible).tolist():
+            ends = gripper.edge_points[edge].tolist()
+            for face in self._faces(points_m, eye_m, ends):
+                ways = [points_m[far] - points_m[end] for end in ends for far in self._behind(end) if far in face]
+                # At the fingers' roots there are edges across them, too.
+                if ways and ways[0][2] < 0.0:
+                    both = np.stack([ways[0], ways[-1]])
+                    rows += [(points_m[ends], both, share, gripper.edge_finger[edge]) for share in _ACROSS]
+        if not rows:
+            return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, dtype=np.intp)
+        share = np.array([[1.0 - row[2], row[2]] for row in rows])
+        sides = np.array([row[1] for row in rows])
+        start = np.einsum("ns,nsi->ni", share, np.array([row[0] for row in rows]))
+        way = np.einsum("ns,nsi->ni", share, sides)
+        length_m = np.linalg.norm(sides, axis=2).min(axis=1)
+        return start, way / np.linalg.norm(way, axis=1)[:, None], length_m, np.array([row[3] for row in rows])
+
+    def _faces(self, points_m: Array, eye_m: Array, ends: list[int]) -> list[set[int]]:
+        """Points of each face at an edge that looks at the camera; all points where the gripper has no faces."""
+        if not self._gripper.faces:
+            return [set(range(len(points_m)))]
+        out = []
+        for face in self._gripper.faces:
+            corners = points_m[face.points]
+            normal = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+            if set(ends) <= set(face.points.tolist()) and normal @ (eye_m - corners.mean(axis=0)) > 0.0:
+                out.append(set(face.points.tolist()))
+        return out
+
+    def _behind(self, point: int) -> list[int]:
+        """The other ends of the edges along the finger that begin in a point."""
+        edges = self._gripper.edge_points[self._along]
+        return edges[:, ::-1][edges == point].tolist()
+
+
+_ACROSS = ((np.arange(LINES) + 0.5) / LINES).tolist()

@@ -1,0 +1,138 @@
+"""What fingers show along themselves, against poses slid along them: simulated images with exact truth."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from support.meters import box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip, simulator
+
+from gripmon.model.camera import make_camera
+from gripmon.model.records import Image
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Background, Cover, FingerLook, FingerMark, JawScript
+from gripmon.track.edges.ends import along_fingers
+from gripmon.track.look import FingerStrips
+from gripmon.track.look.strips import FEWEST_FRAMES, RELEARN_S
+
+RISK = 1e-3
+SLIDES_M = (1.5e-3, -1.5e-3, 3.3e-3, -3.3e-3, 6e-3, -6e-3)
+LINED = FingerLook(
+    level_dn=83.0, texture=0.1, marks=(FingerMark(from_tip_m=(3.5e-3, 3.8e-3), across=(-2.0, 2.0), gain=2.5),)
+)
+"""A thin bright line round each finger."""
+
+PLAIN = FingerLook(texture=0.0, carriers=False)
+DARK = Background(kind="stripes", level_dn=51.0, contrast=0.4)
+LAST = 9
+"""A frame that isn't learnt."""
+
+
+def filmed(fingers: FingerLook, **sections: object) -> Simulator:
+    sections = {"background": DARK, "fingers": fingers, **sections}
+    return simulator(Scenario(duration_s=5.0, fps=2.0, **sections), sharp=False)  # type: ignore[arg-type]
+
+
+def new_strips() -> FingerStrips:
+    gripper = box_gripper(sharp=False)
+    return FingerStrips(make_camera(PAPER_LENS), gripper, along_fingers(gripper)[1])
+
+
+def taught(simulation: Simulator, frames: int = FEWEST_FRAMES) -> FingerStrips:
+    strips = new_strips()
+    for i in range(frames):
+        truth = simulation.truth(i)
+        strips.learn(simulation.render(i), truth.cam_T_grip, truth.jaw_opening_m, truth.time_s)
+    return strips
+
+
+@cache
+def lined() -> tuple[Simulator, FingerStrips, Image]:
+    simulation = filmed(LINED)
+    return simulation, taught(simulation), simulation.render(LAST)
+
+
+def slid(cam_T_grip: np.ndarray, way_m: float) -> np.ndarray:
+    """The gripper moved along its fingers, outwards."""
+    out = cam_T_grip.copy()
+    out[:3, 3] += way_m * cam_T_grip[:3, 2]
+    return out
+
+
+def told_m(simulation: Simulator, strips: FingerStrips, image: Image, way_m: float) -> float | None:
+    """The slide that the strips tell of a pose ``way_m`` beside the true one, along the fingers."""
+    truth = simulation.truth(LAST)
+    slide_m = strips.slide_m(image, slid(truth.cam_T_grip, way_m), truth.jaw_opening_m, RISK)
+    if slide_m is None:
+        return None
+    assert np.abs(slide_m[:2]).max() < 1e-9, "these fingers run along z"
+    return float(slide_m[2])
+
+
+@pytest.mark.parametrize("way_m", SLIDES_M)
+def test_of_a_pose_slid_along_lined_fingers_they_tell_the_way_back(way_m: float):
+    assert told_m(*lined(), way_m) == pytest.approx(-way_m, abs=3e-4)
+
+
+def test_of_the_true_pose_and_of_a_pixel_beside_it_nothing_is_told():
+    for way_m in (0.0, 2e-4, -2e-4):
+        assert told_m(*lined(), way_m) is None
+
+
+@pytest.mark.parametrize(("gain", "offset_dn"), [(0.4, 10.0), (1.0, 60.0), (1.8, 0.0)])
+def test_light_changes_nothing(gain: float, offset_dn: float):
+    simulation, strips, image = lined()
+    lit = np.clip(gain * image.astype(float) + offset_dn, 0.0, 255.0).astype(np.uint8)
+    assert told_m(simulation, strips, lit, 0.0) is None
+    assert told_m(simulation, strips, lit, 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
+
+
+def test_they_move_with_the_jaws():
+    knots = ((0.0, 0.034), (1.5, 0.034), (4.0, 0.024))
+    simulation = filmed(LINED, jaw=JawScript(knots=knots))
+    assert abs(simulation.truth(LAST).jaw_opening_m - 0.034) > 5e-3
+    seen = simulation, taught(simulation), simulation.render(LAST)
+    assert told_m(*seen, 0.0) is None
+    assert told_m(*seen, -3.3e-3) == pytest.approx(3.3e-3, abs=3e-4)
+
+
+def test_colour_is_read_as_grey():
+    simulation, strips, image = lined()
+    grey = image if image.ndim == 2 else image[..., 0]
+    assert told_m(simulation, strips, np.repeat(grey[..., None], 3, axis=2), 3.3e-3) == pytest.approx(-3.3e-3, abs=3e-4)
+
+
+@pytest.mark.parametrize("way_m", [0.0, *SLIDES_M])
+def test_before_a_background_like_them_fingers_of_one_shade_tell_of_no_slide_that_isnt_there(way_m: float):
+    """Their outline may tell the way back, but nothing tells another one."""
+    simulation = filmed(PLAIN)
+    told = told_m(simulation, taught(simulation), simulation.render(LAST), way_m)
+    assert told is None or told == pytest.approx(-way_m, abs=6e-4)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 3.3e-3])
+def test_what_hides_the_fingers_tells_of_no_slide_that_isnt_there(way_m: float):
+    simulation = filmed(LINED, covers=(Cover(start_s=2.0, end_s=5.0, move_s=0.5),))
+    told = told_m(simulation, taught(simulation), simulation.render(LAST), way_m)
+    assert told is None or told == pytest.approx(-way_m, abs=3e-4)
+
+
+def test_they_need_some_frames_and_then_learn_one_a_second():
+    simulation, _, image = lined()
+    strips = taught(simulation, FEWEST_FRAMES - 1)
+    assert not strips.ready and told_m(simulation, strips, image, 3.3e-3) is None
+    truth = simulation.truth(LAST)
+    for now_s, frames in ((10.0, 0), (10.0 + 0.9 * RELEARN_S, 0), (10.0 + RELEARN_S, 1)):
+        strips.learn(image, truth.cam_T_grip, truth.jaw_opening_m, now_s)
+        assert strips.ready and strips.frames == FEWEST_FRAMES + frames
+
+
+def test_out_of_view_there_is_nothing_to_learn():
+    strips, away_T = new_strips(), nominal_cam_T_grip()
+    away_T[:3, 3] = (0.0, 0.0, -0.5)
+    image = np.full((576, 768), 90, dtype=np.uint8)
+    for i in range(FEWEST_FRAMES):
+        strips.learn(image, away_T, None, float(i))
+    assert not strips.ready and strips.slide_m(image, away_T, None, RISK) is None
