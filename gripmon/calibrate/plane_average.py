@@ -13,7 +13,6 @@ from gripmon.calibrate.plane import DOUBTED, Coincidence, corners_of, lengths_of
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.geometry import perturb, perturbation_between
-from gripmon.model.least_squares import covariance_of
 from gripmon.model.records import Array
 
 BESIDE_STEPS = 2.0
@@ -63,7 +62,7 @@ def average(images: Sequence[Coincidence], inferred: bool) -> PlaneCalibration:
     """
     if inferred and len({i.corners.names for i in images}) > 1:
         raise CalibrationError("the images show different corners; for a gripper that is inferred the same in all")
-    information = [covariance_of(i.own @ i.own.T + i.printed @ i.printed.T) for i in images]
+    information = [_inverse(i.own @ i.own.T + i.printed @ i.printed.T) for i in images]
     total = np.linalg.inv(np.sum(information, axis=0))
     gains = [total @ i for i in information]
     cam_T_grip = images[0].cam_T_grip
@@ -129,6 +128,12 @@ def _of_print(slopes: Sequence[Array]) -> Array:
     per_weight = [sizes.sum() / size if size > 0.0 else 0.0 for size in sizes]
     out: Array = np.sum([part * per for part, per in zip(parts, per_weight, strict=True)], axis=0)
     return out
+
+
+def _inverse(covariance: Array) -> Array:
+    """Of a matrix whose rows have different units; one direction may be known far better than another."""
+    scale = np.sqrt(covariance.diagonal())
+    return np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
 
 
 def _of_images(images: Sequence[Coincidence], inferred: bool) -> list[str]:

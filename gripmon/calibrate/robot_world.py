@@ -252,7 +252,13 @@ def _conclude(
     freedom = 6 * int(used.sum()) - 12
     variance = max(float(np.square(_sizes(whiten, values)[used]).sum()) / freedom, 1e-18)
     normal, _ = normal_equations((whiten @ slopes(base_T_ee, *at))[used], values[used])
-    return RobotWorld(at[0], at[1], covariance_of(normal, variance), values, used, freedom)
+    try:
+        covariance = covariance_of(normal, variance)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            "the poses leave a direction undetermined; poses turned about at least two axes, and shifted"
+        ) from None
+    return RobotWorld(at[0], at[1], covariance, values, used, freedom)
 
 
 def check_target_scale(cam_T_target: Array) -> None:
