@@ -222,11 +222,6 @@ def test_lines_round_both_fingers_are_no_ends_of_them_after_a_knock():
     assert valid(seen)[knock - first + 3 :].all() and error[knock - first + 3 :].max() < 2e-4
 
 
-@pytest.mark.xfail(
-    reason="where the gripper isn't found, the tips' edges seen at its old place stand against a knock, but they say "
-    "nothing of one across the fingers",
-    strict=True,
-)
 def test_a_knock_across_lined_fingers_before_a_background_like_them_misleads_in_no_frame():
     line = FingerMark(from_tip_m=(3.5e-3, 3.8e-3), across=(-2.0, 2.0), gain=2.48)
     lamp = (0.437, 0.162, -0.75)

@@ -195,11 +195,13 @@ class Integrity:
 
     def _at_its_place(self, frame: Frame, now_s: float) -> _Candidate | None:
         """The measurement where the gripper was, if it may be there still: marks on the fingers and borders beside them
-        look like their ends elsewhere.
+        look like their ends elsewhere.  None also where too little of the sides is seen there.
         """
         weigher = self._weigher
         there = self._measured(frame, weigher.expected[0], weigher.sigma(now_s), now_s)
-        return None if there is None or there.trust.displaced else there
+        if there is None or there.trust.displaced or not weigher.held_across(there.measurement):
+            return None
+        return there
 
     def _measured(self, frame: Frame, cam_T_grip: Array, sigma: Array, now_s: float) -> _Candidate | None:
         """The measurement at a pose (4, 4) with what lies within the standard deviations (6,) of it; None where nothing

@@ -206,6 +206,14 @@ class Weigher:
         by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
         return int((by_edge * np.maximum(corners, 1)).sum())
 
+    def held_across(self, measurement: Measurement) -> bool:
+        """Whether enough of the fingers' sides is seen where they are expected to exclude an unseen knock across the
+        fingers, of which their ends' edges say nothing: each side may be misread as an end may.
+        """
+        edge = measurement.normal.edge
+        sides = int((measurement.consensus.edge_seen[edge] & self._tracker.along[edge]).sum())
+        return KNOCKED_UNSEEN * MISREAD_END**sides <= self._policy.integrity_risk
+
     def _not_as_expected(self, away: Array) -> Protection:
         """The bound by what the first frames differ from the reference, ``away`` (6,)."""
         risk = self._policy.integrity_risk
