@@ -10,14 +10,15 @@ pytestmark = pytest.mark.usefixtures("tools_importable")
 
 def test_discs_lie_where_they_are_projected_to():
     """Centroids of what is dark against the disc's outline, sent point by point through the camera."""
-    from benchmarks.offline_images import DISCS, PAPER_LENS, Plate, Setting
+    from benchmarks.offline_images import DISCS, PAPER_LENS, Setting
 
     from gripmon.model.camera import make_camera
+    from gripmon.simulate.plates import Plate, Print
 
     setting = Setting.random(np.random.default_rng(2), print_m=5e-5)
     assert setting.errors_m is not None
     cam_T_plate = setting.cam_T_grip @ setting.grip_T_plate
-    light = Plate(DISCS, cam_T_plate, setting.errors_m).light(PAPER_LENS, 0.6)
+    light = Plate(DISCS, cam_T_plate, Print(margin=np.inf, errors_m=setting.errors_m)).light(PAPER_LENS, 0.6)
     camera, way = make_camera(PAPER_LENS), np.linspace(0.0, 2.0 * np.pi, 400, endpoint=False)
     for column, row in ((3, 3), (4, 5), (5, 2)):
         centre = np.array([column, row]) * DISCS.spacing_m + setting.errors_m[row, column]
