@@ -45,7 +45,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def on_page_content(html: str, page: Any, **_: Any) -> str:
     """Docstrings mark names as Sphinx does; Markdown shows the name alone."""
-    return re.sub(r":(?:class|meth|func|data|attr|mod):(?=<code>)", "", html) if "api.md" in page.file.src_uri else html
+    return re.sub(r":(?:class|meth|func|data|attr|mod):(?=<code>)", "", html)
 
 
 def on_post_build(config: Any) -> None:
