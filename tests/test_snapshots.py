@@ -281,6 +281,17 @@ def test_somebody_elses_table_is_left_alone(table: str, said: str, tmp_path: Pat
     assert (tmp_path / "timestamps.csv").read_text() == table
 
 
+def patient_snapshot(operator: Client, times: int = 10) -> tuple[CommandReply, bytes | None]:
+    """A busy machine may take longer than the monitor's 2 s for five megabytes of noise; a person would ask again."""
+    for _ in range(times - 1):
+        try:
+            return operator.snapshot(5.0 * WAIT_S)
+        except NotCarriedOut as refused:
+            if refused.fault is not CommandFault.TIMEOUT:
+                raise
+    return operator.snapshot(5.0 * WAIT_S)
+
+
 def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: Path):
     """Five megabytes, with the files that are shipped: no limit on the way is smaller than what is sent."""
     router = free_endpoint()
@@ -297,7 +308,7 @@ def test_a_large_one_comes_through_the_secure_router_to_the_operator(tmp_path: P
     ):
         wait_until(lambda: daemon.publisher.connected and daemon.frames, "a frame of a monitor on the network")
         with Client("arm", "wrist", zenoh_config_file=str(tmp_path / "operator.json5")) as operator:
-            reply, data = operator.snapshot(5.0 * WAIT_S)
+            reply, data = patient_snapshot(operator)
     assert reply.snapshot is not None and data is not None and len(data) > 5_000_000
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED), noise)
 
