@@ -29,7 +29,7 @@ from gripmon.cli import (
     view,
     watch,
 )
-from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED, CommandFailedError
+from gripmon.cli.common import EXIT_BROKEN_PIPE, EXIT_INTERRUPTED
 from gripmon.model.errors import InputError, NoResultError
 
 _COMMANDS = (
@@ -117,7 +117,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code: int = chosen.handler(chosen)
         sys.stdout.flush()
-    except (CommandFailedError, InputError, NoResultError) as error:
+    except (InputError, NoResultError) as error:
         print(error, file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:

@@ -20,17 +20,8 @@ EXIT_DONE = 0
 EXIT_USAGE = 2
 EXIT_FAILED = 3
 EXIT_INTERRUPTED = 130
-RECORDING_PATIENCE_S = 30.0  # images that can wait outrun any camera: they wait for the recording, none is dropped
 EXIT_BROKEN_PIPE = 141  # as the shell reports a program that SIGPIPE stopped
 _LARGEST_SEED = 2**32 - 1
-
-
-class CommandFailedError(Exception):
-    """A command ends here; ``str()`` is the one line for stderr."""
-
-    def __init__(self, text: str, exit_code: int = EXIT_FAILED):
-        super().__init__(text)
-        self.exit_code = exit_code
 
 
 def add_command(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.analyse.api import CorrectedRun
@@ -60,12 +61,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon correct``."""
     out = Path(arguments.out)
     if out.suffix.lower() == ".rrd" and arguments.stamps is not None:
-        raise common.CommandFailedError(
-            "--stamps: a track has its frames' times; .jsonl or .parquet", common.EXIT_USAGE
-        )
+        raise InputError("--stamps: a track has its frames' times; .jsonl or .parquet")
     common.make_directory(out.parent)
     if out.is_dir():
-        raise common.CommandFailedError(f"--out {out}: is a folder; a file", common.EXIT_USAGE)
+        raise InputError(f"--out {out}: is a folder; a file")
     from gripmon.analyse.api import correct
 
     done = correct(arguments.recordings, out, stamps=arguments.stamps, progress=common.progress_bar)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.model.records import FrameRecord
@@ -25,9 +26,7 @@ def is_recording(paths: list[Path]) -> bool:
 
     other = next((path for path in paths if not holds(path)), None)
     if other is not None and len(paths) > 1:
-        raise common.CommandFailedError(
-            f"{other}: is no .rrd file; one input, or several .rrd files of one run", common.EXIT_USAGE
-        )
+        raise InputError(f"{other}: is no .rrd file; one input, or several .rrd files of one run")
     return other is None
 
 
@@ -73,7 +72,7 @@ class RecordedRun:
         """A recorder into one file that shows what was recorded and what is replayed, overlaid."""
         path = Path(name)
         if path.is_dir():
-            raise common.CommandFailedError(f"--recording {path}: is a folder; a file", common.EXIT_USAGE)
+            raise InputError(f"--recording {path}: is a folder; a file")
         common.make_directory(path.parent, "--recording")
         with contextlib.ExitStack() as opened:
             try:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 _DESCRIPTION = """\
 Says what happened in recordings: when the camera moved, how far the tool centre point (TCP) went
@@ -99,7 +100,7 @@ def _check_folder(path: Path | None, option: str) -> None:
     if path is None:
         return
     if path.is_dir():
-        raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+        raise InputError(f"{option} {path}: is a folder; a file")
     common.make_directory(path.parent, option)
 
 

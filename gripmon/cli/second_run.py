@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from gripmon.cli import common
 from gripmon.cli.viewing import LiveView
+from gripmon.model.errors import InputError
 from gripmon.model.stopping import StopRequest
 
 if TYPE_CHECKING:
@@ -60,6 +61,7 @@ def run_second(
     from gripmon import daemon
     from gripmon.daemon import camera_source
     from gripmon.daemon.network import with_source
+    from gripmon.daemon.starting import RECORDING_PATIENCE_S
 
     settings, laser = config.settings, config.settings.laser
     camera_source.look_ahead(config)
@@ -77,7 +79,7 @@ def run_second(
         opened.callback(publisher.close)
         source = camera_source.open_source(config, network.link)
         opened.callback(source.close)
-        recorder = _open_recorder(config, out, live, 0.0 if source.live else common.RECORDING_PATIENCE_S)
+        recorder = _open_recorder(config, out, live, 0.0 if source.live else RECORDING_PATIENCE_S)
         opened.callback(recorder.close)
         if live is not None:
             live.open(viewed)
@@ -114,9 +116,9 @@ def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
             return _Network(None, NullPublisher(), None, None, Reports())
         link = Link(config.settings.publish, config.directory)
     except ConfigError as error:
-        raise common.CommandFailedError(str(error), common.EXIT_USAGE) from None
+        raise InputError(str(error)) from None
     except PublishError as error:
-        raise common.CommandFailedError(f"{config.path}: {error}", common.EXIT_USAGE) from None
+        raise InputError(f"{config.path}: {error}") from None
     with contextlib.ExitStack() as failed:
         failed.callback(link.close)  # a process must not end while its session is being opened
         network = _on_link(config, link, take_over=take_over)
@@ -164,7 +166,7 @@ def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None
         configuration = second_to_recorded(config)
     except OSError as error:
         text = f"{config.path}: {error.filename}: can't be read any more ({error.strerror})"
-        raise common.CommandFailedError(text, common.EXIT_USAGE) from None
+        raise InputError(text) from None
     try:
         return open_spot_recorder(
             settings.recording,
@@ -179,8 +181,7 @@ def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None
     except OSError as error:
         if out is not None:
             raise common.not_writable(out, error) from None
-        raise common.CommandFailedError(
+        raise InputError(
             f"{config.path}: recording.directory: {settings.recording.directory} can't be made ({error.strerror}); "
-            "a folder that may be written",
-            common.EXIT_USAGE,
+            "a folder that may be written"
         ) from None

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
@@ -154,7 +155,7 @@ def _check_usage(arguments: argparse.Namespace) -> None:
     """Without corners by hand images and a configuration are needed; nothing else makes sense."""
 
     def refuse(text: str) -> None:
-        raise common.CommandFailedError(f"teach: {text}", common.EXIT_USAGE)
+        raise InputError(f"teach: {text}")
 
     if not arguments.images:
         refuse("no image; image files, or --page --live DEVICE")
@@ -173,20 +174,15 @@ def _out(arguments: argparse.Namespace, config: Config) -> Path:
         if path:
             common.make_directory(path.parent, option)
             if path.is_dir():
-                raise common.CommandFailedError(f"{option} {path}: is a folder; a file", common.EXIT_USAGE)
+                raise InputError(f"{option} {path}: is a folder; a file")
     if arguments.into_config and config.taught_path is not None and config.taught_path.resolve() != out.resolve():
-        raise common.CommandFailedError(
-            f"--into-config: {config.path} names {config.taught_path} already; without it, or without --out",
-            common.EXIT_USAGE,
+        raise InputError(
+            f"--into-config: {config.path} names {config.taught_path} already; without it, or without --out"
         )
     if out.exists() and not arguments.force:
-        raise common.CommandFailedError(
-            f"--out {out}: is there already; another file, or --force to replace it", common.EXIT_USAGE
-        )
+        raise InputError(f"--out {out}: is there already; another file, or --force to replace it")
     if arguments.picture is not None and Path(arguments.picture).suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise common.CommandFailedError(
-            f"--picture {arguments.picture}: has no known ending; .png or .jpg", common.EXIT_USAGE
-        )
+        raise InputError(f"--picture {arguments.picture}: has no known ending; .png or .jpg")
     return out
 
 

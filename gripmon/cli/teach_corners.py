@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.teaching import Inputs
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace, command: str) -> int:
     if arguments.page and all(getattr(arguments, name) is None for name in _NEED_A_GRIPPER):
         if len(images) > 1:
             text = f"teach: {len(images)} images, and no gripper; one image, to put rough corners in, or --gripper FILE"
-            raise common.CommandFailedError(text, common.EXIT_USAGE)
+            raise InputError(text)
         folder = paths["out"] or Path()
         desk = rough_desk(images[0], paths["camera"], folder)
         common.make_directory(folder)
@@ -55,7 +56,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
     """Options that contradict each other end the command with exit code 2."""
 
     def refuse(text: str) -> None:
-        raise common.CommandFailedError(f"teach: {text}", common.EXIT_USAGE)
+        raise InputError(f"teach: {text}")
 
     if arguments.page and arguments.corners is not None:
         refuse("--page and --corners are two ways of the same; one of them")
@@ -107,7 +108,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
         try:
             live = open_source(live_settings(arguments.live, inputs.bench.camera))
         except SourceError as error:
-            raise common.CommandFailedError(f"--live: {error}", common.EXIT_USAGE) from None
+            raise InputError(f"--live: {error}") from None
     saving = FileSaving(inputs)
     return _serve(arguments, Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live))
 
@@ -120,8 +121,8 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
         server = PageServer(desk, arguments.port)
     except OSError as error:
         desk.close()
-        raise common.CommandFailedError(
-            f"--port {arguments.port}: can't be listened on ({error.strerror}); another one, or none", common.EXIT_USAGE
+        raise InputError(
+            f"--port {arguments.port}: can't be listened on ({error.strerror}); another one, or none"
         ) from None
     try:
         print(f"teach on this page: {server.url}", flush=True)
@@ -131,9 +132,7 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
         while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
             dark_s, why = desk.dark()
             if arguments.live_wait is not None and dark_s > arguments.live_wait:
-                raise common.CommandFailedError(
-                    f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s"
-                )
+                raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
     finally:
         server.close()
         desk.close()
@@ -155,27 +154,24 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
 
     rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
     if inputs.bench.reference is None and len(rough) < FEWEST_PUT:
-        raise common.CommandFailedError(
+        raise InputError(
             f"{arguments.corners}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, hidden ones too, "
-            "about where they would show; or --reference FILE (of gripmon calibrate plane)",
-            common.EXIT_USAGE,
+            "about where they would show; or --reference FILE (of gripmon calibrate plane)"
         )
     picture = inputs.pictures[0]
     corners = {name: np.array(at) for name, at in rough.items()}
     found = inputs.bench.look(picture.image, corners, (), picture.jaw_opening_m)
     if found.snapped.refused is not None:
-        raise common.CommandFailedError(f"{picture.name}: {found.snapped.refused}")
+        raise NoResultError(f"{picture.name}: {found.snapped.refused}")
     print("\n".join(_table(found)))
     put = Put(corners=rough, image=0, jaw_opening_m=picture.jaw_opening_m)
     order = SaveOrder(put=put, robot=inputs.robot, camera_name=inputs.camera_name, replace=arguments.force)
     try:
         saved = FileSaving(inputs).save(order, found, 0, inputs.pictures)
     except SavingRefused as refused:
-        raise common.CommandFailedError(f"teach: {refused}") from None
+        raise NoResultError(f"teach: {refused}") from None
     if saved.exists:
-        raise common.CommandFailedError(
-            f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace", common.EXIT_USAGE
-        )
+        raise InputError(f"--out {', '.join(saved.exists)}: there already; another folder, or --force to replace")
     _say(saved)
     return common.EXIT_DONE
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from gripmon.cli import common
+from gripmon.model.errors import InputError, NoResultError
 
 _DESCRIPTION = """\
 Show recordings in rerun's viewer: in a window where there is a display, else as a page for a browser
@@ -59,11 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
         except OSError as error:
             wrong = f"can't be read ({error.strerror})"
         if wrong:
-            raise common.CommandFailedError(f"{path}: {wrong}", common.EXIT_USAGE)
+            raise InputError(f"{path}: {wrong}")
     if arguments.port is not None and not is_free(arguments.port):
-        raise common.CommandFailedError(
-            f"--port {arguments.port}: is in use on 127.0.0.1; another port, or none for any", common.EXIT_USAGE
-        )
+        raise InputError(f"--port {arguments.port}: is in use on 127.0.0.1; another port, or none for any")
     try:
         with signals_exit(), ExitStack() as opened:
             if arguments.native or (has_display() and not arguments.web):
@@ -74,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"{page.url}\n(Ctrl-C ends it)", flush=True)
             threading.Event().wait()
     except ViewerError as error:
-        raise common.CommandFailedError(f"view: {error}") from None
+        raise NoResultError(f"view: {error}") from None
     return common.EXIT_DONE
 
 

@@ -8,7 +8,7 @@ import time
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from gripmon.cli import common
+from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.record.write import ViewSettings
@@ -41,13 +41,11 @@ class LiveView:
         self._native = kind == "native" or (kind == "auto" and has_display())
         self._web = kind == "web" or (kind == "auto" and not has_display())
         if kind == "native" and not has_display():
-            raise common.CommandFailedError("--view native: there is no display; --view web", common.EXIT_USAGE)
+            raise InputError("--view native: there is no display; --view web")
         ports = [("port", settings.port)] + [("web_port", settings.web_port)] * self._web
         for key, port in ports:
             if not is_free(port):
-                raise common.CommandFailedError(
-                    f"{said_by}: view.{key}: {port} is in use on 127.0.0.1; another port", common.EXIT_USAGE
-                )
+                raise InputError(f"{said_by}: view.{key}: {port} is in use on 127.0.0.1; another port")
 
     def open(self, opened: ExitStack) -> None:
         """Start the viewer, which shows the stream as soon as there is one; a page ends with ``opened``."""
@@ -58,7 +56,7 @@ class LiveView:
             try:
                 page = WebPage(self.settings.web_port, [url])
             except ViewerError as error:
-                raise common.CommandFailedError(f"--view web: {error}", common.EXIT_FAILED) from None
+                raise NoResultError(f"--view web: {error}") from None
             opened.callback(page.close)
             print(f"live view: {page.url}", file=sys.stderr)
         print(f"live view: rerun viewers connect to {url}", file=sys.stderr)
