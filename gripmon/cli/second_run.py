@@ -106,7 +106,7 @@ def run_second(
 def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
     """Open all of it; ends the command as :func:`gripmon.daemon.network.open_network` does."""
     from gripmon.daemon import Reports
-    from gripmon.daemon.config import ConfigError, check_second_network
+    from gripmon.daemon.config import check_second_network
     from gripmon.io.publish import NullPublisher
     from gripmon.io.wire import Link, PublishError
 
@@ -115,8 +115,6 @@ def _open_network(config: SecondConfig, *, take_over: bool) -> _Network:
         if not config.settings.publish.enabled:
             return _Network(None, NullPublisher(), None, None, Reports())
         link = Link(config.settings.publish, config.directory)
-    except ConfigError as error:
-        raise InputError(str(error)) from None
     except PublishError as error:
         raise InputError(f"{config.path}: {error}") from None
     with contextlib.ExitStack() as failed:
