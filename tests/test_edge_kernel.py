@@ -1,0 +1,146 @@
+"""The compiled fit against the same in NumPy: same points, same decisions, numbers equal to rounding."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from test_consensus import (
+    EDGES,
+    PREDICTION,
+    PRIOR,
+    SAMPLED,
+    SETTINGS,
+    XI,
+    candidates,
+    true_candidates,
+    votes_for,
+    with_background_edge,
+    with_clutter,
+)
+
+from gripmon.model.compiled import COMPILES
+from gripmon.track.edges.consensus import AGAIN_PX, Prior, Votes, agree, agree_with_numpy
+from gripmon.track.edges.uncertainty import (
+    assess,
+    assess_with_numpy,
+    contradictions_without,
+    contradictions_without_with_numpy,
+)
+
+pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
+CLOSE = 1e-9
+
+
+def many_votes() -> list[Votes]:
+    """Edges alone, in clutter, behind an edge of the background; with polarity, spreads and cut-off edges."""
+    rng = np.random.default_rng(21)
+    found = [true_candidates(rng, sigma) for sigma in (0.0, 0.05, 0.3)]
+    found += [with_clutter(rng, missing, extra) for missing in (0.0, 0.3, 0.8) for extra in (0.0, 0.5, 2.0)]
+    found += [with_background_edge(int(edge), 1.5, seen) for edge in SAMPLED[:4] for seen in (False, True)]
+    votes = [votes_for(f) for f in found]
+    polarity = np.where(np.arange(EDGES) % 3 == 0, 1, 0).astype(np.int8)
+    for f in found:
+        mixed = replace(
+            f,
+            sigma_px=rng.uniform(0.02, 0.4, len(f.sample)),
+            step=rng.choice([-40.0, 40.0], len(f.sample), p=[0.2, 0.8]),
+            zoom=int(rng.choice([1, 2, 4])),
+        )
+        spread_px, cut_off_px = rng.uniform(0.0, 0.1, EDGES), rng.uniform(0.0, 0.2, EDGES)
+        votes.append(replace(votes_for(mixed, polarity=polarity, edge_spread_px=spread_px), cut_off_px=cut_off_px))
+    return votes
+
+
+VOTES = many_votes()
+NOTHING = votes_for(candidates(np.arange(0), np.zeros(0)))
+HARDLY = [votes_for(candidates(np.arange(count), np.full(count, 0.3))) for count in (3, 6)]
+RIGID = replace(PREDICTION, jacobian=np.ascontiguousarray(PREDICTION.jacobian[:, :6]))
+"""The same edges of a gripper without a jaw: six unknowns."""
+
+
+def prior(unknowns: int, jaw_sigma_m: float = 1e-4, opened_m: float = 0.0) -> Prior:
+    information = PRIOR[:unknowns].copy()
+    information[6:] = jaw_sigma_m**-2
+    return Prior(np.array([0.0] * 6 + [opened_m])[:unknowns], information)
+
+
+def cases() -> Iterator[tuple[Votes, Prior, np.ndarray]]:
+    rng = np.random.default_rng(22)
+    for votes in (*VOTES, *HARDLY, NOTHING):
+        for start in (np.zeros(7), 0.5 * XI, XI + rng.normal(size=7) * [2e-4, 2e-4, 2e-4, 2e-3, 2e-3, 2e-3, 1e-4]):
+            yield votes, prior(7), start
+        yield votes, prior(7, 1e-6, 2e-5), np.zeros(7)
+        yield votes, prior(7, 0.02), np.zeros(7)
+        yield replace(votes, prediction=RIGID), prior(6), np.zeros(6)
+
+
+def assert_alike(one: object, other: object, unit: np.ndarray, condition: float) -> None:
+    """Every field of two records: decisions equal, numbers within :data:`CLOSE` of the largest in their field.
+
+    ``unit`` (m,) makes the unknowns comparable with each other: by how much they are uncertain.  ``condition`` of the
+    normal matrix in these units: rounding grows with it where a handful of points hardly determines the motion.
+    """
+    close = CLOSE * max(1e-4 * condition, 1.0)
+    scale = {
+        "xi": 1.0 / unit,
+        "pull": unit,
+        "information": np.outer(unit, unit),
+        "middle": np.outer(unit, unit),
+        "covariance": 1.0 / np.outer(unit, unit),
+    }
+    for field in fields(one):  # type: ignore[arg-type]
+        if field.name == "normal":
+            assert_alike(one.normal, other.normal, unit, condition)  # type: ignore[attr-defined]
+            continue
+        left, right = np.asarray(getattr(one, field.name)), np.asarray(getattr(other, field.name))
+        assert left.shape == right.shape and left.dtype == right.dtype, field.name
+        if left.dtype.kind == "f":
+            by = scale.get(field.name, 1.0)
+            most = close * max(float(np.abs(right * by).max(initial=0.0)), 1e-3)
+            np.testing.assert_allclose(left * by, right * by, rtol=0.0, atol=most, err_msg=field.name)
+        else:
+            np.testing.assert_array_equal(left, right, err_msg=field.name)
+
+
+def test_the_compiled_fit_and_covariance_are_those_of_numpy():
+    for votes, known, start in cases():
+        expected = agree_with_numpy(votes, known, start, SETTINGS)
+        assert_same_fit(votes, known, start, None)
+        assert_same_fit(votes, known, expected.xi, AGAIN_PX)
+
+
+def assert_same_fit(votes: Votes, known: Prior, start: np.ndarray, width_px: float | None) -> None:
+    expected = agree_with_numpy(votes, known, start, SETTINGS, width_px)
+    unit = 1.0 / np.sqrt(np.diag(expected.information) + known.information)
+    normal = expected.information + np.diag(known.information)
+    condition = float(np.linalg.cond(normal * np.outer(unit, unit)))
+    assert_alike(agree(votes, known, start, SETTINGS, width_px), expected, unit, condition)
+    for shared_px in (0.0, 0.2):
+        one, other = (f(votes, expected, known.information, shared_px) for f in (assess, assess_with_numpy))
+        assert_alike(one, other, unit, condition)
+
+
+def test_the_compiled_fits_without_one_edge_are_those_of_numpy():
+    for votes, known, start in list(cases())[::7]:
+        stays = contradictions_without(votes, known, start, SETTINGS)
+        expected = contradictions_without_with_numpy(votes, known, start, SETTINGS)
+        assert len(stays) == len(SAMPLED)
+        np.testing.assert_allclose(stays, expected, rtol=1e-8)
+
+
+def test_what_can_not_be_solved_is_an_error():
+    """No candidates and a prior that holds nothing: all of these have a normal matrix of zeros."""
+    nothing = Prior(np.zeros(7), np.zeros(7))
+    for fit in (agree, agree_with_numpy):
+        with pytest.raises(FloatingPointError, match="not positive definite"):
+            fit(NOTHING, nothing, np.zeros(7), SETTINGS)
+    empty = agree(NOTHING, prior(7), np.zeros(7), SETTINGS)
+    for covariance in (assess, assess_with_numpy):
+        with pytest.raises(FloatingPointError, match="not positive definite"):
+            covariance(NOTHING, empty, np.zeros(7))
+    for without in (contradictions_without, contradictions_without_with_numpy):
+        with pytest.raises(FloatingPointError, match="not positive definite"):
+            without(NOTHING, nothing, np.zeros(7), SETTINGS)
