@@ -7,14 +7,14 @@ to see whether it has changed: compiled functions that call one another stand in
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 try:
     import numba
 except ImportError:  # no build of it for this machine
     COMPILES = False
 else:
-    COMPILES = not numba.config.DISABLE_JIT
+    COMPILES = not getattr(numba.config, "DISABLE_JIT", False)
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -27,5 +27,5 @@ def compiled(function: _F) -> _F:
     """
     if not COMPILES:
         return function
-    made: _F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return made
+    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    return cast("_F", made)
