@@ -23,9 +23,9 @@ def compiled(function: _F) -> _F:
     """``function``, compiled when it is first called with arguments of some types; as it is where nothing compiles.
 
     Arithmetic is as written, neither fused nor reordered, so that a replay on another machine decides alike; a division
-    by zero gives what NumPy's does; other threads run meanwhile.
+    by zero gives what NumPy's does.  The interpreter stays locked meanwhile: to get it back takes longer than a kernel.
     """
     if not COMPILES:
         return function
-    made: Any = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    made: Any = numba.njit(cache=True, error_model="numpy")(function)
     return cast("_F", made)
