@@ -22,7 +22,8 @@ from test_consensus import (
 )
 
 from gripmon.model.compiled import COMPILES
-from gripmon.track.edges.consensus import AGAIN_PX, Prior, Votes, agree, agree_with_numpy
+from gripmon.track.edges.consensus import AGAIN_PX, Prior, agree, agree_with_numpy
+from gripmon.track.edges.profiles import Votes
 from gripmon.track.edges.uncertainty import (
     assess,
     assess_with_numpy,

@@ -33,7 +33,7 @@ from gripmon.track.edges.kernel import (
     TUKEY,
 )
 from gripmon.track.edges.prediction import Prediction
-from gripmon.track.edges.profiles import Candidates
+from gripmon.track.edges.profiles import Votes
 
 
 class ConsensusSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -91,22 +91,6 @@ _ROUNDS_AGAIN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Votes:
-    """The candidates of one image with what they are worth: ``weight`` (k,) from :func:`base_weights`, 1/px², and
-    ``edge_spread_px`` (e,) the standard deviation that all points of an edge share.
-
-    ``cut_off_px`` (e,): what comes on top where an edge's bright side may be cut off; it isn't known well enough to
-    prefer other edges.
-    """
-
-    candidates: Candidates
-    prediction: Prediction
-    weight: Array
-    edge_spread_px: Array
-    cut_off_px: Array
-
-
-@dataclass(frozen=True, slots=True)
 class Prior:
     """What holds the unknowns (m,) before the image is seen: ``mean`` relative to the prediction, ``information`` in
     1/m², 1/rad².
@@ -149,24 +133,6 @@ class Consensus:
     edge_share: Array
     edge_seen: NDArray[np.bool_]
     share: float
-
-
-def base_weights(
-    candidates: Candidates,
-    prediction: Prediction,
-    polarity: NDArray[np.int8],
-    settings: ConsensusSettings,
-) -> Array:
-    """Weight (k,) of each candidate before the robust part, 1/px²; zero where the taught polarity disagrees.
-
-    ``polarity`` (e,) belongs to the gripper's edges.
-    """
-    edge = prediction.layout.edge[candidates.sample]
-    weight = 1.0 / (candidates.sigma_px**2 + settings.point_floor_px**2)
-    if polarity.any():
-        wanted = polarity[edge]
-        weight[(wanted != 0) & (np.sign(candidates.step) != wanted)] = 0.0
-    return weight
 
 
 def agree(

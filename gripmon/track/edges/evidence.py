@@ -19,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Image
-from gripmon.track.edges.consensus import Consensus, Prior, Votes, agree
+from gripmon.track.edges.consensus import Consensus, Prior, agree
 from gripmon.track.edges.ends import FingerEnds
 from gripmon.track.edges.lines import CornerGeometry, intersect_edges
-from gripmon.track.edges.settling import FEWEST_WIDTHS, Expected, Measurement, Settler, median
+from gripmon.track.edges.profiles import Votes, median
+from gripmon.track.edges.settling import FEWEST_WIDTHS, Expected, Measurement, Settler
 
 FINGER_SIGMA = np.array([3e-3] * 3 + [0.1] * 3)
 """How far a finger's own fit may go from its start, m and rad: only keeps weak views solvable."""
@@ -219,6 +221,16 @@ class FingerMeter(Settler):
             if best is None or share > CLEARLY_BETTER * best.share:
                 best = _Place(votes, fit, share)
         return best
+
+
+def agreeing_fingers(measurement: Measurement, gripper: Gripper) -> list[float]:
+    """Share of each finger's profiles that agree with the measured pose; 1 for a finger that isn't sampled."""
+    prediction = measurement.prediction
+    finger = gripper.edge_finger[prediction.layout.edge]
+    fingers = len(gripper.finger_ids)
+    agreeing = np.bincount(finger, measurement.consensus.supported, fingers).tolist()
+    sampled = np.bincount(finger, prediction.ok, fingers).tolist()
+    return [a / n if n else 1.0 for a, n in zip(agreeing, sampled, strict=True)]
 
 
 def _brightest(image: Image) -> float:

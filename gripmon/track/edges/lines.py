@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, CornerFault
-from gripmon.track.edges.consensus import Consensus, Votes
+from gripmon.track.edges.consensus import Consensus
 from gripmon.track.edges.prediction import Prediction
+from gripmon.track.edges.profiles import Votes
 
 
 class CornerSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

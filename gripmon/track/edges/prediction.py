@@ -155,6 +155,11 @@ class Prediction:
         return float(np.median(np.sqrt(np.einsum("ni,ni->n", self.jacobian[:, :3], self.jacobian[:, :3]))))
 
     @cached_property
+    def bevel_px(self) -> Array:
+        """(e,) ``edge_spread_m`` at the gripper's scale, px."""
+        return self.edge_spread_m * self.pixels_per_m
+
+    @cached_property
     def jacobian_by_unknown(self) -> Array:
         """(6 or 7, n): the Jacobian by rows, for fits."""
         return np.ascontiguousarray(self.jacobian.T)

@@ -20,10 +20,8 @@ from gripmon.track.edges.consensus import (
     Consensus,
     ConsensusSettings,
     Prior,
-    Votes,
     agree,
     agree_on_seen,
-    base_weights,
     prior_information,
 )
 from gripmon.track.edges.lines import CornerGeometry, Corners, CornerSettings, intersect_edges
@@ -31,13 +29,15 @@ from gripmon.track.edges.prediction import EdgeLayout, Prediction, SamplingSetti
 from gripmon.track.edges.profiles import (
     Candidates,
     EdgeSettings,
-    cut_off_spread,
+    Votes,
     estimate_noise,
     find_candidates,
     full_scale,
+    median,
     profile_offsets_px,
     quantum,
     read_profiles,
+    weigh,
 )
 from gripmon.track.edges.search import SearchSettings
 from gripmon.track.edges.taught import TaughtEdges
@@ -290,12 +290,7 @@ class Settler:
         return self._votes(candidates, prediction)
 
     def _votes(self, candidates: Candidates, prediction: Prediction) -> Votes:
-        weights = base_weights(candidates, prediction, self._polarity, self._settings.consensus)
-        # A whole edge is off by a share of the edges' width, and by what the model doesn't say of a bevel.
-        width_px = max(median(candidates.width_px), 1.0) if len(candidates.sample) else 1.0
-        bevel_px = prediction.edge_spread_m * prediction.pixels_per_m
-        spread_px = np.hypot(bevel_px, self._settings.consensus.edge_floor_px * width_px)
-        return Votes(candidates, prediction, weights, spread_px, width_px * cut_off_spread(candidates, prediction))
+        return weigh(candidates, prediction, self._polarity, self._settings.consensus)
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         return assess(votes, consensus, self._prior)
@@ -329,9 +324,3 @@ class Settler:
         jaw_opening_m = prediction.jaw_opening_m + (float(xi[6]) if len(xi) == 7 else 0.0)
         jaw_opening_m = min(max(jaw_opening_m, gripper.jaw_min_m), gripper.jaw_max_m)
         return replace(expected, cam_T_grip=perturb(prediction.cam_T_grip, xi[:6]), jaw_opening_m=jaw_opening_m)
-
-
-def median(values: Array) -> float:
-    """The upper one of two middle values; NumPy's own checks for NaN take longer than the rest."""
-    middle = len(values) // 2
-    return float(np.partition(values, middle)[middle])

@@ -17,11 +17,11 @@ from gripmon.track.edges.consensus import (
     Consensus,
     ConsensusSettings,
     Prior,
-    Votes,
     agree,
     agree_with_numpy,
 )
 from gripmon.track.edges.kernel import FEWEST_FREE, SMALLEST_SCATTER
+from gripmon.track.edges.profiles import Votes
 
 CONTRADICTION = 3.0
 """Stretches that contradict each other more than this call for an edge that is none; texture gives 1 to 2."""
