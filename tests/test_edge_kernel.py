@@ -7,7 +7,11 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from support.box_models import cube_model
+from support.meters import measure, picture
+from support.simulated import plain_scenario
 from test_consensus import (
+    CAMERA,
     EDGES,
     PREDICTION,
     PRIOR,
@@ -22,6 +26,8 @@ from test_consensus import (
 )
 
 from gripmon.model.compiled import COMPILES
+from gripmon.model.gripper import gripper_from_dict
+from gripmon.track.edges import FingertipMeter, MeasurementSettings, kernel, lines, profile_kernel, warm_up
 from gripmon.track.edges.consensus import AGAIN_PX, Prior, agree, agree_with_numpy
 from gripmon.track.edges.profiles import Votes
 from gripmon.track.edges.uncertainty import (
@@ -145,3 +151,25 @@ def test_what_can_not_be_solved_is_an_error():
     for without in (contradictions_without, contradictions_without_with_numpy):
         with pytest.raises(FloatingPointError, match="not positive definite"):
             without(NOTHING, nothing, np.zeros(7), SETTINGS)
+
+
+def signatures() -> dict[str, int]:
+    """How many combinations of types each function is compiled for."""
+    compiled = [getattr(room, name) for room in (kernel, profile_kernel, lines) for name in vars(room)]
+    return {f.__name__: len(f.signatures) for f in compiled if hasattr(f, "signatures")}
+
+
+def test_after_warming_up_no_frame_waits_for_the_compiler():
+    """Whatever the gripper and the image: with a jaw and without, in colour, that may not be written to."""
+    assert 0.0 < warm_up() < 300.0
+    before = signatures()
+    assert {"fit", "assess", "contradictions_without", "read_profiles", "worth", "_intersect"} <= before.keys()
+    clear = picture(plain_scenario())
+    covered = clear.copy()
+    covered[:, :300] = 90
+    for image in (clear, covered, np.dstack([clear] * 3)[:, :, ::-1]):
+        measure(image)
+        measure(image, using=FingertipMeter(CAMERA, gripper_from_dict(cube_model()), MeasurementSettings(), 0.0))
+    contradictions_without(VOTES[4], prior(7), np.zeros(7), SETTINGS)
+    assert signatures() == before
+    assert all(count <= 1 for name, count in before.items() if name not in ("read_profiles", "_cut_out"))

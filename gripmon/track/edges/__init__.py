@@ -9,6 +9,7 @@ from gripmon.track.edges.sums import edge_sums
 from gripmon.track.edges.taught import TaughtEdges, TaughtModel
 from gripmon.track.edges.uncertainty import NormalEquations
 from gripmon.track.edges.views import trace_of
+from gripmon.track.edges.warming import warm_up
 
 __all__ = [
     "JAW_UNREPORTED_SIGMA_M",
@@ -27,4 +28,5 @@ __all__ = [
     "edge_sums",
     "prior_information",
     "trace_of",
+    "warm_up",
 ]

@@ -51,23 +51,10 @@ FEWEST_FREE = 3
 
 @compiled
 def fit(
-    sample: Any,
-    offset_px: Any,
-    weight: Any,
-    jacobian: Any,
-    edge: Any,
-    ok: Any,
-    edge_spread_px: Any,
-    mean: Any,
-    prior: Any,
-    start: Any,
-    width_px: float,
-    rounds: int,
-    start_width_px: float,
-    gate_px: float,
-    support_sigmas: float,
+    sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, ok: Any, edge_spread_px: Any, mean: Any,
+    prior: Any, start: Any, width_px: float, rounds: int, start_width_px: float, gate_px: float, support_sigmas: float,
     support_share: float,
-) -> Any:
+) -> Any:  # fmt: skip
     """``consensus.agree``: whether it could be solved, then the fields of ``Consensus`` in their order."""
     count = len(start)
     near = _near(sample, offset_px, weight, jacobian, edge, start, max(width_px, TUKEY * FARTHEST_PX))
@@ -88,21 +75,9 @@ def fit(
         sample, offset_px, weight, residual_px, edge, ok, len(edge_spread_px),
         start_width_px, gate_px, support_sigmas, support_share,
     )  # fmt: skip
-    return (
-        solved,
-        (
-            unknowns[:count].copy(),
-            every,
-            residual_px,
-            information[:count, :count].copy(),
-            spread_px,
-            stiffness,
-            supported,
-            share,
-            seen,
-            believed,
-        ),
-    )
+    own, own_information = unknowns[:count].copy(), information[:count, :count].copy()
+    fitted = own, every, residual_px, own_information, spread_px, stiffness, supported, share, seen, believed
+    return solved, fitted
 
 
 @compiled
@@ -134,15 +109,8 @@ def _near(
 
 @compiled
 def _irls(
-    near: Any,
-    edge_spread_px: Any,
-    mean: Any,
-    prior: Any,
-    xi: Any,
-    width: float,
-    rounds: int,
-    start_width_px: float,
-) -> tuple[bool, Any, Any, float, float]:
+    near: Any, edge_spread_px: Any, mean: Any, prior: Any, xi: Any, width: float, rounds: int, start_width_px: float,
+) -> tuple[bool, Any, Any, float, float]:  # fmt: skip
     """The rounds of ``consensus.agree``; ``xi`` (SIZE,) is moved from the start to the fit.  Whether all could be
     solved, weights of the candidates near by, information (SIZE, SIZE), spread and stiffness.
     """
@@ -268,18 +236,9 @@ def _stiffness(weight: Any, residual: Any, reach: Any) -> float:
 
 @compiled
 def _judge(
-    sample: Any,
-    offset_px: Any,
-    weight: Any,
-    residual_px: Any,
-    edge: Any,
-    ok: Any,
-    edges: int,
-    start_width_px: float,
-    gate_px: float,
-    support_sigmas: float,
-    support_share: float,
-) -> tuple[Any, Any, Any, float]:
+    sample: Any, offset_px: Any, weight: Any, residual_px: Any, edge: Any, ok: Any, edges: int, start_width_px: float,
+    gate_px: float, support_sigmas: float, support_share: float,
+) -> tuple[Any, Any, Any, float]:  # fmt: skip
     """``consensus._judge``: the profiles that agree, each edge's share and whether it is seen, the share of pairs."""
     supported = np.zeros(len(edge), np.bool_)
     profiles, agreeing, others = np.zeros(edges), np.zeros(edges), np.zeros(edges)
@@ -343,19 +302,9 @@ def _solve(factor: Any, vector: Any) -> None:
 
 @compiled
 def assess(
-    sample: Any,
-    weight: Any,
-    residual_px: Any,
-    information: Any,
-    stiffness: float,
-    jacobian: Any,
-    edge: Any,
-    stretch: Any,
-    edge_spread_px: Any,
-    cut_off_px: Any,
-    prior: Any,
-    expected_shared_px: float,
-) -> Any:
+    sample: Any, weight: Any, residual_px: Any, information: Any, stiffness: float, jacobian: Any, edge: Any,
+    stretch: Any, edge_spread_px: Any, cut_off_px: Any, prior: Any, expected_shared_px: float,
+) -> Any:  # fmt: skip
     """``uncertainty.assess``: whether it could be solved, then covariance, line weights, shared spread and
     contradiction, and edge, pull, information and middle of the ``NormalEquations``.
     """
@@ -482,20 +431,9 @@ def _sandwich(stiffness: float, information: Any, prior: Any, middle: Any) -> tu
 
 @compiled
 def contradictions_without(
-    left_out: Any,
-    sample: Any,
-    offset_px: Any,
-    weight: Any,
-    jacobian: Any,
-    edge: Any,
-    stretch: Any,
-    edge_spread_px: Any,
-    mean: Any,
-    prior: Any,
-    start: Any,
-    width_px: float,
-    rounds: int,
-) -> Any:
+    left_out: Any, sample: Any, offset_px: Any, weight: Any, jacobian: Any, edge: Any, stretch: Any,
+    edge_spread_px: Any, mean: Any, prior: Any, start: Any, width_px: float, rounds: int,
+) -> Any:  # fmt: skip
     """(v,) contradiction that stays in a fit from ``start`` without each of the edges ``left_out`` (v,); NaN where it
     can't be solved.
     """

@@ -189,16 +189,9 @@ def _nth(values: Any, count: int, nth: int) -> float:
 
 @compiled
 def find_candidates(
-    profiles: Any,
-    ok: Any,
-    taps: Any,
-    step_px: float,
-    threshold: float,
-    peak_noise: float,
-    near: int,
-    far: int,
+    profiles: Any, ok: Any, taps: Any, step_px: float, threshold: float, peak_noise: float, near: int, far: int,
     full_scale: float,
-) -> Any:
+) -> Any:  # fmt: skip
     """``profiles.find_candidates``: sample, offset, step, sigma, width and how surely it is cut off, each (k,)."""
     count, samples = profiles.shape
     margin, responses = len(taps) // 2, samples - len(taps) + 1
@@ -280,17 +273,9 @@ def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: 
 
 @compiled
 def worth(
-    sample: Any,
-    step: Any,
-    sigma_px: Any,
-    width_px: Any,
-    cut_off: Any,
-    edge: Any,
-    polarity: Any,
-    bevel_px: Any,
-    point_floor_px: float,
-    edge_floor_px: float,
-) -> tuple[Any, Any, Any]:
+    sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
+    point_floor_px: float, edge_floor_px: float,
+) -> tuple[Any, Any, Any]:  # fmt: skip
     """What ``consensus.Votes`` holds of the candidates: weight (k,), spread and what a cut-off side adds to it (e,)."""
     count, edges = len(sample), len(bevel_px)
     weight = np.empty(count)
