@@ -8,11 +8,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from support.box_models import cube_model
-from support.meters import measure, picture
+from support.meters import measure, meter, moved, picture
 from support.simulated import plain_scenario
 from test_consensus import (
     CAMERA,
     EDGES,
+    GRIPPER,
     PREDICTION,
     PRIOR,
     SAMPLED,
@@ -27,7 +28,18 @@ from test_consensus import (
 
 from gripmon.model.compiled import COMPILES
 from gripmon.model.gripper import gripper_from_dict
-from gripmon.track.edges import FingertipMeter, MeasurementSettings, kernel, lines, profile_kernel, warm_up
+from gripmon.track.edges import (
+    FingertipMeter,
+    MeasurementSettings,
+    agreeing_fingers,
+    evidence,
+    kernel,
+    lines,
+    prediction,
+    profile_kernel,
+    settling,
+    warm_up,
+)
 from gripmon.track.edges.consensus import AGAIN_PX, Prior, agree, agree_with_numpy
 from gripmon.track.edges.profiles import Votes
 from gripmon.track.edges.uncertainty import (
@@ -153,16 +165,45 @@ def test_what_can_not_be_solved_is_an_error():
             without(NOTHING, nothing, np.zeros(7), SETTINGS)
 
 
+def test_what_is_read_off_a_measurement_is_what_numpy_reads():
+    """Motion of the edges, blur, shares of the fingers, residuals of the edges and of the corners."""
+    image = picture(plain_scenario()).copy()
+    image[:, :250] = 90
+    using = meter()
+    found = measure(image, using=using)
+    consensus, candidates, sampled = found.consensus, found.candidates, found.prediction
+    for xi in (XI, XI[:6], -XI):
+        assert sampled.moved_px(xi) == pytest.approx(np.abs(sampled.jacobian[:, : len(xi)] @ xi).max(), rel=CLOSE)
+    widths_px = np.sort(candidates.width_px[consensus.weight > 0.0])
+    kernel_px = candidates.zoom * MeasurementSettings().edges.blur_px
+    assert found.blur_px == pytest.approx(np.sqrt(widths_px[len(widths_px) // 2] ** 2 - kernel_px**2), rel=CLOSE)
+    finger = GRIPPER.edge_finger[sampled.layout.edge]
+    shares = [consensus.supported[finger == f].sum() / sampled.ok[finger == f].sum() for f in (0, 1)]
+    assert agreeing_fingers(found, GRIPPER) == pytest.approx(shares, rel=CLOSE) and min(shares) < 0.8 < max(shares)
+    residual_px, edge = using.edge_residuals_px(found), sampled.layout.edge[candidates.sample]
+    for e in range(EDGES):
+        own = (edge == e) & (consensus.weight > 0.0)
+        mean = np.average(consensus.residual_px[own], weights=consensus.weight[own]) if own.any() else np.nan
+        assert residual_px[e] == pytest.approx(mean, abs=CLOSE, nan_ok=True)
+    pose = moved(found.cam_T_grip, np.array([1e-4, 2e-4, -1e-4, 1e-3, 2e-3, 3e-3]))
+    points_grip_m = GRIPPER.points_grip_m(found.jaw_opening_m)[GRIPPER.corner_points]
+    points = points_grip_m @ pose[:3, :3].T + pose[:3, 3]
+    miss_px = np.einsum("cij,cj->ci", sampled.corners.d_uv_d_xy, found.corners.xy - points[:, :2] / points[:, 2:])
+    rms_px = np.sqrt((miss_px[found.corners.usable] ** 2).sum(axis=1).mean())
+    assert found.corner_rms_px(pose) == pytest.approx(rms_px, rel=1e-3)  # the jaw's motion is linear there
+
+
 ENTRIES = {
     "fit", "assess", "contradictions_without", "read_profiles", "low_third_difference", "find_candidates", "worth",
-    "_fit_lines", "_intersect",
+    "_fit_lines", "_intersect", "largest_motion", "usual_width", "corner_rms", "agreeing_shares", "edge_means",
 }  # fmt: skip
 
 
 def signatures() -> dict[str, int]:
     """For how many combinations of types each function that Python calls is compiled."""
-    compiled = {name: getattr(room, name) for room in (kernel, profile_kernel, lines) for name in vars(room)}
-    return {name: len(compiled[name].signatures) for name in ENTRIES}
+    rooms = (kernel, profile_kernel, lines, prediction, settling, evidence)
+    functions = {name: f for room in rooms for name, f in vars(room).items() if hasattr(f, "signatures")}
+    return {name: len(functions[name].signatures) for name in ENTRIES}
 
 
 def test_after_warming_up_no_frame_waits_for_the_compiler():
@@ -174,7 +215,10 @@ def test_after_warming_up_no_frame_waits_for_the_compiler():
     covered = clear.copy()
     covered[:, :300] = 90
     for image in (clear, covered, np.dstack([clear] * 3)[:, :, ::-1]):
-        measure(image)
+        found = measure(image)
+        found.corner_rms_px(found.cam_T_grip)
+        agreeing_fingers(found, GRIPPER)
+        meter().edge_residuals_px(found)
         measure(image, using=FingertipMeter(CAMERA, gripper_from_dict(cube_model()), MeasurementSettings(), 0.0))
     contradictions_without(VOTES[4], prior(7), np.zeros(7), SETTINGS)
     assert signatures() == before

@@ -272,6 +272,17 @@ def _doubt(profiles: Any, n: int, place: float, side: int, width: float, level: 
 
 
 @compiled
+def usual_width(width_px: Any, weight: Any) -> tuple[int, float]:
+    """How many points have a weight, and the upper median of their widths; 0 without any."""
+    widths, count = np.empty(len(weight)), 0
+    for k in range(len(weight)):
+        if weight[k] > 0.0:
+            widths[count] = width_px[k]
+            count += 1
+    return count, _nth(widths, count, count // 2) if count else 0.0
+
+
+@compiled
 def worth(
     sample: Any, step: Any, sigma_px: Any, width_px: Any, cut_off: Any, edge: Any, polarity: Any, bevel_px: Any,
     point_floor_px: float, edge_floor_px: float,

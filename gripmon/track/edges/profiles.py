@@ -142,12 +142,12 @@ def _pixels(image: Image) -> Image:
 
 def full_scale(image: Image) -> float:
     """Largest grey level of an image's type; 1 for float images."""
-    return 1.0 if np.issubdtype(image.dtype, np.floating) else float(np.iinfo(image.dtype.str).max)
+    return 1.0 if image.dtype.kind == "f" else float(np.iinfo(image.dtype.str).max)
 
 
 def quantum(image: Image) -> float:
     """Step between grey levels of an image's type; float images are taken to come from 16 bits."""
-    return 1.0 if np.issubdtype(image.dtype, np.integer) else 1.0 / 65535.0
+    return 1.0 / 65535.0 if image.dtype.kind == "f" else 1.0
 
 
 @lru_cache(maxsize=64)
@@ -360,6 +360,15 @@ def cut_off_spread(candidates: Candidates, prediction: Prediction) -> Array:
     energy = candidates.step**2
     total = np.bincount(edge, energy, edges)
     return SPREAD * np.bincount(edge, energy * candidates.cut_off, edges) / np.maximum(total, 1e-12)
+
+
+def usual_width_px(candidates: Candidates, weight: Array) -> tuple[int, float]:
+    """How many candidates have a ``weight`` (k,), and the median width of these, px; 0 without any."""
+    if COMPILES:
+        count, width_px = profile_kernel.usual_width(candidates.width_px, weight)
+        return count, width_px
+    widths_px = candidates.width_px[weight > 0.0]
+    return len(widths_px), median(widths_px) if len(widths_px) else 0.0
 
 
 def median(values: Array) -> float:

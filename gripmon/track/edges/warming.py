@@ -8,6 +8,7 @@ import numpy as np
 
 from gripmon.model.compiled import COMPILES
 from gripmon.track.edges.consensus import ConsensusSettings, Prior, agree
+from gripmon.track.edges.evidence import agreeing_shares, edge_means
 from gripmon.track.edges.lines import CornerGeometry, CornerSettings, intersect_edges
 from gripmon.track.edges.prediction import EdgeLayout, PredictedCorners, Prediction, SamplingSettings
 from gripmon.track.edges.profiles import (
@@ -16,8 +17,10 @@ from gripmon.track.edges.profiles import (
     find_candidates,
     profile_offsets_px,
     read_profiles,
+    usual_width_px,
     weigh,
 )
+from gripmon.track.edges.settling import corner_rms
 from gripmon.track.edges.uncertainty import assess, contradictions_without
 
 
@@ -42,7 +45,13 @@ def warm_up() -> float:
     nothing = np.zeros(0, dtype=np.intp)
     places = nothing.reshape(0, 4)
     geometry = CornerGeometry(nothing, nothing, nothing, np.zeros((0, 3)), places, np.zeros(1, dtype=np.intp))
-    intersect_edges(votes, consensus, line_weight, geometry, CornerSettings())
+    corners = intersect_edges(votes, consensus, line_weight, geometry, CornerSettings())
+    prediction.moved_px(consensus.xi)
+    usual_width_px(candidates, consensus.weight)
+    here, edge, points_m = prediction.cam_T_grip, prediction.layout.edge, prediction.corners.cam_m
+    corner_rms(corners.xy, corners.usable, points_m, here, here, prediction.corners.d_uv_d_xy)
+    agreeing_shares(np.zeros(1, dtype=np.intp), edge, prediction.ok, consensus.supported, 1)
+    edge_means(candidates.sample, consensus.weight, consensus.residual_px, edge, 1)
     return time.perf_counter() - begin_s
 
 
