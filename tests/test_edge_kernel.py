@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -222,3 +226,31 @@ def test_after_warming_up_no_frame_waits_for_the_compiler():
         measure(image, using=FingertipMeter(CAMERA, gripper_from_dict(cube_model()), MeasurementSettings(), 0.0))
     contradictions_without(VOTES[4], prior(7), np.zeros(7), SETTINGS)
     assert signatures() == before
+
+
+MEASURE = """
+import numpy as np
+from gripmon.model.compiled import COMPILES
+from test_golden import measured
+found, _ = measured("clutter")
+print(COMPILES, *found.cam_T_grip.ravel(), *found.covariance.ravel(), *np.nan_to_num(found.corners.uv_px).ravel())
+"""
+
+
+def test_where_nothing_compiles_numpy_measures_the_same():
+    """A whole measurement in a cluttered image: pose to a picometre, corners to a millionth of a pixel."""
+    found = []
+    for disabled in ("0", "1"):
+        environment = {**os.environ, "NUMBA_DISABLE_JIT": disabled, "PYTHONPATH": str(Path(__file__).parent)}
+        said = subprocess.run(
+            [sys.executable, "-c", MEASURE], env=environment, capture_output=True, text=True, timeout=600, check=True
+        )
+        compiles, *numbers = said.stdout.split()
+        assert compiles == str(disabled == "0")
+        found.append(np.array(numbers, dtype=float))
+    one, other = found
+    assert len(one) > 60
+    np.testing.assert_allclose(one[:16], other[:16], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(one[[3, 7, 11]], other[[3, 7, 11]], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(one[16:65], other[16:65], rtol=1e-6, atol=1e-20)
+    np.testing.assert_allclose(one[65:], other[65:], rtol=0.0, atol=1e-6)
