@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
 from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
@@ -76,7 +77,7 @@ class Weigher:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+        self._model = _model_error(tracker, gripper)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
@@ -199,12 +200,10 @@ class Weigher:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
         further corner.  ``kept`` (v,): the measured edges that count.
         """
-        fingers = len(self._gripper.finger_ids)
-        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
         edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
         edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
-        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
-        return int((by_edge * np.maximum(corners, 1)).sum())
+        by_edge = set(self._gripper.edge_finger[edge].tolist())
+        return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
     def held_across(self, measurement: Measurement) -> bool:
         """Whether enough of the fingers' sides is seen where they are expected to exclude an unseen knock across the
@@ -275,6 +274,10 @@ def _floor(settings: MonitorSettings) -> Array:
     return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
 
 
+def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
+    return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids))
+
+
 def foresee_protection(
     tracker: Tracker, gripper: Gripper, settings: MonitorSettings, measurement: Measurement
 ) -> Protection:
@@ -284,6 +287,6 @@ def foresee_protection(
     hypotheses = _hypotheses_about(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
-    model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+    model = _model_error(tracker, gripper)
     doubts = Refits(measurement, hypotheses, _floor(settings), model).doubts(measurement.cam_T_grip, hypotheses.prior)
     return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)
