@@ -2,8 +2,8 @@
 was."""
 
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
-from gripmon.judge.drift.motion import Baseline, MotionWatch
-from gripmon.judge.drift.sequential import Finding, SequentialTest
+from gripmon.judge.drift.motion import Baseline, MotionWatch, SequentialTest
+from gripmon.judge.drift.sequential import Finding
 from gripmon.judge.drift.settings import DriftSettings
 
 __all__ = [

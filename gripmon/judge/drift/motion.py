@@ -11,9 +11,15 @@ from dataclasses import replace
 import numpy as np
 
 from gripmon.judge.drift.kinds import History, VibrationWatch, goes_on
-from gripmon.judge.drift.sequential import SequentialTest, square_beyond, whitening
+from gripmon.judge.drift.sequential import PlainTest
 from gripmon.judge.drift.settings import DriftSettings
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
+
+if COMPILES:
+    from gripmon.judge.drift.compiled import CompiledTest as SequentialTest
+else:
+    SequentialTest = PlainTest
 
 ALLOWED = 4.0
 """Standard deviations of the reference, on every axis, up to which a first shift is the reference's error."""
@@ -89,7 +95,6 @@ class MotionWatch:
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
-        self._tolerated = settings.tolerated
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
@@ -142,7 +147,7 @@ class MotionWatch:
         at_once = stepped and length <= STEP_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
-        self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance())
+        self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance)
         frames = max(int(test.windows.frames[0]), 1)
         level, level_covariance = self._level(min(frames, VIBRATING_LEVEL if self.vibrates_anew else LEVEL_FRAMES))
         before = self._present
@@ -201,7 +206,7 @@ class MotionWatch:
         return mean[0], covariance[0]
 
     def _away(self, level: Array, covariance: Array) -> bool:
-        return bool(square_beyond(whitening(covariance), level, self._tolerated) > RETURNED)
+        return self.test.square_beyond(level, covariance) > RETURNED
 
     def _look_back(self, level: Array, covariance: Array) -> None:
         """Step or creep, by the last minutes."""
