@@ -226,9 +226,10 @@ def extremes(
     """(2, k, s) squares of the short windows' means about the ``middle`` (s, 6), and of their differences, each up to
     ``far`` times the limit where that is known.
     """
-    out = np.empty(whitening.shape[:3])
-    for k in range(out.shape[1]):
-        for s in range(out.shape[2]):
+    lengths, streams = whitening.shape[1], whitening.shape[2]
+    out = np.empty((2, lengths, streams))
+    for k in range(lengths):
+        for s in range(streams):
             out[0, k, s] = _square(whitening[0, k, s], mean[k, s] - middle[s])
             out[1, k, s] = _square(whitening[1, k, s], difference[k, s])
             for kind in range(2):

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from gripmon.judge.drift.kinds import History, VibrationWatch, goes_on
-from gripmon.judge.drift.sequential import PlainTest
 from gripmon.judge.drift.settings import DriftSettings
 from gripmon.model.compiled import COMPILES
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
-if COMPILES:
-    from gripmon.judge.drift.compiled import CompiledTest as SequentialTest
+if TYPE_CHECKING or not COMPILES:
+    from gripmon.judge.drift.sequential import PlainTest as SequentialTest
 else:
-    SequentialTest = PlainTest
+    from gripmon.judge.drift.compiled import CompiledTest as SequentialTest
+
+__all__ = ["Baseline", "MotionWatch", "SequentialTest"]
 
 ALLOWED = 4.0
 """Standard deviations of the reference, on every axis, up to which a first shift is the reference's error."""
