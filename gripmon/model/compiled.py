@@ -7,14 +7,14 @@ to see whether it has changed: compiled functions that call one another stand in
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 try:
     import numba
 except ImportError:  # no build of it for this machine
     COMPILES = False
 else:
-    COMPILES = not numba.config.DISABLE_JIT
+    COMPILES = not getattr(numba.config, "DISABLE_JIT", False)
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -23,9 +23,9 @@ def compiled(function: _F) -> _F:
     """``function``, compiled when it is first called with arguments of some types; as it is where nothing compiles.
 
     Arithmetic is as written, neither fused nor reordered, so that a replay on another machine decides alike; a division
-    by zero gives what NumPy's does; other threads run meanwhile.
+    by zero gives what NumPy's does.  The interpreter stays locked meanwhile: to get it back takes longer than a kernel.
     """
     if not COMPILES:
         return function
-    made: _F = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return made
+    made: Any = numba.njit(cache=True, error_model="numpy")(function)
+    return cast("_F", made)
