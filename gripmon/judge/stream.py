@@ -5,6 +5,7 @@ Time is the frames' own stamps.  Some 1,700 pixels of each frame are looked at, 
 
 from __future__ import annotations
 
+import bisect
 import math
 import statistics
 from collections import deque
@@ -153,12 +154,13 @@ class _Frozen:
         image = frame.image
         if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
             return None
-        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]
+        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)].copy()
         number = hash(sample.tobytes())
         again = number in self._before
         self._before.append(number)
-        self._coded += not again and _stands_in_large_parts(sample, self._sample)
-        self._sample = sample.copy()
+        if self._coded < CODED_FRAMES and not again:
+            self._coded += _stands_in_large_parts(sample, self._sample)
+        self._sample = sample
         # An even image shows no noise, and is another fault.
         if not again or sample.size == 0 or sample.min() == sample.max():
             self._longest = self._longest if self._frozen else max(self._longest, self._run)
@@ -181,10 +183,12 @@ def _stands_in_large_parts(sample: NDArray[Any], before: NDArray[Any] | None) ->
     """Whether two samples of images differ, but in few of the pixels; those cut off at black or white always stand."""
     if before is None or before.shape != sample.shape or before.dtype != sample.dtype:
         return False
+    stands = sample == before
+    if np.count_nonzero(stands) < STOOD_SHARE * FEWEST_INNER:
+        return False  # too few, whichever of them count
     inner = (sample > sample.min()) & (sample < sample.max())
     count = int(np.count_nonzero(inner))
-    same = int(np.count_nonzero(inner & (sample == before)))
-    return count >= FEWEST_INNER and STOOD_SHARE * count <= same
+    return count >= FEWEST_INNER and STOOD_SHARE * count <= int(np.count_nonzero(inner & stands))
 
 
 class _Clock:
@@ -235,6 +239,7 @@ class _Rate:
         self._settings = settings
         self._last: tuple[int, int] | None = None
         self._arrivals_ns: deque[int] = deque(maxlen=ARRIVALS)
+        self._in_order_ns: list[int] = []
         self._block_ns: list[float] = []
         self._blocks: deque[_Block] = deque(maxlen=MOST_BLOCKS)
         self.usual_ns: float | None = None
@@ -244,7 +249,9 @@ class _Rate:
     def frames_per_s(self) -> float | None:
         if len(self._arrivals_ns) < BLOCK:
             return None
-        return _NS / statistics.median(self._arrivals_ns)
+        half, odd = divmod(len(self._in_order_ns), 2)
+        upper_ns = self._in_order_ns[half]
+        return _NS / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
 
     def longest_ns(self, frames: int) -> float:
         """Longest time that so many frames take as long as nothing is wrong; infinite until it is known."""
@@ -259,7 +266,10 @@ class _Rate:
         interval_ns = step_ns / max(frame.seq - last[0], 1)
         if interval_ns > JUMP_NS and interval_ns > self.longest_ns(1):
             return self._fault  # a gap
+        if len(self._arrivals_ns) == ARRIVALS:
+            self._in_order_ns.remove(self._arrivals_ns[0])
         self._arrivals_ns.append(step_ns)
+        bisect.insort(self._in_order_ns, step_ns)
         self._block_ns.append(interval_ns)
         if len(self._block_ns) == BLOCK:
             middle_ns = statistics.median(self._block_ns)

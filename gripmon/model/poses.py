@@ -11,7 +11,7 @@ import numpy as np
 
 from gripmon.model import geometry
 from gripmon.model.compiled import COMPILES, compiled
-from gripmon.model.records import Array
+from gripmon.model.records import Array, Transform
 
 _SMALL_RAD = 1e-8
 
@@ -116,7 +116,14 @@ motion_between = _motion_between if COMPILES else _motion_between_numpy
 """Length d (m) and angle delta (rad) of the motion from one pose (4, 4) to another, equation (14)."""
 
 
+def to_record(a_T_b: Array) -> Transform:
+    """A pose (4, 4) as it is published."""
+    x, y, z = a_T_b[:3, 3].tolist()
+    return Transform((x, y, z), quaternion_of(a_T_b) if COMPILES else geometry.quaternion_xyzw(a_T_b[:3, :3]))
+
+
 def warm_up() -> None:
     """Compile, or load what was compiled."""
     here = np.eye(4)
     motion_between(here, perturb(here, perturbation_between(here, here)))
+    to_record(here)
