@@ -62,8 +62,8 @@ class Refits:
     """One measurement's fits under h hypotheses."""
 
     def __init__(self, measurement: Measurement, hypotheses: Hypotheses, floor: Array, model: ModelError):
-        """``floor`` (6,): variances of the error that no averaging removes."""
-        self.hypotheses, self._floor = hypotheses, np.diag(floor)
+        """``floor`` (6, 6): covariance of the error that no averaging removes."""
+        self.hypotheses, self._floor = hypotheses, floor
         normal = self._normal = measurement.normal
         xi = measurement.consensus.xi
         self._fit_T = perturb(measurement.prediction.cam_T_grip, xi[:6])

@@ -54,18 +54,27 @@ class Trust:
 
     ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such; ``displaced``: the
     pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
-    ``instead``: pose and covariance that the anchor and the rest of the edges give under the most probable hypothesis,
-    with its number; None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where
-    no edge is seen.
+    ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis; None where there is
+    none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
     """
 
     protection: Protection
     proven: bool
     displaced: bool = False
     ambiguous: bool = False
-    instead: tuple[int, Array, Array] | None = None
+    most_probable: tuple[Anchored, int] | None = None
     ends: FingerEndsSeen | None = None
     fits: Refits | None = None
+
+    @property
+    def instead(self) -> tuple[int, Array, Array] | None:
+        """Number of the most probable hypothesis, with the pose (4, 4) and covariance (6, 6) that the anchor and the
+        rest of the edges give under it; None where there is none.
+        """
+        if self.most_probable is None or self.fits is None:
+            return None
+        anchored, number = self.most_probable
+        return (number, *self.fits.solution(anchored, number))
 
 
 class Weigher:
@@ -103,7 +112,7 @@ class Weigher:
 
     def sigma(self, now_s: float) -> Array:
         """(6,) standard deviations of where it is expected, m and rad."""
-        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor))
+        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor.diagonal()))
 
     def weigh(
         self,
@@ -151,15 +160,15 @@ class Weigher:
         else:
             # The ends belong to where it was: what else may have been wrong all along the average knows, too.
             all_along = self.anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
-        possible = np.where(holds, prior, 0.0)
-        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
-        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
+        possible = holds * prior
+        number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
+        most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
         protection = protection_of(all_along + since, risk)
         if self._unexplained is not None:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        return Trust(protection, proven, displaced, ambiguous, instead, ends, fits)
+        return Trust(protection, proven, displaced, ambiguous, most_probable, ends, fits)
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
@@ -239,7 +248,9 @@ class Weigher:
             fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model)
             expected_T, covariance = self.expected
             of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
-            anchored = fits.anchored(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
+            covariance = covariance.copy()
+            covariance.flat[::7] += self._wander(now_s)
+            anchored = fits.anchored(expected_T, covariance, of_model)
             self._newest = measurement, now_s, fits, anchored
         return self._newest[2:]
 
@@ -270,8 +281,8 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 
 def _floor(settings: MonitorSettings) -> Array:
-    """(6,) variances of the error that no averaging removes."""
-    return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+    """(6, 6) covariance of the error that no averaging removes."""
+    return np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
 
 
 def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
