@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
-from gripmon.track.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
+from gripmon.track.integrity.hypotheses import EDGE, GRIPPER
 from gripmon.track.integrity.quantiles import Tails
 from gripmon.track.integrity.separation import NEAR
 
@@ -355,9 +355,9 @@ def test_hypotheses_doubt_what_their_names_say():
     prior = dict(zip(found.name, found.prior.tolist(), strict=True))
     assert prior["nothing is wrong"] == prior["what looks like the fingers' ends is something else"] == 1.0
     assert {p for n, p in prior.items() if n.startswith("edge ")} == {EDGE}
-    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {ONE_FINGERS_ENDS}
-    assert {p for n, p in prior.items() if n.startswith("finger ")} == {FINGER}
-    assert prior["the jaw opening is wrong"] == OPENING
+    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {EDGE}
+    assert {p for n, p in prior.items() if n.startswith("finger ")} == {GRIPPER}
+    assert prior["the jaw opening is wrong"] == GRIPPER
 
 
 def test_hypotheses_know_what_kind_they_are():

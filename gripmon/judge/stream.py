@@ -35,14 +35,13 @@ coded stream: of a sensor's own pixels fewer than nine in ten come again, down t
 FEWEST_INNER = 200
 """Pixels neither black nor white, of some 1,700, without which an image doesn't tell."""
 
-CODED_FRAMES = 3
-"""So many such images make sure of it."""
+SURE_FRAMES = 3
+"""Frames that make sure: images with large parts that stand, stamps that stand, before it is the clock and not a frame
+that was handed over twice, and images of another kind, before it is another camera.
+"""
 
 CALM_FRAMES = 30
 """Frames without a fault of their stamps after which the clock is right again."""
-
-STANDING_STAMPS = 3
-"""Stamps that stand still, among that many frames, before it is the clock: one may be a frame handed over twice."""
 
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
 """A stamp that is so many usual periods, and so long, after the one before has jumped."""
@@ -62,8 +61,8 @@ REGULAR = 0.3
 DEPARTED, RETURNED = 1.6, 1.3
 """Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
 
-KIND_FRAMES, OTHER_FRAMES = 5, 3
-"""Frames in a row of one size and type after which that is the camera's own, and of another after which it is not."""
+KIND_FRAMES = 5
+"""Frames in a row of one size and type after which that is the camera's own."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -158,7 +157,7 @@ class _Frozen:
         number = hash(sample.tobytes())
         again = number in self._before
         self._before.append(number)
-        if self._coded < CODED_FRAMES and not again:
+        if self._coded < SURE_FRAMES and not again:
             self._coded += _stands_in_large_parts(sample, self._sample)
         self._sample = sample
         # An even image shows no noise, and is another fault.
@@ -171,7 +170,7 @@ class _Frozen:
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
         enough = max(self._settings.frozen_frames, USUAL_RUNS * self._longest)
         settings = self._settings
-        frozen_s = settings.frozen_s if self._coded < CODED_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
+        frozen_s = settings.frozen_s if self._coded < SURE_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
         self._frozen |= self._run >= enough and lasted_ns >= _NS * frozen_s
         if not self._frozen:
             return None
@@ -221,7 +220,7 @@ class _Clock:
         if step_ns == 0:
             self._standing, self._calm = self._standing + 1, 0
             text = f"{self._standing} frames have the stamp of the one before: their clock stands still"
-            return StreamFault("clock", Cause.CLOCK, text) if self._standing >= STANDING_STAMPS else None
+            return StreamFault("clock", Cause.CLOCK, text) if self._standing >= SURE_FRAMES else None
         if step_ns > JUMP_NS and step_ns > rate.longest_ns(max(frame.seq - self._seq, 1)):
             # The frames alone don't tell which.
             text = f"no frame came for {1e-9 * step_ns:.1f} s, or the frames' clock was set ahead by so much"
@@ -342,7 +341,7 @@ class _Kind:
         if self._own is None:
             self._own = kind if self._run >= KIND_FRAMES else None
             return None
-        if kind == self._own or self._run < OTHER_FRAMES:
+        if kind == self._own or self._run < SURE_FRAMES:
             return None
         text = f"images are now {_words(kind)}; they were {_words(self._own)}: another camera, or another setting of it"
         return StreamFault("replaced", Cause.CAMERA_REPLACED, text)

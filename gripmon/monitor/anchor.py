@@ -23,11 +23,8 @@ from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, tell
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
 
-UNUSUAL = 12.6
-"""Squared normalised distance that six normal errors exceed once in twenty times (chi-square)."""
-
 DISPLACED = 33.1
-"""The same that they exceed once in 100,000 times."""
+"""Squared normalised distance that six normal errors exceed once in 100,000 times (chi-square)."""
 
 LEAST_YOUNG = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take

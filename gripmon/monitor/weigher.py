@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.drift import USUAL_SQUARE
 from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
+from gripmon.monitor.anchor import DISPLACED, Anchor, Lasting
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -140,7 +141,7 @@ class Weigher:
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
         displaced = not holds[0] and explained is None
-        again = bool(anchored.surprise[0] <= UNUSUAL) and (self.anchor is None or self.anchor.confirmed)
+        again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven else 1.0 if slid else MISREAD_END ** self.confirmations(measurement, ends, kept)

@@ -16,13 +16,12 @@ from gripmon.judge.drift.sequential import (
     PlainTest,
 )
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.statistics import LARGEST, LENGTHS, MEMORY_FRAMES, MEMORY_WINDOWS, PRIOR_WINDOWS, RARE
+from gripmon.judge.drift.statistics import COUNT, LARGEST, LENGTHS, MEMORY_FRAMES, MEMORY_WINDOWS, PRIOR_WINDOWS, RARE
 from gripmon.model.records import Array
 
 _LENGTHS = np.array(LENGTHS)
-_COUNT = _LENGTHS[:, None].astype(float)
-_SHARE = np.minimum(0.5 * LEARNING_FRAMES / _COUNT, 1.0)
-_MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / _COUNT, MEMORY_WINDOWS)
+_SHARE = np.minimum(0.5 * LEARNING_FRAMES / COUNT, 1.0)
+_MOST_WINDOWS = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
 
 
 class CompiledTest(PlainTest):

@@ -13,7 +13,7 @@ import numpy as np
 from gripmon.model.records import Array, Creep, Vibration
 
 BLOCK_S = 0.5
-"""Frames are averaged over so many seconds."""
+"""Seconds over which frames are averaged; a change of the mean that took no longer is a step."""
 
 KEPT_BLOCKS = 256
 
@@ -27,7 +27,9 @@ BETTER = 0.6
 """A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
 
 SIGNIFICANT = 4.0
-"""Standard deviations by which a rate must differ from zero."""
+"""Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero, and a
+first shift from the reference on some axis is more than the reference's error.
+"""
 
 
 class History:

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import special
 
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.statistics import BLOCK_FRAMES, LENGTHS, Extremes, Scatter, Windows
+from gripmon.judge.drift.statistics import BLOCK_FRAMES, COUNT, LARGEST, LENGTHS, Extremes, Scatter, Windows
 from gripmon.model.records import Array
 
 SWEEPS = 8
@@ -78,8 +78,8 @@ STUDENT_TAIL, HEAVY = 1.6, (0.25, 1.5)
 heavier, tails has this much of the logarithm of its inflation at least and at most.
 """
 
-SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
-"""Differences over the last frames, or windows, that are larger than learnt, up to so many times, count as noise."""
+SURGE_FRAMES, SURGE_WINDOWS = 32, 16
+"""Differences over the last frames, or windows, that are larger than learnt count as noise."""
 
 MARGIN = 1.55
 """Factor on the threshold: biases have heavier tails than normal ones, too, and change by more than theory has it (on
@@ -105,8 +105,6 @@ REPORTED_MEMORY = 1.0 / 64.0
 
 WORTH = 0.25
 """Part of its threshold from which a statistic is worth the search for the shift that may be tolerated."""
-
-_COUNT = np.array(LENGTHS, dtype=float)[:, None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +143,7 @@ class PlainTest:
         self._stale = True
         self._threshold = 1.0
         self._inflation: Array | None = None
-        self._extremes = Extremes(np.tile(np.maximum(2.0 * _COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
+        self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
         self._of_extremes: tuple[float, np.ndarray, Array] | None = None
         self._limit = np.full((2, len(LENGTHS), streams), np.inf)
         self._known = np.zeros(self._limit.shape, dtype=bool)
@@ -283,14 +281,14 @@ class PlainTest:
 
     def _learn_surge(self, normalised: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
-        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * _COUNT), 0.0)
-        self._surge += rate * (np.minimum(normalised / 6.0, SURGE_MOST) - self._surge)
+        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * COUNT), 0.0)
+        self._surge += rate * (np.minimum(normalised / 6.0, LARGEST) - self._surge)
 
     def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
         """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
         ones.
         """
-        share = np.minimum(LEARNING_FRAMES / (2.0 * _COUNT), 1.0) / TAIL_WINDOWS
+        share = np.minimum(LEARNING_FRAMES / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
         beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 
@@ -377,6 +375,6 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
     Student's distribution, with its degrees of freedom: both count.
     """
     chance = false_alarms_per_day / (86_400.0 * frames_per_s * 2 * len(LENGTHS))
-    freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
+    freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * COUNT**FREEDOM_GROWTH))
     threshold = float(special.chdtri(6, chance))
     return MARGIN * threshold, np.asarray(special.fdtri(6.0, freedom, 1.0 - chance) * 6.0 / threshold)

@@ -100,7 +100,8 @@ MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
 LARGEST = 4.0
 """Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
 
-_COUNT = np.array(LENGTHS, dtype=float)[:, None]
+COUNT = np.array(LENGTHS, dtype=float)[:, None]
+"""(k, 1) the lengths, for what is reckoned for all of them at once."""
 RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
 """(k,) number of the first length in which noise is rare to each."""
 
@@ -126,8 +127,8 @@ class Scatter:
         """Differences (k, s, 6) of neighbouring windows after ``frames`` more of them, their squares ``normalised``
         (k, s) to a mean of 6, and which of them to learn from.
         """
-        share = np.minimum(0.5 * frames / _COUNT, 1.0)  # of an independent pair of windows
-        most = np.maximum(0.5 * MEMORY_FRAMES / _COUNT, MEMORY_WINDOWS)
+        share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
+        most = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
         self._windows = np.where(usable, np.minimum(self._windows + share, most), self._windows)
         tame = np.minimum(1.0, 6.0 * LARGEST / np.maximum(normalised, 1e-12))
         gain = np.where(usable, share / self._windows, 0.0)
