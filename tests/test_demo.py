@@ -15,7 +15,7 @@ import pytest
 from support.gripmon_process import gripmon
 
 from gripmon.analyse.comparison import compare
-from gripmon.daemon import demo
+from gripmon.daemon import simulated as demo
 from gripmon.model.geometry import from_record, make_transform, to_record
 from gripmon.model.records import Alert, AlertEvent, AlertKind, Cause, FrameRecord, Origin, Severity, State, Verdict
 from gripmon.simulate import FrameTruth

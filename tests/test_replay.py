@@ -19,7 +19,7 @@ from support.gripmon_process import GRIPMON
 from support.loopback import frame_record
 
 from gripmon.cli import main
-from gripmon.cli.replay import _Counts
+from gripmon.daemon.replaying import Counts
 from gripmon.model.records import Frame, FrameRecord, Origin, Refusal
 from gripmon.monitor import Monitor
 
@@ -226,7 +226,7 @@ def test_a_monitor_that_fails_on_a_frame_costs_that_frame_only(
 
 
 def test_the_summary_needs_no_memory_for_each_frame():
-    counts = _Counts()
+    counts = Counts()
     latencies_ns = np.random.default_rng(3).lognormal(14.0, 0.5, 5001).astype(int).tolist()
     for seq, latency_ns in enumerate(latencies_ns):
         counts.add(frame_record(seq, latency_ns=latency_ns, source=Origin.HELD, reason=f"few_points: {seq} left"))

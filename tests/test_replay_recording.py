@@ -20,11 +20,9 @@ from support.replayed import EVERY_FRAME, replayed, without_latency
 
 from gripmon.analyse.replay_differences import Differences
 from gripmon.cli import main
-from gripmon.cli.recorded_run import RecordedRun
 from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
-from gripmon.daemon.one_recording import one_recording
-from gripmon.daemon.recorded_run import as_recorded_before_bounds
+from gripmon.daemon.recorded_run import RecordedRun, as_recorded_before_bounds, one_recording
 from gripmon.daemon.replaying import replay
 from gripmon.io.sources.folder import FolderSettings, FolderSource
 from gripmon.model.records import (

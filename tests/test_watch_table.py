@@ -12,8 +12,7 @@ import pytest
 from support.loopback import alert_record, state_record
 
 from gripmon.cli import fleet_table
-from gripmon.cli.alert_log import AlertLog
-from gripmon.client import Condition, MonitorName, MonitorStatus, trouble
+from gripmon.client import AlertLog, Condition, MonitorName, MonitorStatus, trouble
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, StateRecord, Verdict, from_json, to_json
 
 GONE_NS = 1_700_000_000_000_000_000
@@ -231,7 +230,7 @@ def test_the_alert_log_says_who_vanished_and_came(tmp_path: Path, capsys: pytest
 def test_while_nobody_reads_what_is_printed_the_oldest_are_lost(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("gripmon.cli.alert_log._WAITING_MOST", 3)
+    monkeypatch.setattr("gripmon.client.alert_log._WAITING_MOST", 3)
     log = AlertLog(None, as_json=True)
     for i in range(5):
         log.alert(ARM, alert_record(str(i)), to_json(alert_record(str(i))))

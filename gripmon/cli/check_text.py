@@ -6,8 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import EXIT_DONE, EXIT_FAILED
-
 if TYPE_CHECKING:
     from gripmon.daemon.findings import Finding
     from gripmon.daemon.forecast_values import (
@@ -46,16 +44,11 @@ def lines(path: str, findings: Sequence[Finding]) -> list[str]:
     return [f"{path}: {', '.join(parts)}", *rows]
 
 
-def exit_code(findings: Sequence[Finding]) -> int:
-    """3 where something fails."""
-    return EXIT_FAILED if any(each.level == "FAIL" for each in findings) else EXIT_DONE
-
-
 def _counted(count: int, what: str) -> str:
     return f"{count} {what}{'s' if count > 1 else ''}"
 
 
-def details(report: Forecast, around: Surroundings) -> list[str]:
+def details(report: Forecast) -> list[str]:
     """The forecast for a person: px, mm, degrees."""
     edges = [edge.id for edge in report.edges if edge.visible]
     seen = sum(corner.visible for corner in report.corners)
@@ -76,8 +69,7 @@ def details(report: Forecast, around: Surroundings) -> list[str]:
     lines += [_corner_line(corner, width) for corner in report.corners]
     lines += _accuracy_lines(report.accuracy)
     lines.append(f"promise    {report.promise}")
-    lines += _in_view_lines(report.in_view)
-    return lines + surrounding_lines(around)
+    return lines + _in_view_lines(report.in_view)
 
 
 def _camera_line(camera: CameraValues) -> str:

@@ -1,10 +1,16 @@
-"""What ``gripmon check`` says first: one line for each thing that matters, OK, WARN or FAIL."""
+"""What ``gripmon check`` finds: one line for each thing that matters, OK, WARN or FAIL."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import msgspec
+
+from gripmon.daemon.config import SecondConfig, is_second, load_config, load_second
+from gripmon.daemon.forecast import forecast
 from gripmon.daemon.forecast_values import (
     CameraValues,
     Forecast,
@@ -16,7 +22,8 @@ from gripmon.daemon.forecast_values import (
     RecalibrationForecast,
     ReferenceValues,
 )
-from gripmon.daemon.surroundings import SourceReport, Surroundings
+from gripmon.daemon.surroundings import SourceReport, Surroundings, surroundings
+from gripmon.laser.report import expectation
 
 Level = Literal["OK", "WARN", "FAIL"]
 
@@ -32,23 +39,54 @@ class Finding(NamedTuple):
     text: str
 
 
-def findings(forecast: Forecast, around: Surroundings) -> list[Finding]:
-    """What to know of a wrist camera's configuration before it runs."""
-    found = [
-        _source(around.source),
+@dataclass(frozen=True)
+class Checked:
+    """A configuration that was checked: what its calibration lets expect, of a wrist camera a ``forecast``, of a second
+    camera plain values (m, rad, px, ns), and what lies outside.
+    """
+
+    forecast: Forecast | None
+    second: dict[str, Any] | None
+    around: Surroundings
+
+    def values(self) -> dict[str, Any]:
+        """All of it as plain values for JSON."""
+        expected = self.second if self.second is not None else msgspec.to_builtins(self.forecast)
+        return {**expected, **msgspec.to_builtins(self.around)}
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What to know of the configuration before it runs."""
+        about = _of_wrist(self.forecast) if self.forecast is not None else _of_second(self.second or {})
+        found = [_source(self.around.source), *about, _network(self.around.keys)]
+        return [each for each in found if each is not None]
+
+
+def check_file(path: Path) -> Checked:
+    """Check a configuration file, a wrist camera's or a second camera's.  Raises :class:`ConfigError`, and
+    :class:`NoResultError` where a laser calibration or recorded frames can't be used.
+    """
+    if not is_second(path):
+        config = load_config(path)
+        return Checked(forecast(config), None, surroundings(config))
+    second = load_second(path)
+    around, watch = surroundings(second), second.settings.laser.watch
+    expected = expectation(str(second.calibration_path), second.calibration, watch)
+    return Checked(None, {**_second_values(second), "foreseen": expected}, around)
+
+
+def _of_wrist(forecast: Forecast) -> list[Finding | None]:
+    return [
         _camera(forecast.camera),
         _mount(forecast.reference),
         _view(forecast.in_view, forecast.gripper),
         _promise(forecast),
         _jaw_travel(forecast.in_view.jaw_travel, forecast.jaw),
         _recalibration(forecast.accuracy.recalibration),
-        _network(around.keys),
     ]
-    return [each for each in found if each is not None]
 
 
-def second_findings(report: dict[str, Any], around: Surroundings) -> list[Finding]:
-    """Those about a second camera."""
+def _of_second(report: dict[str, Any]) -> list[Finding]:
     calibration, watch, pulses = report["calibration"], report["watch"], report["pulses"]
     spots = f"{calibration['used']} of {calibration['spots']} spots, RMS {calibration['rms_px']:.2f} px"
     size = f"{calibration['width_px']} x {calibration['height_px']} px"
@@ -56,11 +94,9 @@ def second_findings(report: dict[str, Any], around: Surroundings) -> list[Findin
     table = pulses["table"]
     heard = f"by the robot's program on {pulses['key']}" if table is None else f"{pulses['count']} in {table}"
     return [
-        _source(around.source),
         Finding("OK", "calibration", f"{size}, {spots}"),
         Finding("OK", "watch", limits),
         Finding("OK", "pulses", heard),
-        _network(around.keys),
     ]
 
 
@@ -182,3 +218,43 @@ def _millimetres(value_m: float) -> str:
 
 def _degrees(value_rad: float) -> str:
     return f"{math.degrees(value_rad):.2g}°"
+
+
+def _second_values(config: SecondConfig) -> dict[str, Any]:
+    """Plain values for JSON: metres, radians, px, ns."""
+    settings, calibration = config.settings, config.calibration
+    camera, residuals, watch = config.camera, calibration.residuals, config.settings.laser.watch
+    pulses = config.pulses
+    return {
+        "config": str(config.path),
+        "robot": settings.robot,
+        "camera_name": settings.camera_name,
+        "calibration": {
+            "file": str(config.calibration_path),
+            "time": calibration.provenance.time,
+            "id": config.pulsed_watch().reference_id,
+            "width_px": camera.width_px,
+            "height_px": camera.height_px,
+            "spots": residuals.spots,
+            "used": residuals.used,
+            "rms_px": residuals.rms_px,
+            "distance_m": calibration.plane.distance_cam_m,
+            "translation_m": list(calibration.base_T_cam.translation_m),
+            "rotation_xyzw": list(calibration.base_T_cam.rotation_xyzw),
+            "sigmas": dict(calibration.sigmas),
+        },
+        "watch": {
+            "false_alarms_per_1000_pulses": watch.false_alarms_per_1000_pulses,
+            "arm_noise_m": watch.arm_noise_m,
+            "arm_noise_rad": watch.arm_noise_rad,
+            "warn_m": watch.warn_m,
+            "limit_m": watch.limit_m,
+        },
+        "pulses": {
+            "key": None if settings.laser.pulses else f"gripmon/{settings.robot}/{settings.camera_name}/pulse",
+            "table": None if settings.laser.pulses is None else str(config.directory / settings.laser.pulses),
+            "count": len(pulses) if settings.laser.pulses else None,
+            "first_ns": pulses[0].stamp_ns if pulses else None,
+            "last_ns": pulses[-1].until_ns if pulses else None,
+        },
+    }

@@ -8,8 +8,8 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from gripmon.daemon.camera_source import look_ahead
-from gripmon.daemon.config import Config, SecondConfig, check_network, check_second_network
+from gripmon.daemon.api import look_ahead
+from gripmon.daemon.config import Config, SecondConfig, check_network
 from gripmon.io.sources import LiveSettings, NetworkSettings, network_key
 from gripmon.io.sources.live import shown_name
 from gripmon.io.wire import Keys
@@ -55,8 +55,7 @@ def surroundings(config: Config | SecondConfig) -> Surroundings:
     can be read.
     """
     settings, metrics = config.settings, config.settings.metrics
-    joining = check_second_network(config) if isinstance(config, SecondConfig) else check_network(config)
-    joined = None
+    joining, joined = check_network(config), None
     if joining is not None:
         file = None if joining.file is None else str(joining.file)
         joined = Joined(joining.mode, joining.listen, joining.connect, file)

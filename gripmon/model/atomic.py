@@ -10,6 +10,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+from gripmon.model.errors import InputError
+
+
+def writable_folder(path: Path) -> Path:
+    """The folder, made where it is missing.  :class:`InputError` where nothing can be written to it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: can't be made ({error.strerror}); a directory to write to") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise InputError(f"{path}: may not be written to; a directory of your own")
+    return path
+
 
 def write_atomically(path: Path, data: bytes) -> None:
     """A whole file at once, see :func:`opened_atomically`."""

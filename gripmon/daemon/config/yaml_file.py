@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
-from gripmon.daemon.config.errors import ConfigError
+from gripmon.daemon.config.typed import ConfigError, SettingsError, to_settings
 
+_T = TypeVar("_T")
 _TAG = "tag:yaml.org,2002:"
 
 
@@ -93,6 +94,29 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(path, "", f"holds {_kind(value)}", "`key: value` lines; see configs/demo.yaml")
     return value
+
+
+def read_settings(path: Path, kind: type[_T], values: dict[str, Any] | None = None) -> _T:
+    """What a YAML file holds (or ``values``, if it was read), as a settings type.  :class:`ConfigError`."""
+    try:
+        return to_settings(read_yaml(path) if values is None else values, kind)
+    except SettingsError as error:
+        raise ConfigError.of(path, error.fault) from None
+
+
+_LOOKS_LIKE = {"points": "a gripper file", "gripper": "a configuration", "corners": "a file with corners"}
+
+
+def read_document(path: Path, kind: type[_T]) -> _T:
+    """The same of a file whose ``schema`` says what it is.  :class:`ConfigError`."""
+    values, tag = read_yaml(path), str(kind.__struct_config__.tag)  # type: ignore[attr-defined]
+    schema = values.get("schema")
+    if schema is None:
+        looks = next((f"; this looks like {what}" for key, what in _LOOKS_LIKE.items() if key in values), "")
+        raise ConfigError(path, "schema", f"is missing{looks}", f"a file with schema: {tag}")
+    if schema != tag:
+        raise ConfigError(path, "schema", f"is {schema!r}", tag)
+    return read_settings(path, kind, values)
 
 
 def _kind(value: object) -> str:
