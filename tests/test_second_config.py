@@ -177,4 +177,4 @@ def test_other_commands_refuse_it_in_words(folder: Path, command: str, capsys: p
 
 def test_options_of_a_wrist_camera_are_refused(folder: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["run", str(write_config(cell(), folder, None)), "--fresh-state"]) == 2
-    assert "--fresh-state is for wrist cameras" in capsys.readouterr().err
+    assert "--fresh-state: is for wrist cameras" in capsys.readouterr().err

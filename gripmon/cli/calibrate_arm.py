@@ -17,6 +17,7 @@ from gripmon.cli.common import (
     progress_bar,
     whole_number,
     write,
+    write_document,
     write_picture,
     writing,
 )
@@ -101,7 +102,6 @@ def _reach(text: str) -> float:
 )  # fmt: skip
 def laser(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate laser``."""
-    from gripmon.daemon.calibrations import write_document
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
     from gripmon.laser.pointer.samples import plan_table
@@ -176,7 +176,7 @@ def robot_world(arguments: argparse.Namespace) -> None:
     from gripmon.calibrate.api import calibrate_robot_world
     from gripmon.calibrate.arm_poses import read_arm_poses
     from gripmon.calibrate.documents import robot_world_document
-    from gripmon.daemon.calibrations import read_given_camera, target_of, write_document
+    from gripmon.daemon.calibrations import read_given_camera, target_of
     from gripmon.model.provenance import provenance_of
 
     check_outputs(arguments, "out")

@@ -7,7 +7,7 @@ import re
 import sys
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Command, check_outputs, command_line, refuse_without, write
+from gripmon.cli.common import REQUIRED, Command, check_outputs, command_line, refuse_without, write, write_document
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ def _name(text: str) -> str:
 def import_(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate import``."""
     from gripmon.calibrate.interchange.cameras import ReadOptions
-    from gripmon.daemon.calibrations import import_camera, write_document
+    from gripmon.daemon.calibrations import import_camera
 
     check_outputs(arguments, "out")
     options = ReadOptions(arguments.camera, arguments.size, arguments.fisheye)

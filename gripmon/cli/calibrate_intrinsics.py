@@ -8,7 +8,15 @@ import math
 import sys
 from typing import TYPE_CHECKING
 
-from gripmon.cli.common import REQUIRED, Command, check_outputs, command_line, progress_bar, write_picture
+from gripmon.cli.common import (
+    REQUIRED,
+    Command,
+    check_outputs,
+    command_line,
+    progress_bar,
+    write_document,
+    write_picture,
+)
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +66,7 @@ def intrinsics(arguments: argparse.Namespace) -> None:
 
     from gripmon.calibrate.api import calibrate_intrinsics
     from gripmon.calibrate.picture import draw_maps
-    from gripmon.daemon.calibrations import target_of, write_document
+    from gripmon.daemon.calibrations import target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
 

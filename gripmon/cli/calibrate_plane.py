@@ -15,6 +15,7 @@ from gripmon.cli.common import (
     command_line,
     positive_number,
     progress_bar,
+    write_document,
     write_picture,
 )
 from gripmon.model.errors import InputError
@@ -102,7 +103,7 @@ def plane(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate plane``."""
     import cv2
 
-    from gripmon.daemon.calibrations import is_target_file, plane_inputs, target_of, write_document
+    from gripmon.daemon.calibrations import is_target_file, plane_inputs, target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
     from gripmon.model.targets import name_of
@@ -127,7 +128,7 @@ def plane(arguments: argparse.Namespace) -> None:
     made = found.gripper(arguments.name, arguments.jaw_range, arguments.jaw_opening, provenance)
     written = [arguments.gripper_out, arguments.out] if arguments.infer else [arguments.out]
     if arguments.infer:
-        write_document(gripper_values(made.model), arguments.gripper_out)
+        write_document(gripper_values(made.model), arguments.gripper_out, "--gripper-out")
     write_document(found.document(made, provenance), arguments.out)
     for warning in found.fit.warnings:
         print(f"warning: {warning}", file=sys.stderr)

@@ -98,8 +98,8 @@ def _check(arguments: argparse.Namespace) -> int:
     else:
         lines = check_text.lines(str(arguments.config[0]), found.findings)
         if arguments.verbose:
-            second = found.second
-            lines += ["", *(check_text.details(found.forecast) if second is None else check_laser.details(second))]
+            lines += ["", *([] if found.forecast is None else check_text.details(found.forecast))]
+            lines += [] if found.second is None else check_laser.details(found.second)
             lines += check_text.surrounding_lines(found.around)
         print("\n".join(lines))
     return EXIT_FAILED if any(each.level == "FAIL" for each in found.findings) else EXIT_DONE

@@ -28,7 +28,9 @@ NETWORK_OPTIONS = f"""
 """
 """Of the commands that join the network as a client, which say whose endpoint it is."""
 
-_PATH = re.compile(r"FILE|DIR|CONFIG|[A-Z]+\.yaml")  # an argument of such a name is one
+_PATH = re.compile(
+    r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml"
+)  # an argument of such a name is one
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
@@ -41,8 +43,8 @@ class Command:
     which goes on in lines that are indented: ``NAME``, ``[NAME]``, ``NAME...``, ``[NAME...]`` for one argument, at most
     one, some, any number; ``--flag``, ``--option VALUE``, ``--option VALUE...`` for one that may be repeated.  A row
     that begins with ``|`` excludes the row before.  ``groups``: more such tables by title, each with a description.
-    Values called FILE, DIR or CONFIG are paths.  ``more``: keywords of ``add_argument`` for single arguments, or only a
-    type.
+    Values called FILE, DIR and the like are paths.  ``more``: keywords of ``add_argument`` for single arguments, or
+    only a type.
     """
 
     def __init__(
@@ -243,6 +245,14 @@ def write(data: bytes, path: Path, option: str = "--out") -> None:
 
     with writing(path, option):
         write_atomically(path, data)
+
+
+def write_document(document: Any, path: Path, option: str = "--out") -> None:
+    """Write a calibration as YAML, whole or not at all."""
+    from gripmon.daemon.calibrations import write_document as write_yaml
+
+    with writing(path, option):
+        write_yaml(document, path)
 
 
 def write_picture(picture: Image, path: Path) -> None:

@@ -95,8 +95,8 @@ def table(statuses: Sequence[MonitorStatus], fault: str, height: int, width: int
     out = Table(title="gripmon watch", title_justify="left", expand=True, box=None, pad_edge=False)
     chosen = [name for name in COLUMNS if name != _SPARED or width >= _WIDE]
     for name in chosen:
-        side, ratio = "right" if name in COLUMNS[3:8] else "left", 1 if name == "alerts" else None
-        out.add_column(name, justify=side, no_wrap=True, overflow="ellipsis", ratio=ratio)
+        ratio, number = 1 if name == "alerts" else None, name in COLUMNS[3:8]
+        out.add_column(name, justify="right" if number else "left", no_wrap=True, overflow="ellipsis", ratio=ratio)
     for status in shown:
         condition, cells = row(status)
         # Text, not markup: what came from the network has no say in how it looks.

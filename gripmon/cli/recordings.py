@@ -127,7 +127,7 @@ _TO_STDOUT = Path("-")
 
 @Command(
     "report", "what happened: when did the camera move, what is affected", _REPORT, _REPORT_OPTIONS, _REPORT_EXAMPLES,
-    recording={"type": Path}, limit_mm=positive_number, limit_deg=positive_number,
+    limit_mm=positive_number, limit_deg=positive_number,
 )  # fmt: skip
 def report(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon report``."""
@@ -161,7 +161,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 @Command(
     "export", "write recordings as Parquet, by robot and day", _EXPORT, _EXPORT_OPTIONS, _EXPORT_EXAMPLES,
-    recording={"type": Path}, out=REQUIRED,
+    out=REQUIRED,
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon export``."""
@@ -179,7 +179,7 @@ def export(arguments: argparse.Namespace) -> None:
 
 @Command(
     "correct", "the best transform for every instant, knowing the whole recording", _CORRECT, _CORRECT_OPTIONS,
-    _CORRECT_EXAMPLES, recording={"type": Path}, out=REQUIRED,
+    _CORRECT_EXAMPLES, out=REQUIRED,
 )  # fmt: skip
 def correct(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon correct``."""
@@ -195,7 +195,7 @@ def correct(arguments: argparse.Namespace) -> None:
 
 @Command(
     "view", "recordings in rerun's viewer, native or in a browser", _VIEW, _VIEW_OPTIONS, _VIEW_EXAMPLES,
-    recording={"type": Path}, port=port,
+    port=port,
 )  # fmt: skip
 def view(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""

@@ -52,7 +52,7 @@ FILE.rrd from before stays then); 130 interrupted (what was done until then is i
 
 @Command(
     "replay", "recorded images or a video through the monitor, JSON lines out", _DESCRIPTION, _OPTIONS, _EXAMPLES,
-    input={"type": Path}, out=REQUIRED, fps=positive_number,
+    out=REQUIRED, fps=positive_number,
 )  # fmt: skip
 def replay(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon replay``."""

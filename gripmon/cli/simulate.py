@@ -50,8 +50,8 @@ inputs for every step from a new gripper to a running monitor
 )  # fmt: skip
 def simulate(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon simulate``."""
-    from gripmon.daemon.config import load_config
-    from gripmon.daemon.simulated import simulate_images
+    from gripmon.daemon.config import builtin_config, load_config
+    from gripmon.daemon.simulated import next_step, simulate_images
     from gripmon.simulate import CALIBRATION_KINDS, SCENARIO_NAMES
 
     if arguments.list:
@@ -60,7 +60,7 @@ def simulate(arguments: argparse.Namespace) -> None:
     kind = arguments.scenario
     if kind is None or arguments.out is None:
         raise InputError("simulate: SCENARIO and --out DIR are needed; e.g. gripmon simulate bump --out bump/")
-    config = None if arguments.config is None else load_config(arguments.config, check_source=False)
+    config = load_config(arguments.config or builtin_config("demo.yaml"), check_source=False)
     unit = "image" if kind in CALIBRATION_KINDS else "frame"
     with progress_bar(None, unit) as step:
         made = simulate_images(
@@ -72,4 +72,4 @@ def simulate(arguments: argparse.Namespace) -> None:
             fps=arguments.fps,
             step=lambda _done, total: step(total),
         )
-    print(f"{made.frames} {unit}s in {made.folder}; next: {made.next}")
+    print(f"{made.frames} {unit}s in {made.folder}; next: {next_step(kind, made, config.gripper)}")

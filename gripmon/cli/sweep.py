@@ -52,13 +52,13 @@ def run(arguments: argparse.Namespace) -> int:
 
     config = load_config(arguments.config[0], check_source=False)
     ranges = {name: _range(name, getattr(arguments, name)) for name in _BOUNDS if getattr(arguments, name) is not None}
-    at_px = None if arguments.at is None else _numbers(arguments.at, ",")
-    if at_px == ():
+    at_px = _numbers(arguments.at, ",")
+    if at_px is None and arguments.at is not None:
         width_px, height_px = config.camera.width_px, config.camera.height_px
         right = f"two numbers inside {width_px} x {height_px} px, such as --at {width_px // 2},{height_px // 2}"
         raise InputError(f"--at {arguments.at}: is no point of the image; {right}")
-    travel_m = None if arguments.jaw is None else _numbers(arguments.jaw, ":")
-    if travel_m == ():
+    travel_m = _numbers(arguments.jaw, ":")
+    if travel_m is None and arguments.jaw is not None:
         raise InputError(f"--jaw {arguments.jaw}: is no range; MIN:MAX in metres")
     check_outputs(arguments, "picture")
     grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
@@ -73,12 +73,12 @@ def run(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _numbers(text: str, between: str) -> tuple[float, float] | tuple[()]:
-    """Two numbers; nothing for another text."""
+def _numbers(text: str | None, between: str) -> tuple[float, float] | None:
+    """Two numbers; None for another text."""
     try:
-        first, second = (float(part) for part in text.split(between))
+        first, second = (float(part) for part in (text or "").split(between))
     except ValueError:
-        return ()
+        return None
     return first, second
 
 

@@ -107,7 +107,7 @@ def _key(text: str) -> str:
 @Command(
     "teach", "learn how the gripper's edges look at the reference", _DESCRIPTION, _OPTIONS, _EXAMPLES,
     {"corners by hand": (None, _BY_HAND)},
-    image={"type": Path}, jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
+    jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
     jaw_source={"choices": ("fixed", "frames", "zenoh")},
     port={"type": whole_number(0, 65535, "is no port; a whole number, 0 (any free one) to 65535"), "default": 0},
 )  # fmt: skip

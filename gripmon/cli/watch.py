@@ -7,7 +7,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from gripmon.cli import fleet_table
 from gripmon.cli.common import NETWORK_OPTIONS, Command, check_file, network_errors, network_of, positive_number
@@ -68,7 +68,7 @@ def watch(arguments: argparse.Namespace) -> None:
     from gripmon.client import Fleet
 
     log = _open_log(arguments) if arguments.alerts else None
-    heard = {} if log is None else {"on_alert": log.alert, "on_presence": log.presence}
+    heard: dict[str, Any] = {} if log is None else {"on_alert": log.alert, "on_presence": log.presence}
     with network_errors(arguments):
         opened = Fleet(**joined, transforms=arguments.transforms, **heard)
     with opened as fleet:

@@ -245,11 +245,8 @@ def _target_of_command(provenance: object) -> str | None:
 
 
 def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> None:
-    """Write a calibration as YAML, whole or not at all.  :class:`~gripmon.model.errors.InputError` if it can't be."""
-    try:
-        write_atomically(path, as_yaml(msgspec.to_builtins(document)).encode())
-    except OSError as error:
-        raise InputError(f"{path}: can't be written ({error.strerror or error}); a file") from None
+    """Write a calibration as YAML, whole or not at all.  OSError if it can't be written."""
+    write_atomically(path, as_yaml(msgspec.to_builtins(document)).encode())
 
 
 def import_camera(

@@ -22,6 +22,7 @@ from gripmon.daemon.config import Config, builtin_config, load_config, load_scen
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
 from gripmon.model.targets import name_of
@@ -48,14 +49,11 @@ _TRACKING = ("tracking", "drifting")
 
 
 class SimulatedImages(NamedTuple):
-    """The folder, a configuration that fits (None where calibrations come first), how many images there are, and the
-    command that takes them.
-    """
+    """The folder, a configuration that fits (None where calibrations come first), and how many images there are."""
 
     folder: Path
     config: Path | None
     frames: int
-    next: str
 
 
 def simulate_images(
@@ -92,12 +90,11 @@ def simulate_images(
         raise InputError(f"{scenario}: {error}") from None
     _make_empty(out)
     if scenario == "work":
-        return SimulatedImages(out, None, write_sequence(simulator, out, step), _next_step("work", out, config))
+        return SimulatedImages(out, None, write_sequence(simulator, out, step))
     config_path = out / "config.yaml"
     shutil.copyfile(config.gripper_path, out / "gripper.yaml")
     config_path.write_text(_config_text(config, made, seed), encoding="utf-8")
-    follows = shlex.join(["gripmon", "replay", str(out), "--config", str(config_path), "--out", f"{out}.jsonl"])
-    return SimulatedImages(out, config_path, write_sequence(simulator, out, step), follows)
+    return SimulatedImages(out, config_path, write_sequence(simulator, out, step))
 
 
 def _scenario(name: str | Path, config: Config, duration_s: float | None, fps: float | None) -> Scenario:
@@ -128,7 +125,7 @@ def _calibration_images(
         write_calibration_images(kind, _rig(config), out, seed, lambda: step(next(done), count))
     except ValueError as error:
         raise InputError(f"simulate {kind}: {error}") from None
-    return SimulatedImages(out, None, count, _next_step(kind, out, config))
+    return SimulatedImages(out, None, count)
 
 
 def _make_empty(path: Path) -> None:
@@ -136,9 +133,12 @@ def _make_empty(path: Path) -> None:
         raise InputError(f"{path}: is not empty; a new or empty folder")
 
 
-def _next_step(kind: str, out: Path, config: Config) -> str:
-    """The command that takes images for a calibration."""
-    folder, gripper = shlex.quote(str(out)), config.gripper
+def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
+    """The command that takes these images of ``gripper``."""
+    out = str(made.folder)
+    if made.config is not None:
+        return shlex.join(["gripmon", "replay", out, "--config", str(made.config), "--out", f"{out}.jsonl"])
+    folder = shlex.quote(out)
     jaw = f"--jaw-range {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g} " if gripper.has_jaw else ""
     return {
         "plate": f"gripmon calibrate intrinsics {folder} --target {name_of(PLATE)} --model paper --out camera.yaml",

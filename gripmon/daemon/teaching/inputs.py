@@ -71,8 +71,9 @@ def read_inputs(
     robot: str | None = None,
     camera_name: str | None = None,
 ) -> Inputs:
-    """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what is
-    to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of images.
+    """Read and check what a person names: either ``config``, or ``gripper`` with ``camera`` or ``reference``, and what
+    is to stand in the configuration.  ``command`` goes into the files' provenance; ``live`` is a camera instead of
+    images.
     """
     cv2.setNumThreads(1)
     given = None

@@ -30,7 +30,7 @@ def wanted_names(names: Sequence[str], robots: Sequence[str], hosts: Sequence[st
     """
     of_robots = [name for robot in robots for name in names_of(robot)]
     if names:
-        return dict.fromkeys(names, list(hosts)) | {name: [] for name in of_robots}
+        return {name: list(hosts) for name in names} | {name: [] for name in of_robots}
     others = (*_CLIENTS, *(of_robots or names_of(_SHIPPED_ROBOT)))
     return {"router": [*_LOCAL, *hosts], **{name: [] for name in others}}
 
