@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gripmon.cli.common import (
     REQUIRED,
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from gripmon.calibrate.plane import Coincidence
     from gripmon.calibrate.plane_average import PlaneCalibration
     from gripmon.teach.hand_eye import HandEyeOnPlate
-    from gripmon.teach.onboarding import Look
 
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
@@ -134,7 +133,7 @@ def plane(arguments: argparse.Namespace) -> None:
         print(f"warning: {warning}", file=sys.stderr)
     notes = [*given.notes, *found.notes]
     if arguments.json:
-        print(json.dumps({**_values(found, notes), "written": [str(path) for path in written]}, indent=2))
+        print(json.dumps({**found.values(), "notes": notes, "written": [str(path) for path in written]}, indent=2))
     else:
         print("\n".join([*_lines(found, notes), *(f"written: {path}" for path in written)]))
     if arguments.picture is not None:
@@ -190,48 +189,6 @@ def _lines(found: HandEyeOnPlate, notes: list[str]) -> list[str]:
     lines.append(f"TCP in the camera frame  {x:.3f} {y:.3f} {z:.3f} mm  +- {sx:.4f} {sy:.4f} {sz:.4f} mm")
     lines.append(f"rotation about x, y, z   +- {rx:.4f} {ry:.4f} {rz:.4f} degrees")
     return [*lines, *([_lengths_line(fit)] if found.inferred else [])]
-
-
-def _values(found: HandEyeOnPlate, notes: list[str]) -> dict[str, Any]:
-    from gripmon.model.geometry import to_record
-
-    fit, transform = found.fit, to_record(found.cam_T_grip)
-    out: dict[str, Any] = {
-        "cam_T_grip": {"translation_m": transform.translation_m, "rotation_xyzw": transform.rotation_xyzw},
-        "covariance": fit.covariance.ravel().tolist(),
-        "rms_m": fit.rms_m,
-        "rms_px": fit.rms_px,
-        "consistency_p": fit.consistency_p,
-        "warnings": fit.warnings,
-        "notes": notes,
-        "images": [_image_values(look) for look in found.looks],
-    }
-    if found.inferred:
-        out["sides_m"] = (2.0 * fit.corners_m[3, :2]).tolist()
-        out["sides_sigma_m"] = (fit.lengths_covariance.diagonal()[:2] ** 0.5).tolist()
-    return out
-
-
-def _image_values(look: Look) -> dict[str, Any]:
-    image = look.coincidence
-    sigma_px = (image.corners.covariance_px.diagonal() ** 0.5).reshape(-1, 2)
-    rows = zip(image.corners.names, image.corners.uv_px, sigma_px, image.residuals_m, strict=True)
-    return {
-        "image": image.sighting.name,
-        "plate_points": int(image.plate.used[0].sum()),
-        "plate_points_left_out": int((~image.plate.used[0]).sum()),
-        "plate_rms_px": image.plate.rms_px,
-        "corners": {
-            name: {"uv_px": uv.tolist(), "sigma_px": sigma.tolist(), "residual_m": residual.tolist()}
-            for name, uv, sigma, residual in rows
-        },
-        "missing": look.missing,
-        "residuals_p": image.p_value,
-        "tilt_rad": None if image.tilt_rad is None else image.tilt_rad.tolist(),
-        "gap_m": image.gap_m,
-        "tilt_gap_sigma": None if image.apart_sigma is None else image.apart_sigma.tolist(),
-        "tilt_gap_p": image.apart_p,
-    }
 
 
 def _image_line(image: Coincidence, width: int) -> str:

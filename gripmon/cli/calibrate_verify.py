@@ -7,7 +7,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gripmon.cli.common import Command, positive_number, refuse_without
 from gripmon.model.errors import InputError
@@ -86,7 +86,7 @@ def verify(arguments: argparse.Namespace) -> int:
     found = replace(found, warnings=(*doubts, *found.warnings))
     given = mm is not None or px is not None
     if arguments.json:
-        print(json.dumps(_values(found, given=given)))
+        print(json.dumps(found.values() | {"within_tolerance": found.within if given else None}))
     else:
         print("\n".join([*_lines(found), *(f"warning: {w}" for w in found.warnings), _verdict(found, given=given)]))
     return EXIT_DONE if found.same else EXIT_FAILED
@@ -105,44 +105,6 @@ def _second(first: Calibrated, arguments: argparse.Namespace) -> tuple[Calibrate
     if len(names) > 1:
         raise InputError(f"{names[1]}: a third calibration; two of them, or images")
     return read_calibrated(Path(names[0])), ()
-
-
-def _values(found: Verdict, *, given: bool) -> dict[str, Any]:
-    from gripmon.calibrate.verify import HandEyeDifference
-
-    difference: Any = found.difference
-    said = {
-        "within_tolerance": found.within if given else None,
-        "same": found.same,
-        "level": found.level,
-        "warnings": list(found.warnings),
-    }
-    if isinstance(difference, HandEyeDifference):
-        return {
-            "kind": "hand_eye",
-            "position_m": difference.position_m.tolist(),
-            "position_sigma_m": difference.position_sigma_m.tolist(),
-            "rotation_rad": difference.rotation_rad.tolist(),
-            "rotation_sigma_rad": difference.rotation_sigma_rad.tolist(),
-            "chi2": difference.chi2,
-            "degrees_of_freedom": 6,
-            "p_value": difference.p_value,
-            "position_p_value": difference.position_p,
-            "rotation_p_value": difference.rotation_p,
-            **said,
-        }
-    return {
-        "kind": "camera",
-        "largest_px": difference.largest_px,
-        "largest_sigma_px": difference.largest_sigma_px if difference.p_value is not None else None,
-        "at_px": difference.at_px.tolist(),
-        "rms_px": difference.rms_px,
-        "turn_rad": difference.turn_rad.tolist(),
-        "largest_turned_px": difference.largest_turned_px,
-        "p_value": difference.p_value,
-        "compared": difference.compared,
-        **said,
-    }
 
 
 def _lines(found: Verdict) -> list[str]:
