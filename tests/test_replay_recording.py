@@ -304,7 +304,7 @@ def test_what_cannot_be_replayed_is_said_in_one_line(
         ([tmp_path / "picture.rrd"], 3, "is no rerun recording, whatever its name says"),
         ([tmp_path / "nothing.rrd"], 3, "is empty"),
         ([tmp_path / "none.rrd"], 2, "there is no such file; recordings of gripmon run"),
-        ([tmp_path / "old-0001.rrd", sequence], 2, "is no .rrd file; one input, or several .rrd files of one run"),
+        ([tmp_path / "old-0001.rrd", sequence], 2, "isn't an .rrd file; one input, or several .rrd files of one run"),
         ([tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
         ([tmp_path / "old-0001.rrd", tmp_path / "empty"], 2, "empty: no recordings and no images in it"),
         ([sequence], 2, "only a recording brings its own configuration; --config CONFIG"),

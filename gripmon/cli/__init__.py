@@ -50,7 +50,7 @@ _ENVIRONMENT = {
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    # A camera that is absent, or a file that is no video, we report in our own words.
+    # A camera that is absent, or a file that isn't a video, we report in our own words.
     "OPENCV_LOG_LEVEL": "ERROR",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
     # rerun's own lines, read when it is imported: so are a disk that is full and a file that is damaged.
@@ -135,7 +135,7 @@ def main(arguments: list[str] | None = None) -> int:
         code = command.run(chosen)
         sys.stdout.flush()
     except (InputError, NoResultError) as error:
-        print(_in_words(error, command), file=sys.stderr)
+        print(_in_words(error, chosen), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("gripmon: interrupted", file=sys.stderr)
@@ -147,12 +147,15 @@ def main(arguments: list[str] | None = None) -> int:
     return code
 
 
-def _in_words(error: InputError | NoResultError, command: Command) -> str:
+def _in_words(error: InputError | NoResultError, arguments: argparse.Namespace) -> str:
     """The line that says it; where a function's argument is wrong, the option stands in front."""
+    command: Command = arguments.command
     if isinstance(error, InputError):
         for name in (error.argument, error.argument.rpartition("_")[0]):
-            if command.arguments.get(name):
-                return f"{command.arguments[name]}: {error.wrong}"
+            if option := command.arguments.get(name):
+                given = getattr(arguments, name)
+                values = tuple(map(str, given if isinstance(given, list) else [given]))
+                return f"{option} {error.wrong}" if error.wrong.startswith(values) else f"{option}: {error.wrong}"
         return str(error)
     details = getattr(error, "details", None)  # of gripmon.calibrate.sighting.CalibrationError
     return str(error) if details is None else "\n".join([*details, f"{command.prog}: {error}"])

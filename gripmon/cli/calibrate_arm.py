@@ -91,14 +91,14 @@ nothing is written then"""
 def _reach(text: str) -> float:
     value = positive_number(text)
     if value > LONGEST_ARM_M:
-        raise argparse.ArgumentTypeError(f"{text} m is no arm's reach (millimetres?); metres, e.g. 0.85")
+        raise argparse.ArgumentTypeError(f"{text} m isn't an arm's reach (millimetres?); metres, e.g. 0.85")
     return value
 
 
 @Command(
     "laser", "a fixed camera, its plane and a laser pointer on the arm", _LASER, _LASER_OPTIONS, _LASER_EXAMPLES,
     camera=REQUIRED, out=REQUIRED, arm_noise=arm_noise, reach=_reach,
-    poses={"type": whole_number(1, 200, "is no number of poses; 1 to 200"), "default": 10},
+    poses={"type": whole_number(1, 200, "isn't a number of poses; 1 to 200"), "default": 10},
 )  # fmt: skip
 def laser(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate laser``."""

@@ -83,7 +83,7 @@ exit codes: 0 written; 2 wrong usage or files, or a lens that the format hasn't:
 def _size(text: str) -> tuple[int, int]:
     match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
     if match is None:
-        raise argparse.ArgumentTypeError(f"'{text}' is no image size; e.g. 1280x960")
+        raise argparse.ArgumentTypeError(f"'{text}' isn't an image size; e.g. 1280x960")
     return int(match[1]), int(match[2])
 
 

@@ -80,14 +80,14 @@ nothing is written then"""
 def _opening(text: str) -> float:
     value = 0.0 if text.strip() in ("0", "0.0") else positive_number(text)
     if value > 0.5:
-        raise argparse.ArgumentTypeError(f"{text} m is no jaw opening (millimetres?); metres, 0 to 0.5")
+        raise argparse.ArgumentTypeError(f"{text} m isn't a jaw opening (millimetres?); metres, 0 to 0.5")
     return value
 
 
 def _range(text: str) -> tuple[float, float]:
     low, colon, high = text.partition(":")
     if not colon:
-        raise argparse.ArgumentTypeError(f"'{text}' is no range; MIN:MAX in metres, e.g. 0:0.06")
+        raise argparse.ArgumentTypeError(f"'{text}' isn't a range; MIN:MAX in metres, e.g. 0:0.06")
     ends = _opening(low), _opening(high)
     if not ends[0] < ends[1]:
         raise argparse.ArgumentTypeError(f"'{text}' doesn't ascend; MIN:MAX in metres, e.g. 0:0.06")
@@ -148,15 +148,15 @@ def _check_options(arguments: argparse.Namespace) -> None:
     known = "has no effect with a gripper that is known; --infer, or leave it out"
     wrong = ""
     if infer and arguments.gripper_out is None:
-        wrong = "--infer: where to write the gripper isn't said; --gripper-out FILE.yaml"
+        wrong = "--infer: where to write the gripper isn't given; --gripper-out FILE.yaml"
     elif infer and not corners:
         wrong = "--infer: needs rough corners; --corners FILE.yaml"
     elif not infer and (arguments.gripper_out or arguments.jaw_range):
         wrong = f"{'--gripper-out' if arguments.gripper_out else '--jaw-range'}: {known}"
     elif not infer and arguments.gripper is None and config is None:
-        wrong = "the gripper isn't said; --gripper FILE.yaml, --config CONFIG, or --infer"
+        wrong = "the gripper isn't given; --gripper FILE.yaml, --config CONFIG, or --infer"
     elif arguments.camera is None and config is None:
-        wrong = "the camera isn't said; --camera FILE.yaml (of gripmon calibrate intrinsics), or --config CONFIG"
+        wrong = "the camera isn't given; --camera FILE.yaml (of gripmon calibrate intrinsics), or --config CONFIG"
     elif not corners and config is None:
         wrong = "nothing says where the gripper is in the image; --corners FILE.yaml, or --config CONFIG"
     elif len({path.resolve() for path in given.values()}) < len(given):

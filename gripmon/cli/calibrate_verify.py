@@ -56,7 +56,7 @@ def _share(text: str) -> float:
     except ValueError:
         value = math.nan
     if not 0.0 < value < 0.5:
-        raise argparse.ArgumentTypeError(f"'{text}' is no probability of a false alarm; between 0 and 0.5, e.g. 0.01")
+        raise argparse.ArgumentTypeError(f"'{text}' isn't a probability of a false alarm; between 0 and 0.5, e.g. 0.01")
     return value
 
 

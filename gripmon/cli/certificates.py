@@ -81,8 +81,8 @@ def certificates(arguments: argparse.Namespace) -> None:
                 print(f"{folder / 'ca.pem'}: a new authority; keep ca-key.pem away from the robots")
             for name, hosts in wanted.items():
                 made = authority.issue(name, hosts)
-                said = _issued(made, read(folder / f"{name}.pem"), hosts)
-                print(f"{folder / name}.pem, {name}-key.pem: {said}")
+                issued = _issued(made, read(folder / f"{name}.pem"), hosts)
+                print(f"{folder / name}.pem, {name}-key.pem: {issued}")
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"certificates: {error}") from None
 
@@ -105,7 +105,7 @@ def _add_rules(arguments: argparse.Namespace) -> None:
         with writing(path, "--rules"):
             changed = add_robots(path, robots)
     except ValueError as error:
-        said = "is no text" if isinstance(error, UnicodeDecodeError) else str(error)
-        raise error if isinstance(error, InputError) else InputError(f"certificates: --rules {path} {said}") from None
+        wrong = "isn't text" if isinstance(error, UnicodeDecodeError) else str(error)
+        raise error if isinstance(error, InputError) else InputError(f"certificates: --rules {path} {wrong}") from None
     which = f"{', '.join(robots)} may speak for {'itself' if len(robots) == 1 else 'themselves'}"
     print(f"{path}: {which}{'; restart the router' if changed else ' already'}")

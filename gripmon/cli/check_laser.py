@@ -49,7 +49,7 @@ def _watch_line(watch: dict[str, Any]) -> str:
 
 def _pulses_line(pulses: dict[str, Any]) -> str:
     if pulses["table"] is None:
-        return f"told by the robot's program on {pulses['key']}"
+        return f"by the robot's program on {pulses['key']}"
     length_s = 1e-9 * (pulses["last_ns"] - pulses["first_ns"])
     return f"{pulses['count']} in {pulses['table']}, over {length_s:.4g} s"
 

@@ -115,12 +115,12 @@ def _accuracy_lines(values: forecasts.Accuracy) -> list[str]:
 def _jaw_accuracy_lines(jaw: forecasts.JawAccuracy) -> list[str]:
     unknown, growth = jaw.unknown, jaw.growth
     shift_m = [_JAW_ERROR_M * v for v in jaw.pose_per_jaw_m.tcp_m]
-    told = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw.like}"
+    separates = f"{'can hardly separate' if growth >= _POORLY else 'separates'} the opening from {jaw.like}"
     less = f"{growth:.1f} times less certain than with it"
     return [
         f"jaw        opening reported to {1e3 * jaw.reported_sigma_m:.3f} mm; if it were unknown:",
         f"           {_sigmas(unknown)}; opening {1e3 * unknown.jaw_m:.3f} mm",
-        f"           the image {told}: correlation {jaw.correlation:.2f}, {less}",
+        f"           the image {separates}: correlation {jaw.correlation:.2f}, {less}",
         f"           taken as exact but wrong by {1e3 * _JAW_ERROR_M:.3f} mm it shifts the TCP by {_mm(shift_m)} mm",
     ]
 
@@ -207,7 +207,7 @@ def _camera_lines(values: forecasts.InView) -> list[str]:
         lines.append(f"           the shortest way is {1e3 * amount_m:.1f} mm along {way}: then {reason}")
         if amount_m < values.limit_m:
             limit = f"{1e3 * values.limit_m:g} mm (monitor.policy.limit_m)"
-            lines.append(f"           LESS than the shift past which the reference is measured anew, {limit}")
+            lines.append(f"           LESS than the shift past which the reference is measured again, {limit}")
     return lines
 
 
@@ -258,13 +258,13 @@ def _percent(share: float) -> str:
 def surrounding_lines(around: Surroundings) -> list[str]:
     """Where frames come from, and where messages, recording and metrics go."""
     source = around.source
-    said = {
+    sections = {
         "source": f"{source.kind}: {'NOT REACHABLE: ' if source.reachable is False else ''}{source.detail}",
         "Zenoh": _zenoh_line(around.keys, around.zenoh),
         "recording": around.recording or "off",
         "metrics": around.metrics or "off",
     }
-    return [f"{name:<10} {text}" for name, text in said.items()]
+    return [f"{name:<10} {text}" for name, text in sections.items()]
 
 
 def _zenoh_line(keys: str | None, session: Joined | None) -> str:

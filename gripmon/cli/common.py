@@ -170,8 +170,8 @@ def whole_number(low: int, high: int, wrong: str) -> Callable[[str], int]:
     return convert
 
 
-port = whole_number(1, 65535, "is no TCP port; 1 to 65535")
-seed = whole_number(0, _LARGEST_SEED, f"is no seed; a whole number, 0 to {_LARGEST_SEED}")
+port = whole_number(1, 65535, "isn't a TCP port; 1 to 65535")
+seed = whole_number(0, _LARGEST_SEED, f"isn't a seed; a whole number, 0 to {_LARGEST_SEED}")
 
 
 def arm_noise(text: str) -> tuple[float, float]:
@@ -181,7 +181,7 @@ def arm_noise(text: str) -> tuple[float, float]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"'{text}' is not M:RAD; e.g. 0.0001:0.0002") from None
     if not (0.0 <= position < 0.1 and 0.0 <= rotation < 0.5):
-        raise argparse.ArgumentTypeError(f"{text} is no arm's noise; metres and radians, e.g. 0.0001:0.0002")
+        raise argparse.ArgumentTypeError(f"{text} isn't an arm's noise; metres and radians, e.g. 0.0001:0.0002")
     return position, rotation
 
 
@@ -198,7 +198,7 @@ def network_of(arguments: argparse.Namespace) -> dict[str, Any]:
 
 @contextmanager
 def network_errors(arguments: argparse.Namespace) -> Iterator[None]:
-    """Where there is no session, the error names the option, since no key was written."""
+    """Where there is no session, the error names the option: no key was written."""
     from gripmon.io.wire import PublishError
 
     try:
@@ -215,7 +215,7 @@ def make_directory(path: Path, option: str = "--out") -> Path:
     try:
         return writable_folder(path)
     except InputError as error:
-        raise InputError(f"{option} {error}") from None
+        raise InputError(f"{option} {error.wrong}") from None
 
 
 def check_outputs(arguments: argparse.Namespace, *names: str) -> None:

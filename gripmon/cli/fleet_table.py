@@ -32,7 +32,7 @@ class Row(NamedTuple):
 
 
 def row(status: MonitorStatus) -> Row:
-    """The cells in the order of :data:`COLUMNS`; drift, sigma and bound are what a monitor that is gone said last."""
+    """The cells in the order of :data:`COLUMNS`; of a monitor that is gone they are what it reported last."""
     state = status.state
     there = state is not None and status.condition in ("valid", "suspect", "unknown")
     age_s = status.state_age_s if status.transform_age_s is None else status.transform_age_s

@@ -84,7 +84,7 @@ _LOOK_EVERY_S = 1.0
 @Command(
     "feed", "publish images over Zenoh, as a camera's driver does", _FEED, _FEED_OPTIONS, _FEED_EXAMPLES,
     robot=REQUIRED, camera={"default": "wrist"}, format={"choices": ("raw", "jpeg", "png"), "default": "raw"},
-    quality={"type": whole_number(1, 100, "is no quality; a whole number, 1 to 100"), "default": 90},
+    quality={"type": whole_number(1, 100, "isn't a quality; a whole number, 1 to 100"), "default": 90},
     fps=positive_number,
 )  # fmt: skip
 def feed(arguments: argparse.Namespace) -> int:
@@ -98,7 +98,7 @@ def feed(arguments: argparse.Namespace) -> int:
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)
     try:
         settings = settings_for_text(arguments.source, arguments.fps)
-        sources = [open_source(settings)]  # before anything is sent: what can't be opened is said at once
+        sources = [open_source(settings)]  # before anything is sent: what can't be opened is reported at once
     except SourceError as error:
         raise InputError(f"feed: {arguments.source}: {error}") from None
     try:
@@ -142,12 +142,12 @@ def router(arguments: argparse.Namespace) -> None:
         with opened:
             try:
                 _say(f"listening on {', '.join(opened.listens_on)}")
-                said = ""
+                known = ""
                 while True:
                     time.sleep(_LOOK_EVERY_S)
-                    if (fault := opened.fault()) != said:
+                    if (fault := opened.fault()) != known:
                         _say(fault or "connected")
-                        said = fault
+                        known = fault
             finally:
                 _say("stopped")
 

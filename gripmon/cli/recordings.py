@@ -226,7 +226,7 @@ def _check_recording(path: Path) -> None:
     from gripmon.record.read import is_rrd
 
     try:
-        wrong = "" if is_rrd(path) else "is no recording; an .rrd file of gripmon's"
+        wrong = "" if is_rrd(path) else "isn't a recording; an .rrd file of gripmon's"
     except OSError as error:
         wrong = f"can't be read ({error.strerror})"
     if wrong:

@@ -94,7 +94,7 @@ def _output(arguments: argparse.Namespace) -> Iterator[Callable[[bytes], None]]:
         try:
             act(*values)
         except BrokenPipeError:
-            raise  # a reader that has seen enough is no fault
+            raise  # a reader that has seen enough isn't a fault
         except OSError as error:
             raise NoResultError(f"--out {path}: writing failed ({error.strerror})") from None
 

@@ -56,10 +56,10 @@ def run(arguments: argparse.Namespace) -> int:
     if at_px is None and arguments.at is not None:
         width_px, height_px = config.camera.width_px, config.camera.height_px
         right = f"two numbers inside {width_px} x {height_px} px, such as --at {width_px // 2},{height_px // 2}"
-        raise InputError(f"--at {arguments.at}: is no point of the image; {right}")
-    travel_m = _numbers(arguments.jaw, ":")
+        raise InputError(f"--at {arguments.at}: isn't a point of the image; {right}")
+    travel, travel_m = f"{config.gripper.jaw_min_m:g}:{config.gripper.jaw_max_m:g}", _numbers(arguments.jaw, ":")
     if travel_m is None and arguments.jaw is not None:
-        raise InputError(f"--jaw {arguments.jaw}: is no range; MIN:MAX in metres")
+        raise InputError(f"--jaw {arguments.jaw}: isn't a range; MIN:MAX in metres, within {travel}")
     check_outputs(arguments, "picture")
     grid, place_px = make_grid(config, ranges, arguments.lens or (), at_px)
     with progress_bar(len(grid), "mount") as step:
@@ -96,7 +96,7 @@ def _range(name: str, text: str) -> tuple[float, ...]:
         else:
             values = [float(part) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"--{name} {text}: is no range; {right}") from None
+        raise InputError(f"--{name} {text}: isn't a range; {right}") from None
     wrong = [v for v in values if not lowest <= v <= highest]
     if wrong or len(values) > _MOST_VALUES:
         what = f"{wrong[0]:g} {unit} is out of bounds" if wrong else f"has {len(values)} values"
@@ -161,7 +161,7 @@ def _looked_at(config: Config, present: Trial) -> list[str]:
         usual = f"usual {1e3 * (config.jaw_opening_m or config.gripper.jaw_nominal_m):.1f} mm"
         lines.append(f"jaw        {low_mm:.1f} to {high_mm:.1f} mm of opening, {usual}; --jaw MIN:MAX for a part of it")
     if config.taught is not None:
-        lines.append("taught     as seen from the present mount; taught anew at another one it gets more exact there")
+        lines.append("taught     as seen from the present mount; taught again at another one it gets more exact there")
     return lines
 
 

@@ -100,7 +100,7 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 def _key(text: str) -> str:
     """A name that may stand in a key on the network."""
     if not text or re.fullmatch(r"[^/*$#?@\s][^/*$#?\s]*", text) is None:
-        raise argparse.ArgumentTypeError(f"'{text}' is no name; no blank, none of / * $ # ?, no @ in front")
+        raise argparse.ArgumentTypeError(f"'{text}' isn't a name; no blank, none of / * $ # ?, no @ in front")
     return text
 
 
@@ -109,7 +109,7 @@ def _key(text: str) -> str:
     {"corners by hand": (None, _BY_HAND)},
     jaw_opening=positive_number, live_wait=positive_number, robot=_key, camera_name=_key,
     jaw_source={"choices": ("fixed", "frames", "zenoh")},
-    port={"type": whole_number(0, 65535, "is no port; a whole number, 0 (any free one) to 65535"), "default": 0},
+    port={"type": whole_number(0, 65535, "isn't a port; a whole number, 0 (any free one) to 65535"), "default": 0},
 )  # fmt: skip
 def teach(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon teach``."""

@@ -2,5 +2,5 @@
 
 :mod:`~gripmon.daemon.config` reads a configuration, :mod:`~gripmon.daemon.api` makes a monitor and a source of it,
 :mod:`~gripmon.daemon.starting` opens all that it names, :mod:`~gripmon.daemon.running` runs the supervised loop.
-Nothing is imported here: whoever only reads a configuration needs neither Zenoh nor rerun.
+Nothing is imported here: to read a configuration needs neither Zenoh nor rerun.
 """

@@ -132,13 +132,13 @@ def _state(path: Path, data: bytes) -> Calibrated:
     except ValueError as error:
         raise InputError(f"{path}: {error}; {_RIGHT}") from None
     reference = kept.state.references[-1]
-    said = f"the reference in force of {kept.owner.robot}/{kept.owner.camera}: {reference.reference_id}"
+    which = f"the reference in force of {kept.owner.robot}/{kept.owner.camera}: {reference.reference_id}"
     return Calibrated(
         str(path),
         "a monitor's state",
         cam_T_grip=reference.cam_T_grip,
         covariance=reference.covariance,
-        pose_notes=(f"{said}, revision {reference.revision}, {reference.origin}", *_uncertainty(reference.covariance)),
+        pose_notes=(f"{which}, revision {reference.revision}, {reference.origin}", *_uncertainty(reference.covariance)),
     )
 
 
@@ -152,7 +152,7 @@ def _estimates(path: Path, data: bytes) -> Calibrated:
         try:
             record = decoder.decode(lines[number - 1])
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: line {number}: is no estimate ({error}); {_RIGHT}") from None
+            raise InputError(f"{path}: line {number}: isn't an estimate ({error}); {_RIGHT}") from None
         if record.verdict == "valid" and record.cam_T_grip is not None and record.covariance is not None:
             return Calibrated(
                 str(path),

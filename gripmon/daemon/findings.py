@@ -28,7 +28,7 @@ from gripmon.laser.report import expectation
 Level = Literal["OK", "WARN", "FAIL"]
 
 _USUAL_SPREAD = 2.0
-"""By how much the bound of one frame in twenty is larger than the foreseen one (no unit; docs/integrity.md)."""
+"""By how much the bound of one frame in twenty is larger than the predicted one (no unit; docs/integrity.md)."""
 
 
 class Finding(NamedTuple):
@@ -203,7 +203,7 @@ def _span(low_mm: float, high_mm: float) -> str:
 
 def _recalibration(values: RecalibrationForecast) -> Finding:
     if not values.possible:
-        text = f"the reference can't be measured anew from the corners in view: {values.reason}"
+        text = f"the reference can't be measured again from the corners in view: {values.reason}"
         return Finding("WARN", "recalibration", text)
     return Finding("OK", "recalibration", f"possible, from {values.corners} corners")
 

@@ -26,7 +26,7 @@ from gripmon.record.write.repair import keep_whole
 from gripmon.record.write.wire import make_scene
 
 RECORDING_PATIENCE_S = 30.0
-"""Images that can wait outrun any camera: they wait so long for the recording, none is dropped (s)."""
+"""Images that can wait outrun any camera: they wait for the recording for this time, and none is dropped (s)."""
 
 
 class RecordedRun:
@@ -82,7 +82,7 @@ class RecordedRun:
         """
         config, reference = self.config, self.config.reference
         if path.resolve() in {source.resolve() for source in self.source.paths}:
-            raise InputError(f"{path}: is what is replayed; another file")
+            raise InputError(f"{path}: is what is replayed; another file", "recording")
         if self.state is not None:
             reference = self.state.references[-1]
         part = path.with_name(f".{path.name}.part")
@@ -94,7 +94,7 @@ class RecordedRun:
         try:
             recorder = ComparedRecorder(part, scene, self.source, _limits(self.recorded_config))
         except OSError as error:
-            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file") from None
+            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
         try:
             yield recorder
         finally:
@@ -182,7 +182,7 @@ def one_recording(path: Path | None, config: Config) -> Iterator[Recorder]:
         try:
             scratch = opened.enter_context(tempfile.TemporaryDirectory(prefix=f".{path.stem}-", dir=path.parent))
         except OSError as error:
-            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file") from None
+            raise InputError(f"{path}: can't be written ({error.strerror or error}); a file", "recording") from None
         recorder = open_recorder(
             settings,
             robot=config.settings.robot,

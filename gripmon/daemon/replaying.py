@@ -87,7 +87,7 @@ def replay(
         start_ns = time.perf_counter_ns()
         try:
             record = monitor.process(frame)
-        except Exception as error:  # noqa: BLE001  said in the record and in the summary
+        except Exception as error:  # noqa: BLE001  reported in the record and in the summary
             record = unmeasured_record(frame, monitor.reference, f"internal error: {in_short(error)}")
         record = msgspec.structs.replace(record, latency_ns=time.perf_counter_ns() - start_ns)
         if monitor.reference.revision != revision:
@@ -205,7 +205,7 @@ class PulseReplay:
         self.length = len(source) if isinstance(source, Sized) else None
 
     def recorded_in(self, path: Path | None) -> AbstractContextManager[None]:
-        """There is no recording of it."""
+        """A second camera's replay makes none."""
         if path is not None:
             right = "gripmon run with source: {kind: folder} and --out records"
             raise InputError(f"is for wrist cameras; {right}", "recording")
@@ -268,7 +268,7 @@ def open_replay(
         run = RecordedRun(paths, given, opened) if recorded else None
         config = given if run is None else run.config
         if config is None:
-            raise InputError(f"{first} is no recording, which alone brings its own configuration; name one", "config")
+            raise InputError(f"{first} isn't a recording, which alone brings its own configuration; name one", "config")
         source = _open_input(first, fps) if run is None else run.source
         opened.callback(source.close)
         for note in [] if run is None else run.notes:
@@ -282,7 +282,7 @@ def _are_recordings(paths: Sequence[Path]) -> bool:
     """Whether these are recordings, rather than images or a video; only recordings may be several."""
     other = next((p for p in paths if not (recordings_below(p) if p.is_dir() else p.suffix.lower() == ".rrd")), None)
     if other is not None and len(paths) > 1:
-        raise InputError(f"{other}: is no .rrd file; one input, or several .rrd files of one run")
+        raise InputError(f"{other}: isn't an .rrd file; one input, or several .rrd files of one run")
     return other is None
 
 

@@ -130,7 +130,7 @@ def _calibration_images(
 
 def _make_empty(path: Path) -> None:
     if any(writable_folder(path).iterdir()):
-        raise InputError(f"{path}: is not empty; a new or empty folder")
+        raise InputError(f"{path}: is not empty; a new or empty folder", "out")
 
 
 def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:

@@ -27,7 +27,7 @@ from gripmon.model.records import (
 _RATE_OVER_FRAMES = 64
 _FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _UPDATE_S = 10.0
-"""Pause between two reasons of what fails: a disk that is gone and then full is news, figures that change are none."""
+"""Pause between two reasons of what fails: a disk that is gone and then full is news; figures that change are not."""
 _SILENCE, _FAILURE, _RECORDING, _OUTPUT = "silence", "failure", "recording", "output"
 _OTHERS, _DROPS = "others", "drops"
 
@@ -54,7 +54,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         msgspec.Meta(gt=0.0, le=1.0, description="more of the frames of 10 s dropped, for want of time: an alert"),
     ] = 0.2
     give_up_after_errors: Annotated[
-        int, msgspec.Meta(ge=1, description="internal errors in so many frames in a row: stop, exit code 3")
+        int, msgspec.Meta(ge=1, description="internal errors in N frames in a row: stop, exit code 3")
     ] = 50
     estimates_budget_bytes: Annotated[
         int,
@@ -70,7 +70,7 @@ class DaemonSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class Judged(NamedTuple):
-    """What is kept of a frame.  ``usable``: it told something; ``refused``: it could not be looked at; ``reason``: what
+    """What is kept of a frame.  ``usable``: it was measured; ``refused``: it could not be looked at; ``reason``: what
     is wrong, if anything.  ``tcp_shift_m``, ``sigma_m`` and ``protection_m`` as in the state message.
     """
 
@@ -148,14 +148,14 @@ class Watch:
         self.errors_in_a_row = self.errors_in_a_row + 1 if failure else 0
         if undelivered:
             silent = Alert(AlertKind.OUTPUT, Cause.UNKNOWN, Severity.ERROR, undelivered)
-            told = self._fails(_OUTPUT, silent, now_s, stamp_ns)
+            alerts = self._fails(_OUTPUT, silent, now_s, stamp_ns)
         else:
-            told = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
+            alerts = list(self._alerts.absent(_OUTPUT, "all outputs take what they are given again", now_s))
         if not failure:
-            return [*told, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
+            return [*alerts, *self._alerts.absent(_FAILURE, "frames are judged again", now_s)]
         self.state, self.verdict, self.message = State.LOST, Verdict.UNKNOWN, failure
         failed = Alert(AlertKind.LOST, Cause.UNKNOWN, Severity.ERROR, failure)
-        return [*told, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
+        return [*alerts, *self._alerts.present(_FAILURE, failed, now_s, stamp_ns)]
 
     def recording(self, failure: str | None, now_s: float, stamp_ns: int) -> list[Alert]:
         """Recording has stopped or thins, as it says itself; the monitor goes on."""
@@ -172,20 +172,20 @@ class Watch:
 
     def dropped(self, count: int, now_s: float, stamp_ns: int) -> list[Alert]:
         """So many frames have come since the start while another one was worked on."""
-        if not (said := self._drops.look(self.frames, count, now_s)):
+        if not (text := self._drops.look(self.frames, count, now_s)):
             return list(self._alerts.absent(_DROPS, "the monitor keeps up with the camera again", now_s))
-        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, said)
+        slow = Alert(AlertKind.STREAM, Cause.TOO_SLOW, Severity.WARNING, text)
         return list(self._alerts.present(_DROPS, slow, now_s, stamp_ns))
 
-    def others(self, said: str, now_s: float, stamp_ns: int) -> list[Alert]:
-        """Other monitors of this name: ``said`` of them, empty while there are none."""
-        if not said:
+    def others(self, text: str, now_s: float, stamp_ns: int) -> list[Alert]:
+        """Other monitors of this name: ``text`` about them, empty while there are none."""
+        if not text:
             return list(self._alerts.absent(_OTHERS, "no other monitor has this name any more", now_s))
-        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, said)
+        several = Alert(AlertKind.SEVERAL, Cause.UNKNOWN, Severity.ERROR, text)
         return list(self._alerts.present(_OTHERS, several, now_s, stamp_ns))
 
     def stopped(self) -> None:
-        """The end: whoever keeps the last state message must not go on trusting the last transform."""
+        """The end: a reader that keeps the last state message must not go on trusting the last transform."""
         self.state, self.verdict, self.message = State.STALE, Verdict.UNKNOWN, "stopped"
 
     @property
@@ -205,7 +205,7 @@ class Watch:
 
     @property
     def _holds(self) -> bool:
-        """Is what was said of the last frame still said?"""
+        """Does the last frame's state still hold?"""
         return self._judged is not None and (self.state, self.verdict) == (self._judged.state, self._judged.verdict)
 
     def standing(self, of_the_monitor: tuple[OpenAlert, ...]) -> tuple[StandingAlert, ...]:
@@ -229,7 +229,7 @@ class Watch:
         return (len(times_s) - 1) / (times_s[-1] - times_s[0])
 
     def _keep_message(self, text: str) -> None:
-        """A reason's figures may change with every frame; it is said again only when its kind changes."""
+        """A reason's figures may change with every frame; it is reported again only when its kind changes."""
         if _kind(text) != _kind(self.message):
             self.message = text
 
@@ -268,7 +268,7 @@ class Drops:
     """Counts over the last seconds; all times are monotonic seconds."""
 
     def __init__(self, allowed_share: float) -> None:
-        """``allowed_share`` of the camera's frames may be dropped; from there on it is said, until they are half."""
+        """``allowed_share`` of the camera's frames may be dropped; beyond that it is reported, until they are half."""
         self._allowed = allowed_share
         self._counts: deque[tuple[float, int, int]] = deque()  # time, frames handled, frames dropped
         self._said = ""

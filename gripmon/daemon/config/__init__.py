@@ -1,6 +1,6 @@
 """A configuration file -> checked, typed settings with the camera, the gripper and the reference that they describe.
 
-Everything that can be wrong is found here, before anything starts, and said in one line: :class:`ConfigError`.
+Everything that can be wrong is found here, before anything starts, and reported in one line: :class:`ConfigError`.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Config:
         settings = self.settings
         if settings.state.file != AUTO:
             return None if settings.state.file is None else self.directory / settings.state.file
-        # What is replayed or simulated begins anew each time, and so does the camera's motion.
+        # What is replayed or simulated begins afresh each time, and so does the camera's motion.
         live = isinstance(settings.source, LiveSettings | NetworkSettings)
         return default_path(settings.robot, settings.camera_name) if live else None
 
@@ -134,8 +134,8 @@ def load_config(
     """Read and check a configuration file.  Raises :class:`ConfigError`.
 
     ``check_source=False`` leaves out whether the source's files exist, for those who bring their own input;
-    ``with_taught=False`` leaves out the taught model, for those who teach anew; ``say_deprecated=False`` logs no
-    warning of settings that have been replaced, for files that nobody can edit.
+    ``with_taught=False`` leaves out the taught model, for those who teach it again; ``say_deprecated=False`` logs no
+    warning of settings that have been replaced, for files that can't be edited.
     """
     path = Path(path)
     values = read_yaml(path)

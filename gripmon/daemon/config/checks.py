@@ -333,7 +333,7 @@ _LARGEST_LIMIT_M = 1.0
 def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings | Fault:
     """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: a warning names both.
 
-    ``values`` is what the file holds: with both of them nobody knows which is meant.
+    ``values`` is what the file holds: with both of them it isn't clear which is meant.
     """
     policy = settings.monitor.policy
     if policy.suspect_sigma_m is None:

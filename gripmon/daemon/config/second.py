@@ -47,7 +47,7 @@ class SecondConfig:
 
 
 def is_second(path: Path) -> bool:
-    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that is no YAML."""
+    """Is this the configuration of a second camera?  Raises :class:`ConfigError` for a file that isn't YAML."""
     return SECTION in read_yaml(path)
 
 
@@ -111,7 +111,7 @@ def _refuse_wrist(path: Path, values: dict[str, Any]) -> None:
 
 
 def _fault_between(settings: SecondSettings) -> Fault | None:
-    """Where frames come from, and how the pulses are told: both recorded, or both live."""
+    """Where frames come from, and the pulses: both recorded, or both live."""
     source, pulses = settings.source, settings.laser.pulses
     if isinstance(source, SimulatedSettings):
         return Fault("source.kind", "is simulator, which shows a gripper and no laser", "folder, video, live or zenoh")

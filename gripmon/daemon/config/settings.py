@@ -134,7 +134,7 @@ class LaserSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     no_spot_alert_after_s: (
         Annotated[
             float,
-            Meta(gt=0.0, description="an alert when no spot could be judged for so long; leave out: never (s)"),
+            Meta(gt=0.0, description="an alert when no spot could be judged for this time; leave out: never (s)"),
         ]
         | None
     ) = None

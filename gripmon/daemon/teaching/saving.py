@@ -210,8 +210,8 @@ class FileSaving:
                 trial.write_text(as_yaml(values), encoding="utf-8")
                 load_config(trial, check_source=False, with_taught="taught" in texts)
             except (ConfigError, yaml.YAMLError, OSError) as error:
-                told = str(error).replace(f"{name}{os.sep}", "")
-                raise SavingRefused(f"the configuration would not be sound: {told}") from None
+                wrong = str(error).replace(f"{name}{os.sep}", "")
+                raise SavingRefused(f"the configuration would not be sound: {wrong}") from None
 
     def _write(self, texts: Mapping[str, str], files: Mapping[str, bytes]) -> dict[str, str]:
         """Each whole or not at all; the configuration last, since it names the others."""

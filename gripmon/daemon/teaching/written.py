@@ -109,14 +109,14 @@ def name_taught(config: Config, taught: Path) -> Config:
 
 def _reference(reference: ReferenceRecord, measured_here: CornerPose | None) -> str:
     transform, covariance = reference.cam_T_grip, list(reference.covariance)
-    said = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
+    meaning = "  # maps gripper coordinates to camera coordinates: x right, y down, z forward"
     lines = ["reference:"]
     if measured_here is not None:
         seen = f"{len(measured_here.corners)} corners of" if measured_here.corners else "the edges in"
         lines.append(f"  # measured from {seen} one image: a plate (gripmon calibrate plane) tells it more exactly")
     lines += [
         f"  id: {yaml_value(reference.reference_id)}  # name of this calibration in messages",
-        f"  cam_T_grip:{said}",
+        f"  cam_T_grip:{meaning}",
         f"    translation_m: {yaml_value(list(transform.translation_m))}  # the TCP in the camera frame: x, y, z (m)",
         f"    rotation_xyzw: {yaml_value(list(transform.rotation_xyzw))}  # unit quaternion x, y, z, w (no unit)",
         "  covariance:  # of its error, 6x6 row by row: TCP's position (m²), then rotation (rad²), camera axes",
@@ -138,8 +138,8 @@ def _jaw(inputs: Inputs, opening_m: float | None, known: bool) -> str:
         return f"jaw:\n  source: {inputs.jaw_source}  # {_FROM_ELSEWHERE[inputs.jaw_source]}"
     openings = [picture.jaw_opening_m for picture in inputs.pictures]
     table = [(Path(p.path).parent / TIMESTAMPS_NAME).exists() for p in inputs.pictures if p.path is not None]
-    told = inputs.jaw_source is None and table and all(table)
-    if told and None not in openings and len(set(table)) == 1 and _in_table(inputs):
+    known_by_table = inputs.jaw_source is None and table and all(table)
+    if known_by_table and None not in openings and len(set(table)) == 1 and _in_table(inputs):
         return f"jaw:\n  source: frames  # {_FROM_ELSEWHERE['frames']}"
     lines = [
         "jaw:",
