@@ -112,7 +112,8 @@ def test_a_known_gripper_from_two_images(here: Path, capsys: pytest.CaptureFixtu
 def test_the_file_says_where_it_comes_from(here: Path):
     assert plane("p0.png", *KNOWN, "--corners", "rough.yaml", "--out", "he.yaml") == 0
     provenance = hand_eye(here / "he.yaml").provenance
-    assert provenance.command.startswith("gripmon calibrate plane p0.png --corners rough.yaml --target circles:12x10")
+    assert provenance.command.startswith("gripmon calibrate plane p0.png --target circles:12x10")
+    assert "--corners rough.yaml" in provenance.command
     assert {i.file: i.sha256 for i in provenance.inputs} == {
         name: sha256_of(here / name) for name in ("p0.png", "camera.yaml", "gripper.yaml", "rough.yaml")
     }
@@ -215,7 +216,7 @@ def one(name: str) -> dict[str, object]:
         (["p0.png", *KNOWN, "--corners", "camera.yaml"], 2, "camera.yaml: schema: unknown key; one of corners"),
         (["p0.png", *KNOWN, "--corners", "outline.yaml"], 2, "corners.left_inner_near: two_box_fingers has no"),
         (["p0.png", *KNOWN, "--corners", "one.yaml"], 2, "one.yaml: 1 corner (L_in_near); at least 2, which lie apart"),
-        (["p0.png", "p1.png", "empty.png", *KNOWN, *["--corners", "rough.yaml"] * 2], 2, "2 files for 3 images"),
+        (["p0.png", "p1.png", "empty.png", *KNOWN, *["--corners", "rough.yaml"] * 2], 2, "--corners: 2 for 3 images"),
         (["p0.png", "p0.png", *KNOWN, "--corners", "rough.yaml"], 2, "p0.png: is the same image as p0.png"),
         (["small.png", *KNOWN, "--corners", "rough.yaml"], 2, "small.png: 384 x 288 px; the camera's 768 x 576 px"),
         (["rough.yaml", *KNOWN, "--corners", "rough.yaml"], 2, "rough.yaml: "),

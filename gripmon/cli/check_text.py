@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gripmon.daemon import forecast_values as forecasts
-    from gripmon.daemon.findings import Finding
-    from gripmon.daemon.surroundings import Joined, Surroundings
+    from gripmon.daemon.findings import Finding, Joined, Surroundings
 
 _POORLY = 2.0  # times less certain than with an exact opening: beyond, the two count as hardly separable
 _JAW_ERROR_M = 1e-5  # an error of the opening for which its effect is given

@@ -61,6 +61,7 @@ class Command:
         self._name, self._summary, self._texts = name, summary, (description, f"examples:\n{examples}")
         self._tables, self._more = {"": (None, options), **(groups or {})}, more
         self.arguments: dict[str, str] = {}  # by name: the option, empty for a positional one
+        self.defaults: dict[str, Any] = {}
         self.prog = ""
 
     def __call__(self, handler: Callable[[argparse.Namespace], int | None]) -> Command:
@@ -110,7 +111,7 @@ class Command:
         elif not value and "choices" not in more:
             keywords["action"] = "store_true"
         group.add_argument(option or name, **(keywords | more))
-        self.arguments[name] = option
+        self.arguments[name], self.defaults[name] = option, keywords.get("default", more.get("default"))
 
 
 def _rows(table: str) -> list[tuple[str, str]]:
@@ -131,7 +132,7 @@ def command_line(arguments: argparse.Namespace, **instead: Any) -> str:
     words = ["gripmon", *command.prog.split()]
     for name, option in command.arguments.items():
         value = instead.get(name, getattr(arguments, name))
-        if name == "json" or value in (None, False, [], 0, ""):
+        if name == "json" or value in (None, False, [], command.defaults[name]):
             continue
         for each in value if isinstance(value, list) else [value]:
             words += [option] if option else []

@@ -211,14 +211,13 @@ def _given(camera: GivenCamera | CameraCalibration | LensSettings) -> GivenCamer
 def _checked_opening(gripper: Gripper, opening_m: float | None) -> float | None:
     if not gripper.has_jaw:
         if opening_m is not None:
-            raise InputError(f"--jaw-opening: {gripper.name} has no jaw; leave it out")
+            raise InputError(f"{gripper.name} has no jaw; leave it out", "jaw_opening_m")
         return None
     if opening_m is None:
         return gripper.jaw_nominal_m
     if not gripper.jaw_min_m <= opening_m <= gripper.jaw_max_m:
-        raise InputError(
-            f"--jaw-opening {opening_m:g}: the gripper's is {gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
-        )
+        span = f"{gripper.jaw_min_m:g} to {gripper.jaw_max_m:g} m"
+        raise InputError(f"{opening_m:g}: the gripper's is {span}", "jaw_opening_m")
     return opening_m
 
 
@@ -242,7 +241,7 @@ def _for_each(corners: Rough | Sequence[Rough] | None, images: int) -> Sequence[
     if corners is None or isinstance(corners, Mapping):
         return [corners] * images
     if len(corners) not in (1, images):
-        raise InputError(f"rough corners {len(corners)} times for {images} images; once for all, or for each")
+        raise InputError(f"{len(corners)} for {images} images; one for all, or one for each", "corners")
     return list(corners) * (images if len(corners) == 1 else 1)
 
 

@@ -91,7 +91,7 @@ class FileSaving:
             model, notes = self._taught(order, found, reference, pictures, files)
             texts["taught"] = to_yaml(model)
         if "config" in wanted and reference is not None:
-            texts["config"] = self._config(order, found, reference, model is not None)
+            texts["config"] = self._config(order, found, model is not None)
         self._try_out(order, found, texts)
         written = self._write(texts, files if order.taught else {})
         config_path = paths["config"] if self._inputs.config is not None or "config" in texts else None
@@ -168,22 +168,11 @@ class FileSaving:
             lines[-1] = "corners: {}"
         return "\n".join(lines) + "\n"
 
-    def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
+    def _config(self, order: SaveOrder, found: Found, taught: bool) -> str:
         given = self._inputs.config
         if given is not None:
             return with_taught(given.path, self._relative(self._paths["taught"], given.directory))
-        return config_text(
-            self._inputs,
-            robot=order.robot,
-            camera_name=order.camera_name,
-            reference=reference,
-            measured_here=found.pose,
-            taught=TAUGHT if taught else None,
-            gripper=self._relative(self._inputs.gripper_path),
-            jaw_opening_m=found.snapped.jaw_opening_m,
-            jaw_known=order.put.jaw_opening_m is not None,
-            folder=self._relative,
-        )
+        return config_text(self._inputs, order, found, TAUGHT if taught else None, self._relative)
 
     def _relative(self, path: Path, to: Path | None = None) -> str:
         """As a configuration in ``to``, or the folder written to, names it."""

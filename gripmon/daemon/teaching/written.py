@@ -22,7 +22,9 @@ from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
+from gripmon.teach.edges.bench import Found
 from gripmon.teach.edges.corner_pose import CornerPose
+from gripmon.teach.page import SaveOrder
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""
@@ -31,30 +33,20 @@ _AS_THEY_ARE = ("monitor", "publish", "ros2", "recording", "metrics", "daemon", 
 
 
 def config_text(
-    inputs: Inputs,
-    *,
-    robot: str,
-    camera_name: str,
-    reference: ReferenceRecord,
-    measured_here: CornerPose | None,
-    taught: str | None,
-    gripper: str,
-    jaw_opening_m: float | None,
-    jaw_known: bool,
-    folder: Callable[[Path], str],
+    inputs: Inputs, order: SaveOrder, found: Found, taught: str | None, folder: Callable[[Path], str]
 ) -> str:
-    """A whole file; ``folder`` names a path as the file does."""
+    """A whole file; ``folder`` names a path as the file does, ``taught`` is the taught model's name (None: none)."""
     source = inputs.source
-    assert source is not None
+    assert source is not None and found.reference is not None
     parts = [
         f"# Written by: {inputs.command} (gripmon {__version__})",
         _UNITS,
-        f"robot: {yaml_value(robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
-        f"camera_name: {yaml_value(camera_name)}  # name of the camera in the Zenoh keys",
+        f"robot: {yaml_value(order.robot)}  # name of the robot in the Zenoh keys gripmon/<robot>/<camera_name>/…",
+        f"camera_name: {yaml_value(order.camera_name)}  # name of the camera in the Zenoh keys",
         "",
         *_camera(inputs, folder),
         "",
-        f"gripper: {yaml_value(gripper)}  # path of the gripper file, relative to this file",
+        f"gripper: {yaml_value(folder(inputs.gripper_path))}  # path of the gripper file, relative to this file",
     ]
     if taught is not None:
         parts.append(f"taught: {yaml_value(taught)}  # what its edges really look like; relative to this file")
@@ -62,18 +54,15 @@ def config_text(
         there = yaml_value(folder(inputs.calibrations["reference"]))
         parts += ["", f"reference: {there}  # file of gripmon calibrate plane, relative to this file; or a section"]
     else:
-        parts += ["", _reference(reference, measured_here)]
+        parts += ["", _reference(found.reference, found.pose)]
     parts += ["", "source:"]
     if isinstance(source, FolderSettings):
-        parts += [
-            "  kind: folder  # images in a folder",
-            f"  path: {yaml_value(folder(Path(source.path)))}  # relative",
-        ]
-        parts[-1] += " to this file"
+        place = yaml_value(folder(Path(source.path)))
+        parts += ["  kind: folder  # images in a folder", f"  path: {place}  # relative to this file"]
     else:
         parts.append(lines_of(source, 2))
     if inputs.bench.gripper.has_jaw:
-        parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
+        parts += ["", _jaw(inputs, found.snapped.jaw_opening_m, order.put.jaw_opening_m is not None)]
     parts += ["", _defaults()]
     return "\n".join(parts) + "\n"
 
