@@ -255,7 +255,7 @@ BAD: list[tuple[tuple[object, ...], str]] = [
     (("export", "camera.yaml", "--format", "ros", "--camera-frame", "x"), "--camera-frame: has no meaning"),
     (("export", "hand_eye.yaml", "--format", "json", "--robot-base-frame", "x"), "--robot-base-frame: has no meaning"),
     (("export", "hand_eye.yaml", "--format", "urdf", "--camera-frame", "a b"), "camera_frame: 'a b' is no frame's"),
-    (("export", "hand_eye.yaml", "--format", "urdf", "--name", "a b"), "--name a b: isn't a plain name"),
+    (("export", "hand_eye.yaml", "--format", "urdf", "--name", "a b"), "--name: a b: isn't a plain name"),
     (("export", "camera.yaml", "--format", "ros", "--out", "camera.yaml"), "camera.yaml: is there already"),
     (("export", "nothing.yaml", "--format", "ros"), "nothing.yaml: there is no such file"),
     (("export", "gripper.yaml", "--format", "ros"), "gripper.yaml: holds no calibration"),

@@ -186,13 +186,15 @@ def test_an_output_that_cannot_be_written_is_said_before_work_begins(
 ):
     arguments = ["replay", str(sequence), "--config", str(sequence / "config.yaml"), "--out", str(tmp_path)]
     assert main(arguments) == 2
-    assert "can't be written" in capsys.readouterr().err
+    assert capsys.readouterr().err.splitlines() == [f"--out {tmp_path}: is a folder; a file"]
 
 
 def test_a_recording_that_cannot_be_written_is_said_before_work_begins(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    replayed(sequence, tmp_path / "out.jsonl", "--recording", str(tmp_path), code=2)
+    config, out = str(sequence / "config.yaml"), tmp_path / "out.jsonl"
+    assert main(["replay", str(sequence), "--config", config, "--out", str(out), "--recording", str(tmp_path)]) == 2
+    assert not out.exists()
     assert capsys.readouterr().err.splitlines() == [f"--recording {tmp_path}: is a folder; a file"]
 
 

@@ -188,13 +188,13 @@ def test_a_sweep_in_which_nothing_works_says_why(tmp_path: Path, capsys: pytest.
         (["--sweep", "--tilt", "ten"], "--tilt ten: isn't a range"),
         (["--sweep", "--tilt=-10"], "-10 degrees is out of bounds"),
         (["--sweep", "--fov", "200"], "200 degrees is out of bounds"),
-        (["--sweep", "--focal", "4"], "--focal 4: fx_px: 4 px is no focal length"),
+        (["--sweep", "--focal", "4"], "--focal: fx_px: 4 px is no focal length"),
         (["--sweep", "--at", "384"], "--at 384: isn't a point of the image"),
         (["--sweep", "--at", "384,700"], "--at: lies at (384.0, 700.0) px, outside of the image"),
         (["--sweep", "--at", "nan,3"], "outside of the image"),
         (["--sweep", "--tilt", "0:80:100", "--roll", "0:90:50"], "45000 mounts; at most 20000"),
-        (["--sweep", "--picture", "sweep.gif"], "--picture sweep.gif: is no kind of picture; .png or .jpg"),
-        (["--sweep", "--picture", "/nowhere/sweep.png"], "--picture /nowhere/sweep.png: can't be written"),
+        (["--sweep", "--picture", "sweep.gif"], "--picture sweep.gif: has no known ending; .png or .jpg"),
+        (["--sweep", "--picture", f"{DEMO}/sweep.png"], f"--picture {DEMO}: can't be made"),
     ],
 )  # fmt: skip
 def test_bad_input_is_said_in_one_line(options: list[str], said: str, capsys: pytest.CaptureFixture[str]):

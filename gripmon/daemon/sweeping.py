@@ -138,7 +138,7 @@ def sweep(
             raise InputError("the gripper's jaw doesn't move; leave it out", "jaw")
         if not gripper.jaw_min_m <= travel_m[0] < travel_m[1] <= gripper.jaw_max_m:
             right = f"MIN:MAX in metres, within {gripper.jaw_min_m:g}:{gripper.jaw_max_m:g}"
-            raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g} is not in the jaw's travel; {right}", "jaw")
+            raise InputError(f"{travel_m[0]:g}:{travel_m[1]:g}: is not in the jaw's travel; {right}", "jaw")
     opening_m, trials = config.jaw_opening_m, []
     mount, cam_T_grip = Mount.of(config.cam_T_grip), config.cam_T_grip
     present = try_mount(rig_of(config), mount, -1, cam_T_grip, opening_m, travel_m)
