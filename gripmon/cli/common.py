@@ -28,9 +28,7 @@ NETWORK_OPTIONS = f"""
 """
 """Of the commands that join the network as a client, which say whose endpoint it is."""
 
-_PATH = re.compile(
-    r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml"
-)  # an argument of such a name is one
+_PATHS = re.compile(r"FILE|DIR|CONFIG|CALIBRATION|DATA|IMAGE|INPUT|RECORDING|[A-Z]+\.yaml")
 _NUMBERS = {"": None, "...": "+", "[]": "?", "[...]": "*"}
 _PICTURES = (".png", ".jpg", ".jpeg")
 _LARGEST_SEED = 2**32 - 1
@@ -102,7 +100,7 @@ class Command:
         keywords: dict[str, Any] = {"help": text}
         if metavar:
             keywords["metavar"] = metavar
-        if _PATH.match(metavar):
+        if _PATHS.match(metavar):
             keywords["type"] = Path
         if not option:
             keywords["nargs"] = _NUMBERS[re.sub(r"[^][.]", "", word.replace(metavar, ""))]
@@ -111,7 +109,7 @@ class Command:
         elif not value and "choices" not in more:
             keywords["action"] = "store_true"
         group.add_argument(option or name, **(keywords | more))
-        self.arguments[name], self.defaults[name] = option, keywords.get("default", more.get("default"))
+        self.arguments[name], self.defaults[name] = option, more.get("default")
 
 
 def _rows(table: str) -> list[tuple[str, str]]:

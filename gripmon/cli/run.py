@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from gripmon.cli.common import Command, make_directory, positive_number
+from gripmon.cli.common import Command, positive_number
 from gripmon.model.stopping import signals_exit
 
 VIEW = {"nargs": "?", "const": "auto", "choices": ("auto", "web", "native", "server")}
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         return run_file(
             arguments.config,
-            out=None if arguments.out is None else make_directory(arguments.out),
+            out=arguments.out,
             duration_s=arguments.duration,
             verbose=arguments.verbose,
             fresh_state=arguments.fresh_state,

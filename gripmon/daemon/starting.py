@@ -21,6 +21,7 @@ from gripmon.daemon.network import open_network, open_second_network, with_sourc
 from gripmon.daemon.recorded_run import RECORDING_PATIENCE_S
 from gripmon.daemon.running import log_to_stderr, run, run_second
 from gripmon.judge.statefile import StateFile, StateFileError
+from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Alert, AlertKind, Cause, MonitorState, Severity
 from gripmon.model.stopping import StopRequest
@@ -46,7 +47,7 @@ def run_file(
 ) -> int:
     """Run the daemon on a configuration file, a wrist camera's or a second camera's; returns the exit code.
 
-    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``).  ``view``: "auto", "web", "native"
+    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``: "auto", "web", "native"
     or "server"; the rest as in :func:`run_monitor`.
     """
     config = load_second(path) if is_second(path) else load_config(path)
@@ -55,7 +56,7 @@ def run_file(
         raise InputError(f"is for wrist cameras, {path} is a second camera's; leave it out", "fresh_state")
     look_ahead(config)
     if out is not None:
-        lines = out / ("spots.jsonl" if second else "estimates.jsonl")
+        lines = writable_folder(out) / ("spots.jsonl" if second else "estimates.jsonl")
         try:
             lines.open("ab").close()
         except OSError as error:

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
-import numpy as np
 
+from gripmon.daemon.calibrations import read_given_camera
 from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
-from gripmon.daemon.config.calibrated import mismatch, read_camera, read_hand_eye
+from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
 from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
 from gripmon.daemon.config.typed import Fault
@@ -181,11 +181,10 @@ def _read_lens(path: Path) -> tuple[LensSettings, CameraError | None]:
     if "model" in values and "schema" not in values:
         lens: LensSettings = read_settings(path, LensSettings, values)  # type: ignore[arg-type]
         return lens, None
-    made = read_camera(path)
-    if not made.parameters:
-        return made.camera, None
-    count = len(made.parameters)
-    return made.camera, CameraError(made.parameters, np.reshape(made.covariance, (count, count)))
+    given = read_given_camera(path)
+    if given.covariance is None or not given.parameters:
+        return given.lens, None
+    return given.lens, CameraError(given.parameters, given.covariance)
 
 
 def _hand_eye(path: Path, lens: LensSettings | None, gripper: Gripper) -> tuple[LensSettings, ReferenceRecord]:
