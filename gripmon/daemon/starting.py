@@ -47,8 +47,8 @@ def run_file(
 ) -> int:
     """Run the daemon on a configuration file, a wrist camera's or a second camera's; returns the exit code.
 
-    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``: "auto", "web", "native"
-    or "server"; the rest as in :func:`run_monitor`.
+    ``out`` is a folder for the recording and ``estimates.jsonl`` (``spots.jsonl``), made if it is missing.  ``view``:
+    "auto", "web", "native" or "server"; the rest as in :func:`run_monitor`.
     """
     config = load_second(path) if is_second(path) else load_config(path)
     second = isinstance(config, SecondConfig)
