@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import msgspec
 import numpy as np
@@ -19,6 +19,7 @@ import numpy as np
 from gripmon import __version__
 from gripmon.analyse.comparison import Comparison, compare
 from gripmon.daemon.config import Config, builtin_config, load_config, load_scenario
+from gripmon.daemon.config.yaml_file import lines_of, yaml_value
 from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.atomic import writable_folder
 from gripmon.model.errors import InputError
@@ -155,46 +156,25 @@ def next_step(kind: str, made: SimulatedImages, gripper: Gripper) -> str:
 
 def _config_text(config: Config, scenario: Scenario, seed: int) -> str:
     """A configuration for the sequence, commented, in the form of the hand-written ones."""
-    camera = msgspec.to_builtins(config.settings.camera)
-    x, y, z, w = config.reference.cam_T_grip.rotation_xyzw
-    lens = "\n".join(f"  {key}: {_yaml(value)}  # {_LENS_UNITS[key]}" for key, value in camera.items())
+    reference = config.reference.cam_T_grip
     jaw = "frames" if config.gripper.has_jaw and scenario.jaw.reported else "fixed"
     return f"""\
 # Written by: gripmon simulate {scenario.name} --seed {seed} (gripmon {__version__})
 robot: simulated  # name of the robot in the Zenoh keys
 camera_name: wrist  # name of the camera in the Zenoh keys
 camera:
-{lens}
+{lines_of(config.settings.camera, 2)}
 gripper: gripper.yaml  # path of the gripper file, relative to this file
 reference:
   cam_T_grip:  # what a perfect calibration gave at the beginning: maps gripper coordinates to camera coordinates
-    translation_m: {_yaml(list(config.reference.cam_T_grip.translation_m))}  # x, y, z (m)
-    rotation_xyzw: {_yaml([x, y, z, w])}  # unit quaternion x, y, z, w
+    translation_m: {yaml_value(reference.translation_m)}  # x, y, z (m)
+    rotation_xyzw: {yaml_value(reference.rotation_xyzw)}  # unit quaternion x, y, z, w
 jaw:
   source: {jaw}  # the opening comes with each frame (timestamps.csv), or is the nominal one if fixed
 source:
   kind: folder  # images in a folder
   path: .  # the folder, relative to this file
 """
-
-
-_LENS_UNITS = {
-    "model": "lens model: paper, brown_conrady or fisheye",
-    "width_px": "image width (px)",
-    "height_px": "image height (px)",
-    "fx_px": "focal length over the pixel's width (px)",
-    "fy_px": "focal length over the pixel's height (px)",
-    "cx_px": "column of the principal point (px)",
-    "cy_px": "row of the principal point (px)",
-    "kappa_per_px2": "radial distortion (1/px²)",
-    "coefficients": "distortion in OpenCV's order (no unit)",
-}
-
-
-def _yaml(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_yaml, value))}]"
-    return repr(value) if isinstance(value, float) else str(value)
 
 
 class Latency(msgspec.Struct, frozen=True):

@@ -17,9 +17,9 @@ from gripmon import __version__
 from gripmon.calibrate.detection.pictures import sharpest_blur_px, to_grey
 from gripmon.calibrate.detection.target import BLURRED_PX
 from gripmon.daemon.config import ConfigError, load_config
-from gripmon.daemon.config.yaml_file import as_yaml, read_yaml
+from gripmon.daemon.config.yaml_file import as_yaml, read_yaml, yaml_value
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough
-from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
+from gripmon.daemon.teaching.written import config_text, with_taught
 from gripmon.io.sources import SourceError, open_source
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError, NoResultError
