@@ -17,7 +17,7 @@ from gripmon.daemon.config.checks import (
     View,
     covariance_of,
     jaw_fault,
-    joined_or_fault,
+    joined,
     monitor_fault,
     network_fault,
     order_fault,
@@ -144,10 +144,10 @@ def load_config(
         raise ConfigError(path, SECTION, "makes this the configuration of a second camera", right)
     values, calibrated = with_sections(path, values)
     settings = read_settings(path, Settings, values)
-    found = with_alert_limit(path, values, settings, say=say_deprecated)
-    if isinstance(found, Fault):
-        raise ConfigError.of(path, found)
-    settings = found
+    try:
+        settings = with_alert_limit(path, values, settings, say=say_deprecated)
+    except SettingsError as error:
+        raise ConfigError.of(path, error.fault) from None
     camera = _camera(path, settings, calibrated)
     gripper_path = path.parent / settings.gripper
     gripper = _gripper(path, gripper_path)
@@ -176,10 +176,10 @@ def check_network(config: Config | SecondConfig) -> Joining | None:
     It finds what only matters to those who join it: files of Zenoh's, endpoints, packages for ROS 2.  Raises
     :class:`ConfigError`.
     """
-    found = joined_or_fault(config.settings, config.camera, config.directory)
-    if isinstance(found, Fault):
-        raise ConfigError.of(config.path, found)
-    return found
+    try:
+        return joined(config.settings, config.camera, config.directory)
+    except SettingsError as error:
+        raise ConfigError.of(config.path, error.fault) from None
 
 
 def builtin_config(name: str) -> Path:
@@ -230,12 +230,11 @@ def _reference(path: Path, settings: Settings, gripper: Gripper, calibrated: Cal
     fault = None if calibrated.hand_eye is None else calibrated_mismatch(calibrated.hand_eye, settings.camera, gripper)
     if fault is not None:
         raise ConfigError.of(file, fault)
-    cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
-    for found in (cam_T_grip, covariance):
-        if isinstance(found, Fault):
-            key = found.key if file is path else found.key.removeprefix("reference.")
-            raise ConfigError.of(file, found._replace(key=key))
-    assert not isinstance(cam_T_grip, Fault) and not isinstance(covariance, Fault)
+    try:
+        cam_T_grip, covariance = reference_transform(settings.reference), covariance_of(settings.reference)
+    except SettingsError as error:
+        key = error.fault.key if file is path else error.fault.key.removeprefix("reference.")
+        raise ConfigError.of(file, error.fault._replace(key=key)) from None
     transform = to_record(cam_T_grip)
     name = settings.reference.id or f"config-{hashlib.sha256(to_json(transform)).hexdigest()[:8]}"
     return ReferenceRecord(name, 0, 0, "configuration", transform, covariance)

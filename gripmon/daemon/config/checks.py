@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, SecondSettings, Settings
-from gripmon.daemon.config.typed import Fault
+from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
 from gripmon.io.ros2 import JOINT_STATE, Ros2Missing, RosNameError, network_of, subscription_key
 from gripmon.io.ros2.types import typestore
@@ -62,51 +62,46 @@ class View:
     edges_visible: NDArray[np.bool_]
 
 
-def reference_transform(settings: ReferenceSettings) -> Array | Fault:
-    """``cam_T_grip`` (4, 4) of a reference, or what is wrong with it by itself."""
+def reference_transform(settings: ReferenceSettings) -> Array:
+    """``cam_T_grip`` (4, 4) of a reference; :class:`SettingsError` for one that is wrong by itself."""
     x, y, z, w = settings.cam_T_grip.rotation_xyzw
     length = math.sqrt(x * x + y * y + z * z + w * w)
-    key = "reference.cam_T_grip.rotation_xyzw"
     if abs(length - 1.0) > _UNIT_TOLERANCE:
-        return Fault(
-            key, f"has length {length:.4g}", "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
-        )
+        right = "a unit quaternion x, y, z, w (Euler angles or another order were given?)"
+        raise SettingsError(Fault("reference.cam_T_grip.rotation_xyzw", f"has length {length:.4g}", right))
     translation_m = np.array(settings.cam_T_grip.translation_m)
-    key = "reference.cam_T_grip.translation_m"
-    distance_m = float(np.linalg.norm(translation_m))
+    distance_m, depth_m = float(np.linalg.norm(translation_m)), float(translation_m[2])
+    wrong, right = "", "metres, e.g. [0.0, 0.0, 0.12]"
     if distance_m > FARTHEST_M:
-        return Fault(
-            key,
-            f"puts the TCP {distance_m:g} m from the camera",
-            f"metres, e.g. [0.0, 0.0, 0.12] ({_as_millimetres(distance_m)})",
-        )
-    if translation_m[2] <= 0.0:
-        return Fault(key, f"puts the TCP behind the camera (z = {translation_m[2]:g} m)", _IN_FRONT)
-    if translation_m[2] < NEAREST_M:
-        return Fault(
-            key, f"puts the TCP {1e3 * translation_m[2]:g} mm before the camera", "metres, e.g. [0.0, 0.0, 0.12]"
-        )
+        unit = f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
+        wrong, right = f"puts the TCP {distance_m:g} m from the camera", f"{right} ({unit})"
+    elif depth_m <= 0.0:
+        wrong, right = f"puts the TCP behind the camera (z = {depth_m:g} m)", _IN_FRONT
+    elif depth_m < NEAREST_M:
+        wrong = f"puts the TCP {1e3 * depth_m:g} mm before the camera"
+    if wrong:
+        raise SettingsError(Fault("reference.cam_T_grip.translation_m", wrong, right))
     return make_transform(rotation_from_xyzw((x, y, z, w)), translation_m)
 
 
-def covariance_of(settings: ReferenceSettings) -> tuple[float, ...] | Fault:
-    """The reference's covariance, row by row, or what is wrong with it."""
+def covariance_of(settings: ReferenceSettings) -> tuple[float, ...]:
+    """The reference's covariance, row by row; :class:`SettingsError` for one that can't be."""
     if settings.covariance is None:
         variances = [settings.position_sigma_m**2] * 3 + [settings.rotation_sigma_rad**2] * 3
         return tuple(np.diag(variances).ravel().tolist())
     matrix = np.array(settings.covariance).reshape(6, 6)
-    scale = np.sqrt(np.abs(np.diag(matrix)))
-    key, right = (
-        "reference.covariance",
-        "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)",
-    )
+    scale, wrong = np.sqrt(np.abs(np.diag(matrix))), ""
     if not (scale > 0.0).all():
-        return Fault(key, "has a variance of zero", right)
-    normalised = matrix / np.outer(scale, scale)
-    if np.abs(normalised - normalised.T).max() > 1e-6:
-        return Fault(key, "is not symmetric", right)
-    if np.linalg.eigvalsh(normalised).min() <= 0.0:
-        return Fault(key, "is not positive definite", right)
+        wrong = "has a variance of zero"
+    else:
+        normalised = matrix / np.outer(scale, scale)
+        if np.abs(normalised - normalised.T).max() > 1e-6:
+            wrong = "is not symmetric"
+        elif np.linalg.eigvalsh(normalised).min() <= 0.0:
+            wrong = "is not positive definite"
+    if wrong:
+        right = "a symmetric 6x6 matrix with positive eigenvalues, position (m²) then rotation (rad²)"
+        raise SettingsError(Fault("reference.covariance", wrong, right))
     return settings.covariance
 
 
@@ -165,10 +160,6 @@ def view_fault(view: View, gripper: Gripper, camera: Camera) -> Fault | None:
             f"a calibration that shows at least {FEWEST_CORNERS_IN_VIEW} corners that no face hides",
         )
     return None
-
-
-def _as_millimetres(distance_m: float) -> str:
-    return f"{distance_m:g} mm were meant?" if distance_m < 1000.0 * FARTHEST_M else "another unit was meant?"
 
 
 class _Pair(NamedTuple):
@@ -295,10 +286,10 @@ def _joint_fault(jaw: JawSettings) -> Fault | None:
     return None
 
 
-def joined_or_fault(settings: Settings | SecondSettings, camera: Camera, directory: Path) -> Joining | Fault | None:
-    """How the network would be joined, or why it can't be; None if it won't.  Paths count from ``directory``."""
+def joined(settings: Settings | SecondSettings, camera: Camera, directory: Path) -> Joining | None:
+    """How the network would be joined; None if it won't be.  :class:`SettingsError` where it can't be."""
     if (missing := package_fault(settings.metrics)) is not None:
-        return Fault(*missing)
+        raise SettingsError(Fault(*missing))
     if not settings.publish.enabled:
         return None
     wrist, source, key = settings if isinstance(settings, Settings) else None, settings.source, ""
@@ -314,7 +305,7 @@ def joined_or_fault(settings: Settings | SecondSettings, camera: Camera, directo
             key = "source."
             PayloadDecoder(source.format, (camera.width_px, camera.height_px))
     except (PublishError, Ros2Missing, SourceError) as error:
-        return _split(f"{key}{error}")
+        raise SettingsError(_split(f"{key}{error}")) from None
     return found
 
 
@@ -330,7 +321,7 @@ _SECTION = "monitor.policy"
 _LARGEST_LIMIT_M = 1.0
 
 
-def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings | Fault:
+def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, say: bool) -> Settings:
     """The settings with ``alert_limit_m`` in place of ``suspect_sigma_m``; ``say``: a warning names both.
 
     ``values`` is what the file holds: with both of them it isn't clear which is meant.
@@ -340,10 +331,11 @@ def with_alert_limit(path: Path, values: dict[str, Any], settings: Settings, *, 
         return settings
     limit_m = round(policy.position_limit_m, 6)
     if _NEW in values["monitor"]["policy"]:
-        return Fault(f"{_SECTION}.{_OLD}", f"stands beside {_NEW}, which replaces it", f"{_NEW} alone")
+        wrong = f"stands beside {_NEW}, which replaces it"
+        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW} alone"))
     if not 0.0 < limit_m <= _LARGEST_LIMIT_M:
         wrong = f"{policy.suspect_sigma_m:g} stands for {_NEW}: {limit_m:g}, which is not within 0 and 1"
-        return Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task bears (m)")
+        raise SettingsError(Fault(f"{_SECTION}.{_OLD}", wrong, f"{_NEW}, the error that the task bears (m)"))
     if say:
         _log.warning(
             "%s: %s.%s: %g is deprecated; write %s: %g, which it stands for",

@@ -19,7 +19,7 @@ from gripmon.daemon.config import Config, ConfigError, load_config, read_gripper
 from gripmon.daemon.config.calibrated import mismatch, read_hand_eye
 from gripmon.daemon.config.checks import covariance_of, predict_view, reference_transform, view_fault
 from gripmon.daemon.config.settings import ReferenceSettings, TransformSettings
-from gripmon.daemon.config.typed import Fault
+from gripmon.daemon.config.typed import SettingsError
 from gripmon.daemon.config.yaml_file import read_settings, read_yaml
 from gripmon.io.sources import FolderSettings, LiveSettings
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -207,10 +207,11 @@ def _check_view(camera: Camera, gripper: Gripper, reference: ReferenceRecord, na
         cam_T_grip=TransformSettings(translation_m=transform.translation_m, rotation_xyzw=transform.rotation_xyzw),
         covariance=reference.covariance,
     )
-    pose, covariance = reference_transform(settings), covariance_of(settings)
-    fault = pose if isinstance(pose, Fault) else covariance if isinstance(covariance, Fault) else None
-    if fault is None and not isinstance(pose, Fault):
-        fault = view_fault(predict_view(camera, gripper, pose, None), gripper, camera)
+    try:
+        cam_T_grip, _ = reference_transform(settings), covariance_of(settings)
+        fault = view_fault(predict_view(camera, gripper, cam_T_grip, None), gripper, camera)
+    except SettingsError as error:
+        fault = error.fault
     if fault is not None:
         raise InputError(f"{name}: {fault.key.removeprefix('reference.')}: {fault.wrong}; {fault.right}", "reference")
 
