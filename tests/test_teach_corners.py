@@ -349,7 +349,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         ([image, *given, "--corners", tmp_path / "flat.yaml"], "corners.L_in_near: has 1 values"),
         ([image, *given, "--corners", tmp_path / "none.yaml"], "there is no such file"),
         ([image, "--gripper", gripper], "teach: --config is missing"),
-        ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera goes with --page"),
+        ([image, "--config", rig.folder / "made_with.yaml", "--camera", camera], "--camera: goes with --page"),
         ([], "no image"),
     ):
         code, out, err = run(["teach", *arguments], capsys)
