@@ -12,8 +12,8 @@ from types import CodeType, FrameType
 from support.loopback import free_endpoint
 
 import gripmon
-from gripmon.daemon import run
 from gripmon.daemon.config import builtin_config, load_config
+from gripmon.daemon.running import run
 from gripmon.io.publish import ZenohPublisher
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.geometry import from_record
