@@ -356,7 +356,7 @@ def test_bad_input_is_one_line_and_exit_2(rig: Rig, tmp_path: Path, capsys):
         assert (code, out) == (2, ""), (arguments, err)
         assert said in err and len(err.splitlines()) == 1, err
     code, out, err = run(["teach", image, "--page", "--port", "70000"], capsys)
-    assert code == 2 and "no port" in err
+    assert code == 2 and "isn't a port" in err
     assert run(["teach", image, "--page", "--robot", "a/b"], capsys)[0] == 2
 
 
