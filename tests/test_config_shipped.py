@@ -11,7 +11,7 @@ import pytest
 from gripmon.daemon.config import ConfigError, builtin_config, is_second, load_config, load_scenario, load_second
 from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import Outlook, expect
+from gripmon.teach.accuracy import Outlook, expect
 
 ROOT = Path(__file__).resolve().parent.parent
 GRIPPERS = ROOT / "configs" / "grippers"

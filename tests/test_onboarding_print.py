@@ -17,8 +17,8 @@ from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.targets import Target
-from gripmon.teach.onboarding import UnknownGripper
-from gripmon.teach.onboarding.plate_print import plate_print
+from gripmon.teach.hand_eye import UnknownGripper
+from gripmon.teach.plate_print import plate_print
 
 TRUE = nominal_cam_T_grip()
 

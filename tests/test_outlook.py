@@ -19,7 +19,7 @@ from gripmon.daemon.config import builtin_config
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import Outlook, expect, weakest_direction
+from gripmon.teach.accuracy import Outlook, expect, weakest_direction
 from gripmon.track.edges import MeasurementSettings
 
 

@@ -15,7 +15,8 @@ from gripmon.cli import main
 from gripmon.daemon.config import builtin_config, load_config
 from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Protection
-from gripmon.teach.forecast import Promise, Rig, foresee_frame, promise
+from gripmon.teach.accuracy import Promise, foresee_frame, promise
+from gripmon.teach.visibility import Rig
 
 DEMO = builtin_config("demo.yaml")
 

@@ -18,17 +18,9 @@ from gripmon.model.gripper import load_gripper
 from gripmon.monitor import MonitorSettings, Tracker
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook
-from gripmon.teach.forecast import (
-    Mount,
-    Rig,
-    expect,
-    field_of_view_rad,
-    moved_camera,
-    see,
-    towards,
-    try_mount,
-    with_focal,
-)
+from gripmon.teach.accuracy import expect
+from gripmon.teach.mounts import Mount, field_of_view_rad, towards, try_mount, with_focal
+from gripmon.teach.visibility import Rig, moved_camera, see
 from gripmon.track.edges.prediction import lay_out
 
 AT_PX = (386.0, 298.0)

@@ -27,11 +27,10 @@ from gripmon.model.provenance import Provenance
 from gripmon.monitor import MonitorSettings
 from gripmon.simulate import Simulator
 from gripmon.simulate.scenario import JawScript, Sensor
-from gripmon.teach.edges import TeachingImage
-from gripmon.teach.edges.bench import Bench
-from gripmon.teach.edges.corner_pose import CameraError, PoseRefused, pose_from_corners
-from gripmon.teach.edges.placing import place, usual_view
-from gripmon.teach.forecast import expect
+from gripmon.teach.accuracy import expect
+from gripmon.teach.corner_pose import CameraError, PoseRefused, place, pose_from_corners, usual_view
+from gripmon.teach.session import Bench
+from gripmon.teach.views import TeachingImage
 from gripmon.track.edges.taught import gripper_digest
 
 INNER = ("L_in_near", "L_in_far", "R_in_near", "R_in_far")

@@ -22,9 +22,10 @@ from gripmon.daemon.calibrations import read_rough_corners
 from gripmon.io.sources import Waiting
 from gripmon.model.records import Frame
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.edges.bench import Bench, Found
-from gripmon.teach.page import Desk, PageServer, Picture, RoughDesk, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page.desk import BadRequest, Labels
+from gripmon.teach.api import Picture
+from gripmon.teach.messages import Saved, SaveOrder
+from gripmon.teach.page_server import PageServer, RoughDesk
+from gripmon.teach.session import BadRequest, Bench, Desk, Found, Labels, SavingRefused
 
 LABELS = Labels("arm", "wrist", False, "/there", {"config": "c", "taught": "t", "corners": "k"}, None, None)
 DEADLINE_S = 30.0

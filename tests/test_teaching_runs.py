@@ -20,7 +20,8 @@ from gripmon.model.records import AlertKind, Frame
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.scenario import FingerLook, Scenario, Sensor
-from gripmon.teach.edges import TeachingImage, teach
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage
 from gripmon.track.edges import MeasurementSettings, TaughtEdges
 
 POSE = nominal_cam_T_grip()

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.model.gripper import Gripper
     from gripmon.model.provenance import Provenance
-    from gripmon.teach.hand_eye import HandEyeOnPlate
-    from gripmon.teach.onboarding import Look
+    from gripmon.teach.hand_eye import HandEyeOnPlate, Look
 
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the

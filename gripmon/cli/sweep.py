@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from gripmon.daemon.config import Config
     from gripmon.model.camera import Camera
-    from gripmon.teach.forecast import Grid
+    from gripmon.teach.mounts import Grid
 
 _MOST_VALUES, _MOST_MOUNTS = 100, 20000
 _NEAREST_M, _FARTHEST_M = 0.005, 5.0
@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
         _check_picture(picture)
     from gripmon.daemon.forecast import rig_of
     from gripmon.daemon.sweeping import as_plain, sweep
-    from gripmon.teach.forecast.picture import draw_sweep
+    from gripmon.teach.mount_picture import draw_sweep
 
     with common.progress_bar(len(grid), "mount") as step:
         swept = sweep(config, grid, at_px, travel_m, step)
@@ -111,7 +111,7 @@ def _check_picture(path: Path) -> None:
 def _write(path: Path, picture: Image) -> None:
     """Whole or not at all."""
     from gripmon.model.atomic import write_atomically
-    from gripmon.teach.forecast.picture import encoded
+    from gripmon.teach.mount_picture import encoded
 
     try:
         write_atomically(path, encoded(picture, path.suffix))
@@ -121,7 +121,7 @@ def _write(path: Path, picture: Image) -> None:
 
 def _grid(config: Config, arguments: argparse.Namespace) -> tuple[Grid, tuple[float, float]]:
     from gripmon.daemon.forecast import rig_of
-    from gripmon.teach.forecast import Grid, Mount, towards
+    from gripmon.teach.mounts import Grid, Mount, towards
 
     present, rig = Mount.of(config.cam_T_grip), rig_of(config)
     low, high, count = _DISTANCES
@@ -177,7 +177,7 @@ def _turns(option: str, text: str | None, present_rad: float) -> tuple[float, ..
 
 
 def _cameras(camera: Camera, arguments: argparse.Namespace) -> list[Camera]:
-    from gripmon.teach.forecast import with_focal
+    from gripmon.teach.mounts import with_focal
 
     if arguments.lens is not None:
         return [_calibrated(Path(name)) for name in arguments.lens]

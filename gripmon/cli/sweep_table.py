@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.daemon.sweeping import Sweep
     from gripmon.model.camera import Camera
-    from gripmon.teach.forecast import Trial
+    from gripmon.teach.mounts import Trial
 
 _SHOWN = 8
 _REASONS_SHOWN = 4

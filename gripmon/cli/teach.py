@@ -14,7 +14,7 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.daemon.config import Config
-    from gripmon.teach.edges import Taught
+    from gripmon.teach.measure import Taught
     from gripmon.track.edges.taught import TaughtEdge
 
 _DESCRIPTION = """\

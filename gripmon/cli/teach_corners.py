@@ -16,8 +16,9 @@ from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.daemon.teaching import Inputs
-    from gripmon.teach.edges.bench import Found
-    from gripmon.teach.page import Desk, RoughDesk, Saved
+    from gripmon.teach.messages import Saved
+    from gripmon.teach.page_server import RoughDesk
+    from gripmon.teach.session import Desk, Found
 
 _LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -101,7 +102,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Teach with a gripper."""
     from gripmon.daemon.teaching import FileSaving, live_settings
     from gripmon.io.sources import SourceError, open_source
-    from gripmon.teach.page import Desk
+    from gripmon.teach.session import Desk
 
     live = None
     if arguments.live is not None:
@@ -115,7 +116,7 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
 
 def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
     """Until the person is done."""
-    from gripmon.teach.page import PageServer
+    from gripmon.teach.page_server import PageServer
 
     try:
         server = PageServer(desk, arguments.port)
@@ -148,9 +149,9 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     import numpy as np
 
     from gripmon.daemon.teaching import FileSaving, read_rough
-    from gripmon.teach.edges.snapping import FEWEST_PUT
-    from gripmon.teach.page import SavingRefused
-    from gripmon.teach.page.messages import Put, SaveOrder
+    from gripmon.teach.messages import Put, SaveOrder
+    from gripmon.teach.session import SavingRefused
+    from gripmon.teach.snapping import FEWEST_PUT
 
     rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
     if inputs.bench.reference is None and len(rough) < FEWEST_PUT:

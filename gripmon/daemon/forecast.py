@@ -36,25 +36,20 @@ from gripmon.judge.drift import CORRELATION_FRAMES, foresee
 from gripmon.judge.recalibrate import coplanar, refusal
 from gripmon.model.geometry import invert, make_transform, rotation_angle, rotation_from_xyzw
 from gripmon.monitor import CORNER_COUNTS
-from gripmon.teach.forecast import (
-    EDGE_POINT_SIGMA_PX,
+from gripmon.teach.accuracy import EDGE_POINT_SIGMA_PX, JawOutlook, Outlook, Promise, expect, foresee_frame, promise
+from gripmon.teach.mounts import Mount
+from gripmon.teach.visibility import (
     FEWEST_CORNERS,
     FEWEST_EDGES,
-    JawOutlook,
-    Mount,
-    Outlook,
-    Promise,
+    SOUGHT_M,
+    SOUGHT_RAD,
     Rig,
     border,
     certainty,
-    expect,
-    foresee_frame,
     freedom,
     over_jaw,
-    promise,
     see,
 )
-from gripmon.teach.forecast.margins import SOUGHT_M, SOUGHT_RAD
 
 __all__ = ["Forecast", "forecast", "limits_warning", "promise_of", "rig_of"]
 

@@ -11,7 +11,8 @@ from gripmon.daemon.config import Config
 from gripmon.daemon.forecast import rig_of
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import to_record
-from gripmon.teach.forecast import Grid, Mount, Trial, field_of_view_rad, tried, try_mount, weakest_direction
+from gripmon.teach.accuracy import weakest_direction
+from gripmon.teach.mounts import Grid, Mount, Trial, field_of_view_rad, tried, try_mount
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ a :class:`~gripmon.calibrate.sighting.CalibrationError`; both are one line of te
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ import numpy as np
 
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.calibrate.plane import GivenCamera
-from gripmon.calibrate.plane_average import PlaneCalibration, average
-from gripmon.calibrate.sighting import CalibrationError, NotFound
+from gripmon.calibrate.intrinsics import plate_pose
+from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners
+from gripmon.calibrate.plane import calibrate_plane as calibrate_image
+from gripmon.calibrate.plane_average import PlaneCalibration, against, average
+from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.errors import InputError
@@ -32,8 +34,19 @@ from gripmon.model.records import Array, Frame, Image, Origin, ReferenceRecord
 from gripmon.model.targets import Target, TargetError, parse_target
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
-from gripmon.teach.onboarding import KnownGripper, Look, UnknownGripper
-from gripmon.teach.onboarding.picture import draw
+from gripmon.teach.drawing import draw_on_plate
+from gripmon.teach.outlines import (
+    Outline,
+    check_rough,
+    contact_height_m,
+    inferred_model,
+    measure_known,
+    measure_outlines,
+    outlines_of,
+    points_in_gripper,
+    rough_pose,
+)
+from gripmon.teach.plate_print import plate_print
 from gripmon.track.edges.taught import TaughtEdges, gripper_digest
 
 Rough = Mapping[str, tuple[float, float]]
@@ -113,7 +126,7 @@ class HandEyeOnPlate:
 
     def picture(self) -> Image:
         """The first image with its residuals, enlarged; BGR."""
-        return draw(self.shown, self.method.camera.lens, self.looks[0].coincidence)
+        return draw_on_plate(self.shown, self.method.camera.lens, self.looks[0].coincidence)
 
 
 def calibrate_plane(
@@ -131,7 +144,7 @@ def calibrate_plane(
 
     Where the gripper is to be looked for, rough ``corners`` say (name: (u, v) in px; for all images or for each), or a
     rough calibration ``cam_T_grip`` (4, 4).  Without a ``gripper`` it is inferred from its innermost corners, whose
-    names :func:`gripmon.teach.onboarding.outlines_of` tells.  ``jaw_opening_m`` in the images; nominal if None.
+    names :func:`gripmon.teach.outlines.outlines_of` tells.  ``jaw_opening_m`` in the images; nominal if None.
     """
     target = parse_target(target) if isinstance(target, str) else target
     given = _given(camera)
@@ -279,3 +292,92 @@ def measure_tracked(
     if len(found) == 1:
         doubts.insert(0, f"{next(iter(found))} alone: nothing confirms what it shows; three images or more are better")
     return (cam_T_grip, covariance), tuple(doubts)
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What an image gives.  ``missing``: corners that were wanted and not measured, and why; ``outline_px`` (p, 2) the
+    points of an inferred gripper's ``outline`` in the image.
+    """
+
+    coincidence: Coincidence
+    missing: dict[str, str] = field(default_factory=dict)
+    outline: Outline | None = None
+    outline_px: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class KnownGripper:
+    """Calibrates with a gripper file, at one jaw opening (nominal if None); ``expected_cam_T_grip`` (4, 4) is a rough
+    calibration, if there is one.
+    """
+
+    camera: GivenCamera
+    gripper: Gripper
+    jaw_opening_m: float | None = None
+    expected_cam_T_grip: Array | None = None
+
+    def check_names(self, rough: Rough) -> None:
+        """Raise :class:`CalibrationError` for rough corners that the gripper doesn't have, or too few of them."""
+        check_rough(self.gripper, rough)
+
+    def look(self, image: Image, sighting: Sighting, rough: Rough | None) -> Look:
+        """``rough`` corners choose which ones are taken; without them all are, and they are expected where the rough
+        calibration has them.  Raises :class:`CalibrationError`.
+        """
+        camera, contact_m = make_camera(self.camera.lens), contact_height_m(self.gripper, self.jaw_opening_m)
+        expected = self.expected_cam_T_grip
+        if rough is not None:
+            cam_T_plate = plate_pose(self.camera.lens, sighting)[0]
+            expected = rough_pose(camera, self.gripper, cam_T_plate, rough, self.jaw_opening_m, contact_m)
+        if expected is None:
+            raise CalibrationError("nothing says where the gripper is in the image; rough corners, or a calibration")
+        corners, missing = measure_known(camera, self.gripper, image, expected, self.jaw_opening_m, rough)
+        points_m = self.gripper.points_grip_m(self.jaw_opening_m)
+        places = [self.gripper.point_ids.index(name) for name in corners.names]
+        found = calibrate_image(self.camera, sighting, corners, KnownCorners(points_m[places], contact_m))
+        if self.expected_cam_T_grip is not None:
+            turned = against(found.cam_T_grip, self.expected_cam_T_grip)
+            if turned is not None:
+                raise CalibrationError(turned)
+        return Look(found, missing)
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownGripper:
+    """Calibrates with rough outlines alone; the gripper comes out, too.  ``target``: the plate, whose print is told
+    from the fingers then.
+    """
+
+    camera: GivenCamera
+    target: Target | None = None
+
+    def look(self, image: Image, sighting: Sighting, rough: Rough) -> Look:
+        """Raises :class:`CalibrationError`."""
+        outline = outlines_of(rough)
+        camera = make_camera(self.camera.lens)
+        printed = plate_print(camera, plate_pose(self.camera.lens, sighting)[0], sighting, self.target, image)
+        corners, snapped = measure_outlines(camera, image, outline, printed)
+        found = calibrate_image(self.camera, sighting, corners, None)
+        return Look(found, {}, outline, snapped.points)
+
+    def model(
+        self,
+        name: str,
+        looks: Sequence[Look],
+        result: PlaneCalibration,
+        jaw_range_m: tuple[float, float] | None,
+        jaw_opening_m: float | None,
+        provenance: Provenance | None = None,
+    ) -> GripperModel:
+        """The gripper file: corners from all images jointly, ends of edges by their mean."""
+        camera, outline = make_camera(self.camera.lens), looks[0].outline
+        assert outline is not None, "an inferred gripper has outlines"
+        places = [
+            points_in_gripper(camera, outline, look.outline_px, result.cam_T_grip)
+            for look in looks
+            if look.outline_px is not None and look.outline is not None and look.outline.names == outline.names
+        ]
+        points_m = np.mean(places, axis=0)
+        points_m[list(outline.corners)] = result.corners_m
+        return inferred_model(name, outline, points_m, jaw_range_m, jaw_opening_m, provenance)

@@ -9,7 +9,7 @@ import numpy as np
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Image
-from gripmon.teach.forecast import EDGE_POINT_SIGMA_PX, ForeseeingMeter
+from gripmon.teach.accuracy import EDGE_POINT_SIGMA_PX, ForeseeingMeter
 from gripmon.track.edges import FingertipMeter, MeasurementSettings
 from gripmon.track.edges.consensus import Consensus, ConsensusSettings, Votes
 from gripmon.track.edges.prediction import Prediction

@@ -14,7 +14,8 @@ from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Image, ReferenceRecord
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, JawScript
-from gripmon.teach.edges import Taught, TeachingImage, teach
+from gripmon.teach.measure import Taught, teach
+from gripmon.teach.views import TeachingImage
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, TaughtEdges
 from support.meters import JAW_SIGMA_M, NARROW, USUAL_SHARE, box_gripper, difference
 from support.simulated import BOX_FINGERS, PAPER_LENS, nominal_cam_T_grip, plain_scenario

@@ -39,7 +39,8 @@ from gripmon.model.records import (
 from gripmon.monitor import Monitor, MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import Bump
-from gripmon.teach.forecast import Rig, foresee_frame
+from gripmon.teach.accuracy import foresee_frame
+from gripmon.teach.visibility import Rig
 
 TIP_SEEN = 0.4
 """Share of a fingertip's edges from which its outline counts as seen; two of them show: one nearly whole is enough."""

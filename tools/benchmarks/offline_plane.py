@@ -20,8 +20,8 @@ from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.simulate.scenario import Sensor
-from gripmon.teach.onboarding import KnownGripper, UnknownGripper
-from gripmon.teach.onboarding.measuring import contact_height_m
+from gripmon.teach.hand_eye import KnownGripper, UnknownGripper
+from gripmon.teach.outlines import contact_height_m
 
 ROUGH_PX = 4.0
 """Somebody clicks on corners; they are off by up to so much."""

@@ -27,7 +27,8 @@ from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import Array, Frame, ReferenceRecord
 from gripmon.simulate import FrameTruth, Hidden, Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript, Sensor
-from gripmon.teach.edges import TeachingImage, TeachingRefused, teach
+from gripmon.teach.measure import teach
+from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import MeasurementSettings, TaughtEdges
 
 CAMERA = PaperLens(

@@ -27,11 +27,11 @@ from gripmon.model.errors import InputError
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord, to_json
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.edges.bench import Bench, rough_fault
-from gripmon.teach.edges.corner_pose import CameraError
-from gripmon.teach.edges.files import Picture, read_any, read_picture
-from gripmon.teach.onboarding.outlines import RoughCorners
-from gripmon.teach.page import RoughDesk
+from gripmon.teach.api import Picture, read_any, read_picture
+from gripmon.teach.corner_pose import CameraError
+from gripmon.teach.outlines import RoughCorners
+from gripmon.teach.page_server import RoughDesk
+from gripmon.teach.session import Bench, rough_fault
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 

@@ -21,11 +21,10 @@ from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.edges import TeachingImage, TeachingRefused
-from gripmon.teach.edges.bench import Found
-from gripmon.teach.edges.files import taught_model, to_yaml
-from gripmon.teach.page import Picture, Saved, SaveOrder, SavingRefused
-from gripmon.teach.page.desk import Labels
+from gripmon.teach.api import Picture, taught_model, to_yaml
+from gripmon.teach.messages import Saved, SaveOrder
+from gripmon.teach.session import Found, Labels, SavingRefused
+from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtModel
 
 TAUGHT, CONFIG, CORNERS, IMAGES = "taught.yaml", "config.yaml", "corners.yaml", "teaching"
@@ -62,7 +61,7 @@ class FileSaving:
         )
 
     def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
-        """As :class:`gripmon.teach.page.Saving`."""
+        """As :class:`gripmon.teach.session.Saving`."""
         paths = self._paths
         notes: list[str] = []
         wanted = [kind for kind in ("corners", "taught", "config") if getattr(order, kind)]

@@ -22,7 +22,7 @@ from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord
-from gripmon.teach.edges.corner_pose import CornerPose
+from gripmon.teach.corner_pose import CornerPose
 
 _UNITS = """\
 # Lengths in metres, angles in radians, times in seconds, image coordinates in pixels (the first one's centre: 0, 0)."""

@@ -15,16 +15,21 @@ import importlib.resources
 import logging
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, TypeVar
 
 import msgspec
 
-from gripmon.teach.page.desk import BadRequest, Desk
-from gripmon.teach.page.messages import Failure, Nothing, Put, SaveOrder
-from gripmon.teach.page.rough_desk import RoughDesk
+from gripmon import __version__
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.model.atomic import write_atomically
+from gripmon.teach.api import Picture
+from gripmon.teach.messages import Failure, Nothing, PictureInfo, Place, Put, Reply, Saved, SaveOrder, State
+from gripmon.teach.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
+from gripmon.teach.session import BadRequest, Desk, encoded
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -79,7 +84,7 @@ class _Shop:
 
     def __init__(self, desk: Desk | RoughDesk, token: str, hosts: frozenset[str], done: threading.Event):
         self.desk, self.token, self.hosts, self.done = desk, token, hosts, done
-        folder = importlib.resources.files("gripmon.teach.page") / "page"
+        folder = importlib.resources.files("gripmon.teach") / "web"
         self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
         self.encoder = msgspec.json.Encoder()
 
@@ -215,3 +220,106 @@ class _Handler(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """The token stands in every address: nothing of it goes to a log."""
+
+
+_NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FINGERS for side in SIDES)
+_COLUMNS = {"left": 0.06, "right": 0.8}
+
+
+class RoughDesk:
+    """As :class:`gripmon.teach.session.Desk`, without a gripper: one image, whose corners go to ``path``.
+
+    ``follows``: the command that reads that file, ``note`` what is to be said of it; ``saved``: what was last written,
+    None before.
+    """
+
+    def __init__(self, picture: Picture, path: Path, follows: str, note: str):
+        self._picture, self._path, self._follows, self._note = picture, path, follows, note
+        self._lock = threading.Lock()
+        self.saved: Saved | None = None
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def dark(self) -> tuple[float, str]:
+        """There is no camera that could show nothing."""
+        return 0.0, ""
+
+    def state(self) -> State:
+        height_px, width_px = self._picture.image.shape[:2]
+        return State(
+            version=__version__,
+            width_px=width_px,
+            height_px=height_px,
+            corners=_NAMES,
+            fingers={name: name.partition("_")[0] for name in _NAMES},
+            places=_columns(width_px, height_px),
+            pictures=(PictureInfo(number=0, name=self._picture.name, jaw_opening_m=None),),
+            live=None,
+            has_jaw=False,
+            jaw_m=(0.0, 0.0, 0.0),
+            gripper="no gripper file yet",
+            reference=None,
+            needed=2 * len(INNERMOST),
+            robot="robot",  # neither name is asked for, nor written
+            camera_name="camera",
+            fixed_names=True,
+            folder=str(self._path.parent.resolve()),
+            files={"corners": str(self._path), "config": "", "taught": ""},
+            corners_only=True,
+        )
+
+    def look(self, put: Put) -> Reply:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("nothing snaps without a gripper file; corners are put and saved")
+
+    def take(self) -> tuple[PictureInfo, ...]:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("there is no live camera here")
+
+    def live(self) -> bytes:
+        """Always :class:`BadRequest`."""
+        raise BadRequest("there is no live camera here")
+
+    def still(self, number: int) -> bytes:
+        """The image as PNG.  Raises :class:`BadRequest`."""
+        if number != 0:
+            raise BadRequest(f"there is no image {number}; 1 is there")
+        return encoded(self._picture.image, ".png")
+
+    def save(self, order: SaveOrder) -> Saved:
+        """Write the corners that were put, if ``calibrate plane --infer`` can use them; else say why not."""
+        corners = order.put.corners
+        try:
+            outlines_of(corners)
+        except CalibrationError as error:
+            return Saved(refused=str(error))
+        with self._lock:
+            if self._path.exists() and not order.replace:
+                return Saved(exists=(str(self._path),))
+            try:
+                write_atomically(self._path, self._text(corners).encode())
+            except OSError as error:
+                return Saved(refused=f"{self._path}: can't be written ({error.strerror or error})")
+            self.saved = Saved(written={str(self._path): "rough corners"}, notes=(self._note,), next=self._follows)
+            return self.saved
+
+    def _text(self, corners: Mapping[str, Place]) -> str:
+        image = " ".join(ascii(self._picture.name)[1:-1].split())
+        lines = [
+            f"# Rough fingertip corners in {image}, put by hand (gripmon teach --page, gripmon {__version__})",
+            "# For gripmon calibrate plane --infer --corners; name: [column, row] in the image (px)",
+            "corners:",
+        ]
+        lines += [f"  {name}: [{corners[name][0]:.2f}, {corners[name][1]:.2f}]" for name in _NAMES if name in corners]
+        return "\n".join(lines) + "\n"
+
+
+def _columns(width_px: int, height_px: int) -> dict[str, Place | None]:
+    """Where the handles wait: a column for each finger, in the order of its outline."""
+    order = [f"{point}_near" for point in reversed(POINTS)] + [f"{point}_far" for point in POINTS]
+    return {
+        f"{finger}_{point}": (round(share * width_px, 1), round((k + 0.7) / (len(order) + 0.8) * height_px, 1))
+        for finger, share in _COLUMNS.items()
+        for k, point in enumerate(order)
+    }

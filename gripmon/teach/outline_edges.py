@@ -1,7 +1,7 @@
 """Sub-pixel corners of a rough outline: a straight line for each of its edges, where adjacent ones meet, and how far
 off they may be by what their points show.
 
-Unlike :mod:`gripmon.teach.edges.snapping`, which poses a gripper that is known, this knows no gripper.  Lines are
+Unlike :mod:`gripmon.teach.snapping`, which poses a gripper that is known, this knows no gripper.  Lines are
 straight in ideal coordinates; profiles lie along the edge as the lens bends it.  Each edge is looked for on its own, as
 the rough ends may be off by several pixels each in any direction.
 """
@@ -16,10 +16,9 @@ import numpy as np
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
-from gripmon.teach.edges.lines import EdgePoints, Line, settle_line
-from gripmon.teach.onboarding.before_print import look_at, moves, rough_line, sharpness
-from gripmon.teach.onboarding.outlines import INNERMOST, Outline
-from gripmon.teach.onboarding.plate_print import PlatePrint
+from gripmon.teach.lines import EdgePoints, Line, settle_line
+from gripmon.teach.outlines import INNERMOST, Outline
+from gripmon.teach.plate_print import PlatePrint, look_at, moves, rough_line, sharpness
 from gripmon.track.edges.consensus import ConsensusSettings
 from gripmon.track.edges.prediction import ROWS, STRETCH
 from gripmon.track.edges.profiles import (
@@ -75,7 +74,7 @@ class _Base:
 
 def find_outline(camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None) -> FoundOutline:
     """The outline on the edges that the image shows; before a known print, which has edges of its own, by
-    :mod:`~gripmon.teach.onboarding.before_print`.  Raises :class:`CalibrationError`, which names the corner or edge:
+    :mod:`~gripmon.teach.plate_print`.  Raises :class:`CalibrationError`, which names the corner or edge:
     outside of the image, not seen, or no corner.
     """
     points = outline.points

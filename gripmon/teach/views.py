@@ -15,7 +15,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, ReferenceRecord
-from gripmon.teach.edges.lines import EdgePoints
+from gripmon.teach.lines import EdgePoints
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import (

@@ -75,7 +75,7 @@ class State(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
-    """``model_px``: where the pose has it; the rest as in :class:`gripmon.teach.edges.snapping.SnappedCorner`."""
+    """``model_px``: where the pose has it; the rest as in :class:`gripmon.teach.snapping.SnappedCorner`."""
 
     name: str
     model_px: Place | None
@@ -87,7 +87,7 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """As :class:`gripmon.teach.edges.bench.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
+    """As :class:`gripmon.teach.session.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
 
     edges: int
     sigma: tuple[float, ...]

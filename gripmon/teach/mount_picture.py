@@ -20,8 +20,8 @@ from gripmon.model.records import Array, Image
 from gripmon.simulate import Scenario, Simulator
 from gripmon.simulate.scenario import Background, FingerLook, JawScript
 from gripmon.simulate.solids import finger_solids
-from gripmon.teach.forecast.sweep import Grid, Trial
-from gripmon.teach.forecast.visibility import Rig
+from gripmon.teach.mounts import Grid, Trial
+from gripmon.teach.visibility import Rig
 
 _WIDTH, _EDGE, _GAP = 1500, 30, 36
 _INK, _FAINT, _PAPER, _MARK = (20, 20, 20), (95, 95, 95), (255, 255, 255), (226, 32, 38)

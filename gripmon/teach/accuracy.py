@@ -6,18 +6,20 @@ standard deviation: what comes out is the covariance that the geometry gives, wi
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
-from gripmon.teach.forecast.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
+from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.track.edges.consensus import Consensus, Votes
 from gripmon.track.edges.prediction import Prediction
@@ -195,3 +197,56 @@ class ForeseeingMeter(FingertipMeter):
         scatters = assess(votes, consensus, self._prior, CLUTTER_PX)
         normal = consensus.information + np.diag(self._prior)
         return replace(scatters, covariance=np.linalg.inv(normal), line_weight=consensus.weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Promise:
+    """``protection`` of a transform in which all visible edges are seen, and the limits that it is held against."""
+
+    protection: Protection
+    alert_limit_m: float
+    alert_limit_rad: float
+
+    @property
+    def reachable(self) -> bool:
+        """Whether a transform of this view can be valid."""
+        return self.excess <= 1.0
+
+    @property
+    def excess(self) -> float:
+        """The larger of both bounds over its limit: above 1, no transform can be valid."""
+        bound = self.protection
+        return max(bound.position_m / self.alert_limit_m, bound.rotation_rad / self.alert_limit_rad)
+
+    @property
+    def needed(self) -> str:
+        """The alert limits that this view could keep, where the present ones are too tight; else empty."""
+        bound, parts = self.protection, []
+        if not (math.isfinite(bound.position_m) and math.isfinite(bound.rotation_rad)):
+            return "more of the fingers in view: no limit would do"
+        if bound.position_m > self.alert_limit_m:
+            needed_m = _rounded_up(bound.position_m)
+            parts.append(f"alert_limit_m of at least {needed_m:g} ({1e3 * needed_m:g} mm)")
+        if bound.rotation_rad > self.alert_limit_rad:
+            needed_rad = _rounded_up(bound.rotation_rad)
+            parts.append(f"alert_limit_rad of at least {needed_rad:g} ({math.degrees(needed_rad):.2g} degrees)")
+        return " and ".join(parts)
+
+    def text(self) -> str:
+        """One line for a person."""
+        bound = self.protection
+        good = f"good to {1e3 * bound.position_m:.2g} mm and {math.degrees(bound.rotation_rad):.2g} degrees"
+        limits = f"{1e3 * self.alert_limit_m:g} mm, {math.degrees(self.alert_limit_rad):.2g} degrees"
+        reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
+        return f"a transform of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
+
+
+def promise(foreseen: Protection, policy: PolicySettings) -> Promise:
+    """What a view may promise, beside the policy's alert limits."""
+    return Promise(foreseen, policy.alert_limit_m, policy.alert_limit_rad)
+
+
+def _rounded_up(value: float) -> float:
+    """To two digits, never below."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return math.ceil(value / unit - 1e-9) * unit

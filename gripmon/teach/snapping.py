@@ -15,7 +15,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image
-from gripmon.teach.edges.placing import Placed, Prior, place, rough_sigma_px
+from gripmon.teach.corner_pose import Placed, Prior, place, rough_sigma_px
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.track.edges.settling import ZOOMS, Expected
 
