@@ -19,13 +19,13 @@ from gripmon.daemon.config import builtin_config
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import gripper_from_dict
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.accuracy import Outlook, expect, weakest_direction
+from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy, weakest_direction
 from gripmon.track.edges import MeasurementSettings
 
 
-def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> Outlook:
+def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> AccuracyForecast:
     known = MonitorSettings(**{"floor_m": 0.0, "floor_rad": 0.0, "corners": INDEPENDENT, **settings})  # type: ignore[arg-type]
-    return expect(make_camera(lens), box_gripper(), known, reference_of(nominal_cam_T_grip()), OPENING_M)
+    return forecast_accuracy(make_camera(lens), box_gripper(), known, reference_of(nominal_cam_T_grip()), OPENING_M)
 
 
 def box_model() -> dict[str, Any]:
@@ -70,7 +70,7 @@ def test_simulated_sequences_scatter_as_expected(measurement: str):
     """Another noise and texture than assumed: within a factor of three."""
     settings = MonitorSettings(measurement=measurement)  # type: ignore[arg-type]
     camera, gripper = make_camera(PAPER_LENS), box_gripper(sharp=False)
-    expected = expect(camera, gripper, settings, reference_of(nominal_cam_T_grip()), OPENING_M).sigma
+    expected = forecast_accuracy(camera, gripper, settings, reference_of(nominal_cam_T_grip()), OPENING_M).sigma
     spread = np.nanstd(watched("static", measurement).errors(), axis=0)
     assert (spread < 3.0 * expected).all()
     assert (spread > 0.1 * expected).all()
@@ -107,7 +107,7 @@ def test_an_exact_opening_leaves_the_pose_of_six_unknowns():
     model["fingers"] = {"left": {}, "right": {}}
     rigid = gripper_from_dict(model)
     settings = MonitorSettings(floor_m=0.0, floor_rad=0.0, jaw_sigma_m=0.0)
-    six = expect(make_camera(PAPER_LENS), rigid, settings, reference_of(nominal_cam_T_grip()), None)
+    six = forecast_accuracy(make_camera(PAPER_LENS), rigid, settings, reference_of(nominal_cam_T_grip()), None)
     assert six.jaw is None
     seven = outlook(jaw_sigma_m=0.0, corners=MeasurementSettings())
     np.testing.assert_allclose(seven.sigma, six.sigma, rtol=0.05)
@@ -139,7 +139,7 @@ def test_corners_nearly_on_a_line_show_it_in_the_covariance():
     thin = gripper_from_dict(model)
     settings = MonitorSettings(measurement="corners", corners=INDEPENDENT)
     camera, reference = make_camera(PAPER_LENS), reference_of(nominal_cam_T_grip())
-    wide, squeezed = (expect(camera, g, settings, reference, OPENING_M) for g in (box_gripper(), thin))
+    wide, squeezed = (forecast_accuracy(camera, g, settings, reference, OPENING_M) for g in (box_gripper(), thin))
     assert squeezed.sigma[3] > 3.0 * wide.sigma[3]
     turn = np.abs(squeezed.weakest[3:]) * squeezed.lever_m
     assert turn.argmax() == 0, "about the line"

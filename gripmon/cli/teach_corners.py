@@ -17,8 +17,8 @@ from gripmon.model.errors import InputError, NoResultError
 if TYPE_CHECKING:
     from gripmon.daemon.teaching import Inputs
     from gripmon.teach.messages import Saved
-    from gripmon.teach.page_server import RoughDesk
-    from gripmon.teach.session import Desk, Found
+    from gripmon.teach.page_server import OutlineSession
+    from gripmon.teach.session import Evaluation, TeachSession
 
 _LOOK_S = 0.2
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
@@ -28,7 +28,7 @@ _NEED_A_GRIPPER = ("config", "gripper", "reference", "live", "robot", "camera_na
 def run(arguments: argparse.Namespace, command: str) -> int:
     """Handle ``gripmon teach --page`` and ``--corners``; ``command`` goes into the files that are written."""
     _check_options(arguments)
-    from gripmon.daemon.teaching import Named, read_inputs, rough_desk
+    from gripmon.daemon.teaching import Named, outline_session, read_inputs
 
     images = [Path(name) for name in arguments.images]
     paths = {
@@ -40,9 +40,9 @@ def run(arguments: argparse.Namespace, command: str) -> int:
             text = f"teach: {len(images)} images, and no gripper; one image, to put rough corners in, or --gripper FILE"
             raise InputError(text)
         folder = paths["out"] or Path()
-        desk = rough_desk(images[0], paths["camera"], folder)
+        session = outline_session(images[0], paths["camera"], folder)
         common.make_directory(folder)
-        return _rough_page(arguments, desk)
+        return _rough_page(arguments, session)
     inputs = read_inputs(
         Named(
             command, images, **paths, live=arguments.live, jaw_opening_m=arguments.jaw_opening,
@@ -79,13 +79,13 @@ def _check_options(arguments: argparse.Namespace) -> None:
         refuse("--config has camera, gripper and reference already; either that, or --camera and --gripper")
 
 
-def _rough_page(arguments: argparse.Namespace, desk: RoughDesk) -> int:
+def _rough_page(arguments: argparse.Namespace, session: OutlineSession) -> int:
     """Serve, then say what was saved, however the page ended."""
     try:
-        return _serve(arguments, desk)
+        return _serve(arguments, session)
     finally:
-        if desk.saved is not None:
-            _say(desk.saved)
+        if session.saved is not None:
+            _say(session.saved)
 
 
 def _say(saved: Saved) -> None:
@@ -102,26 +102,26 @@ def _page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     """Teach with a gripper."""
     from gripmon.daemon.teaching import FileSaving, live_settings
     from gripmon.io.sources import SourceError, open_source
-    from gripmon.teach.session import Desk
+    from gripmon.teach.session import TeachSession
 
     live = None
     if arguments.live is not None:
         try:
-            live = open_source(live_settings(arguments.live, inputs.bench.camera))
+            live = open_source(live_settings(arguments.live, inputs.setup.camera))
         except SourceError as error:
             raise InputError(f"--live: {error}") from None
     saving = FileSaving(inputs)
-    return _serve(arguments, Desk(inputs.bench, inputs.pictures, saving.labels(), saving, live))
+    return _serve(arguments, TeachSession(inputs.setup, inputs.pictures, saving.labels(), saving, live))
 
 
-def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
+def _serve(arguments: argparse.Namespace, session: TeachSession | OutlineSession) -> int:
     """Until the person is done."""
     from gripmon.teach.page_server import PageServer
 
     try:
-        server = PageServer(desk, arguments.port)
+        server = PageServer(session, arguments.port)
     except OSError as error:
-        desk.close()
+        session.close()
         raise InputError(
             f"--port {arguments.port}: can't be listened on ({error.strerror}); another one, or none"
         ) from None
@@ -131,12 +131,12 @@ def _serve(arguments: argparse.Namespace, desk: Desk | RoughDesk) -> int:
         if not arguments.no_browser and _has_display():
             webbrowser.open(server.url)
         while not server.done.wait(_LOOK_S):  # an interrupt that another thread has caught is heard of here
-            dark_s, why = desk.dark()
+            dark_s, why = session.dark()
             if arguments.live_wait is not None and dark_s > arguments.live_wait:
                 raise NoResultError(f"--live: {why.partition(';')[0]}; given up after {arguments.live_wait:g} s")
     finally:
         server.close()
-        desk.close()
+        session.close()
     return common.EXIT_DONE
 
 
@@ -149,19 +149,18 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     import numpy as np
 
     from gripmon.daemon.teaching import FileSaving, read_rough
-    from gripmon.teach.messages import Put, SaveOrder
-    from gripmon.teach.session import SavingRefused
+    from gripmon.teach.messages import Put, SaveOrder, SavingRefused
     from gripmon.teach.snapping import FEWEST_PUT
 
-    rough = read_rough(Path(arguments.corners), inputs.bench.gripper)
-    if inputs.bench.reference is None and len(rough) < FEWEST_PUT:
+    rough = read_rough(Path(arguments.corners), inputs.setup.gripper)
+    if inputs.setup.reference is None and len(rough) < FEWEST_PUT:
         raise InputError(
             f"{arguments.corners}: {len(rough)} of the gripper's corners; at least {FEWEST_PUT}, hidden ones too, "
             "about where they would show; or --reference FILE (of gripmon calibrate plane)"
         )
     picture = inputs.pictures[0]
     corners = {name: np.array(at) for name, at in rough.items()}
-    found = inputs.bench.look(picture.image, corners, (), picture.jaw_opening_m)
+    found = inputs.setup.evaluate(picture.image, corners, (), picture.jaw_opening_m)
     if found.snapped.refused is not None:
         raise NoResultError(f"{picture.name}: {found.snapped.refused}")
     print("\n".join(_table(found)))
@@ -177,7 +176,7 @@ def _without_page(arguments: argparse.Namespace, inputs: Inputs) -> int:
     return common.EXIT_DONE
 
 
-def _table(found: Found) -> list[str]:
+def _table(found: Evaluation) -> list[str]:
     """What was seen, for a person."""
     snapped = found.snapped
     width = max(len(corner.name) for corner in snapped.corners)
@@ -200,11 +199,11 @@ def _table(found: Found) -> list[str]:
             lines.append(
                 "note: another pose explains these corners as well; a corner outside of their plane would tell"
             )
-    expected = found.prospects
+    expected = found.expected
     if expected is not None:
         lines.append(f"expected of a frame   {_axes(expected.sigma)}")
         lines.append(f"smallest drift seen   {_axes(expected.smallest)}")
-        lines.append(f"promise               {expected.promise.text()}")
+        lines.append(f"promise               {expected.promise}")
     return lines
 
 

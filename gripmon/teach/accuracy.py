@@ -1,4 +1,4 @@
-"""What a calibration may expect: how certain a frame's transform will be, and what the view can't tell apart.
+"""Accuracy forecast: how certain a frame's transform will be, what the view can't separate, which alert limits hold.
 
 The monitor's own measurement and update are run on edge points where the model puts them, each with the same assumed
 standard deviation: what comes out is the covariance that the geometry gives, without any image.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from gripmon.model.geometry import from_record, invert
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, Protection, ReferenceRecord
 from gripmon.monitor import MonitorSettings, Tracker, foresee_protection
-from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind
+from gripmon.teach.visibility import FEWEST_EDGES, FEWEST_SAMPLES, Rig, samples_behind, see
 from gripmon.track.edges import FingertipMeter, Measurement, Patience, TaughtEdges
 from gripmon.track.edges.consensus import Consensus, Votes
 from gripmon.track.edges.prediction import Prediction
@@ -34,16 +33,14 @@ CLUTTER_PX = 0.1
 bound is that of the usual frame before clutter; one in twenty has up to four times as much (tools/bench integrity).
 """
 
-_STEP, _NOISE, _FULL_SCALE = 40.0, 1.5, 255.0
-
 
 @dataclass(frozen=True, slots=True)
-class JawOutlook:
-    """What an unknown opening does, the seventh unknown of the fit.
+class UnknownOpening:
+    """What an unknown jaw opening does, the seventh unknown of the fit.
 
-    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when nobody reports it.  ``pose_per_m`` (6,): by how much
-    the pose is wrong for each metre by which an opening that is taken as exact is wrong.  ``correlation`` of the
-    opening with the pose's weakest direction when it is unknown, 0 to 1: near 1 the image can't separate them.
+    ``sigma`` (6,) of the pose and ``sigma_m`` of the opening when the robot doesn't report it.  ``pose_per_m`` (6,): by
+    how much the pose is wrong for each metre by which an opening that is taken as exact is wrong.  ``correlation`` of
+    the opening with the pose's weakest direction when it is unknown, 0 to 1: near 1 the image can't separate them.
     """
 
     sigma: Array
@@ -58,22 +55,21 @@ class JawOutlook:
 
 
 @dataclass(frozen=True, slots=True)
-class Outlook:
+class AccuracyForecast:
     """Expected of one frame in which all visible edges are seen; vectors are (position, rotation), m and rad.
 
-    ``covariance`` (6, 6) as it would be published; ``weakest`` (6,) one standard deviation along its least certain
-    direction, rotations counted by how far they move the fingertips.  ``edges``: how many can be sampled; with fewer
-    than ``FEWEST_EDGES`` nothing will be measured.  ``jaw`` is None for a gripper without one; ``protection``: the
-    level before clutter.
+    ``covariance`` (6, 6) as it would be published.  ``edges``: how many can be sampled; with fewer than
+    ``FEWEST_EDGES`` nothing will be measured.  ``corners`` (c,): which can be measured.  ``lever_m``: root mean square
+    distance of the gripper's corners from the TCP, by which a rotation of one radian moves them.  ``protection``: the
+    level before clutter.  ``jaw``: with an unknown opening; None for a gripper without jaw, or where not asked for.
     """
 
     covariance: Array
-    weakest: Array
     edges: int
     corners: NDArray[np.bool_]
     lever_m: float
-    jaw: JawOutlook | None
     protection: Protection
+    jaw: UnknownOpening | None
 
     @property
     def sigma(self) -> Array:
@@ -81,57 +77,59 @@ class Outlook:
         return np.asarray(np.sqrt(self.covariance.diagonal()))
 
     @property
+    def weakest(self) -> Array:
+        """(6,) one standard deviation along the least certain direction, a radian counting as ``lever_m``."""
+        return weakest_direction(self.covariance, self.lever_m)
+
+    @property
+    def tcp_sigma_m(self) -> float:
+        """Standard deviation of the TCP along its least certain direction."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
     def enough(self) -> bool:
         """Whether anything can be measured at all."""
         return self.edges >= FEWEST_EDGES
 
 
-def expect(
+def forecast_accuracy(
     camera: Camera,
     gripper: Gripper,
     settings: MonitorSettings,
     reference: ReferenceRecord,
     jaw_opening_m: float | None,
     taught: TaughtEdges | None = None,
-) -> Outlook:
-    """What a frame at the reference's pose and an opening (nominal if None) may tell."""
-    tracker = Tracker(camera, gripper, settings, taught)
-    cam_T_grip = from_record(reference.cam_T_grip)
-    opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
-    meter = ForeseeingMeter(camera, gripper, settings.corners, settings.jaw_sigma_m, taught)
-    given = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
-    covariance = tracker.update(given)[1]
-    lever_m = _lever_m(given.prediction)
-    jaw = None
-    if gripper.has_jaw:
-        free = meter.foresee(cam_T_grip, opening_m, jaw_reported=False)
-        jaw = _jaw_outlook(tracker.update(free)[1], free.covariance, lever_m)
-    edges, corners = _edges_seen(given), given.corners.usable
-    protection = foresee_protection(tracker, gripper, settings, given)
-    return Outlook(covariance, weakest_direction(covariance, lever_m), edges, corners, lever_m, jaw, protection)
+) -> AccuracyForecast:
+    """What a frame at the reference's pose and an opening (nominal if None) may give."""
+    rig = Rig(camera, gripper, settings, taught)
+    return forecast_frame(rig, from_record(reference.cam_T_grip), jaw_opening_m, with_jaw=gripper.has_jaw)
 
 
-class Foreseen(NamedTuple):
-    """Of one frame with a reported opening: ``covariance`` (6, 6) as it would be published, ``usable`` (c,) corners,
-    the lever, m, by which a turn counts, and the ``protection`` level before clutter.
-    """
-
-    covariance: Array
-    usable: NDArray[np.bool_]
-    lever_m: float
-    protection: Protection
-
-
-def foresee_frame(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Foreseen:
-    """What a frame at a pose and an opening (nominal if None) gives; only where the view suffices."""
+def forecast_frame(
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, *, with_jaw: bool = False
+) -> AccuracyForecast:
+    """What a frame at a pose and a reported opening (nominal if None) gives; ``with_jaw``: with an unknown one, too."""
     gripper, settings = rig.gripper, rig.settings
     opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
-    meter = ForeseeingMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
-    measurement = meter.foresee(cam_T_grip, opening_m, jaw_reported=True)
+    meter = ForecastMeter(rig.camera, gripper, settings.corners, settings.jaw_sigma_m, rig.taught)
     tracker = Tracker(rig.camera, gripper, settings, rig.taught)
-    covariance = tracker.update(measurement)[1]
-    protection = foresee_protection(tracker, gripper, settings, measurement)
-    return Foreseen(covariance, measurement.corners.usable, _lever_m(measurement.prediction), protection)
+    given = meter.forecast(cam_T_grip, opening_m, jaw_reported=True)
+    covariance = tracker.update(given)[1]
+    levers_m = given.prediction.corners.cam_m - given.prediction.cam_T_grip[:3, 3]
+    lever_m = float(np.sqrt((levers_m**2).sum(axis=1).mean()))
+    jaw = None
+    if with_jaw:
+        free = meter.forecast(cam_T_grip, opening_m, jaw_reported=False)
+        jaw = _unknown_opening(tracker.update(free)[1], free.covariance, lever_m)
+    seen = np.bincount(given.prediction.layout.edge[given.candidates.sample], minlength=1) >= FEWEST_SAMPLES
+    protection = foresee_protection(tracker, gripper, settings, given)
+    return AccuracyForecast(covariance, int(np.count_nonzero(seen)), given.corners.usable, lever_m, protection, jaw)
+
+
+def accuracy_over_jaw(rig: Rig, cam_T_grip: Array, count: int = 13) -> list[tuple[float, AccuracyForecast | None]]:
+    """At ``count`` openings (m) over the jaw's travel: what a frame gives, None where too little is visible."""
+    openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count).tolist()
+    return [(m, forecast_frame(rig, cam_T_grip, m) if see(rig, cam_T_grip, m).enough else None) for m in openings_m]
 
 
 def weakest_direction(covariance: Array, lever_m: float) -> Array:
@@ -144,37 +142,23 @@ def weakest_direction(covariance: Array, lever_m: float) -> Array:
     return np.asarray(weakest * (1.0 if weakest[np.abs(weakest * scale).argmax()] > 0.0 else -1.0))
 
 
-def _jaw_outlook(pose_covariance: Array, covariance: Array, lever_m: float) -> JawOutlook:
+def _unknown_opening(pose_covariance: Array, covariance: Array, lever_m: float) -> UnknownOpening:
     """``covariance`` (7, 7) of the fit itself, ``pose_covariance`` (6, 6) as it would be published."""
     weakest = weakest_direction(covariance[:6, :6], lever_m)
     scale = np.array([1.0] * 3 + [lever_m] * 3)
     # Its length is one standard deviation, so that projecting on it twice takes the scale out.
     with_jaw = float((scale**2 * weakest) @ covariance[:6, 6]) / float((scale * weakest) @ (scale * weakest))
     variance = float(covariance[6, 6])
-    return JawOutlook(
-        np.sqrt(pose_covariance.diagonal()),
-        float(np.sqrt(variance)),
-        covariance[:6, 6] / variance,
-        abs(with_jaw) / np.sqrt(variance),
+    sigma_m = float(np.sqrt(variance))
+    return UnknownOpening(
+        np.sqrt(pose_covariance.diagonal()), sigma_m, covariance[:6, 6] / variance, abs(with_jaw) / sigma_m
     )
 
 
-def _edges_seen(measurement: Measurement) -> int:
-    """Edges of which enough samples are seen."""
-    edge = measurement.prediction.layout.edge[measurement.candidates.sample]
-    return int(np.count_nonzero(np.bincount(edge, minlength=1) >= FEWEST_SAMPLES))
+class ForecastMeter(FingertipMeter):
+    """Reads no image: finds an edge point on every profile that no other finger hides, where it was predicted."""
 
-
-def _lever_m(prediction: Prediction) -> float:
-    """Root mean square distance of the gripper's corners from the TCP: how far a turn by one radian moves them."""
-    levers_m = prediction.corners.cam_m - prediction.cam_T_grip[:3, 3]
-    return float(np.sqrt((levers_m**2).sum(axis=1).mean()))
-
-
-class ForeseeingMeter(FingertipMeter):
-    """Looks at no image: finds an edge point on every profile that no other finger hides, where it was predicted."""
-
-    def foresee(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
+    def forecast(self, cam_T_grip: Array, jaw_opening_m: float, jaw_reported: bool) -> Measurement:
         """What the edge points alone give at a pose and an opening."""
         nothing = np.zeros((1, 1), np.uint8)
         here = Patience(when_doubtful=False, when_lost=False)
@@ -185,12 +169,10 @@ class ForeseeingMeter(FingertipMeter):
         points_grip_m = gripper.points_grip_m(prediction.jaw_opening_m)
         hidden = samples_behind(gripper, prediction.layout, points_grip_m, eye_grip_m)
         sample = np.flatnonzero(prediction.ok & ~hidden)
-        polarity = self._polarity
-        step = np.where(polarity[prediction.layout.edge[sample]] < 0, -_STEP, _STEP)
-        sigma_px, width_px = np.full(len(sample), EDGE_POINT_SIGMA_PX), np.ones(len(sample))
-        whole = np.zeros(len(sample))
-        candidates = Candidates(sample, np.zeros(len(sample)), step, sigma_px, width_px, whole, _NOISE, _FULL_SCALE)
-        return self._votes(candidates, prediction)
+        zero, one = np.zeros(len(sample)), np.ones(len(sample))
+        # Steps of 40 grey levels of 255 in noise of 1.5, in focus.
+        step = np.where(self._polarity[prediction.layout.edge[sample]] < 0, -40.0, 40.0)
+        return self._votes(Candidates(sample, zero, step, EDGE_POINT_SIGMA_PX * one, one, zero, 1.5, 255.0), prediction)
 
     def _assess(self, votes: Votes, consensus: Consensus) -> Uncertainty:
         """As assumed: nothing scatters here."""
@@ -201,11 +183,17 @@ class ForeseeingMeter(FingertipMeter):
 
 @dataclass(frozen=True, slots=True)
 class Promise:
-    """``protection`` of a transform in which all visible edges are seen, and the limits that it is held against."""
+    """``protection`` of a transform in which all visible edges are seen, and the alert limits that it is compared with:
+    whether a view's transforms can be valid, before there is any image.
+    """
 
     protection: Protection
     alert_limit_m: float
     alert_limit_rad: float
+
+    @classmethod
+    def of(cls, protection: Protection, policy: PolicySettings) -> Promise:
+        return cls(protection, policy.alert_limit_m, policy.alert_limit_rad)
 
     @property
     def reachable(self) -> bool:
@@ -239,11 +227,6 @@ class Promise:
         limits = f"{1e3 * self.alert_limit_m:g} mm, {math.degrees(self.alert_limit_rad):.2g} degrees"
         reached = "reachable" if self.reachable else f"NOT reachable: valid needs {self.needed}"
         return f"a transform of this view is {good} (risk {bound.risk:g} a frame); alert limit {limits}: {reached}"
-
-
-def promise(foreseen: Protection, policy: PolicySettings) -> Promise:
-    """What a view may promise, beside the policy's alert limits."""
-    return Promise(foreseen, policy.alert_limit_m, policy.alert_limit_rad)
 
 
 def _rounded_up(value: float) -> float:

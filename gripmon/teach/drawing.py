@@ -1,4 +1,6 @@
-"""Drawing over an enlarged image: places in its pixels, lines in parts of a pixel, letters that stay readable."""
+"""Pictures of what was taught or measured, drawn over an enlarged image: places in its pixels, lines in parts of a
+pixel, letters that stay readable.
+"""
 
 from __future__ import annotations
 
@@ -72,13 +74,8 @@ def enlargement(largest_px: float, to_px: float) -> int:
 
 
 _ENLARGED_TO_PX = 12.0  # the largest offset is drawn at most so long
-_SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR, _TEXT_BGR = (
-    (235, 150, 60),
-    (60, 170, 255),
-    (90, 220, 120),
-    (60, 230, 240),
-    (255, 255, 255),
-)
+_SHARP_BGR, _OUTLINE_BGR, _CREASE_BGR, _CORNER_BGR = (235, 150, 60), (60, 170, 255), (90, 220, 120), (60, 230, 240)
+_TEXT_BGR = (255, 255, 255)
 _TITLE, _LABEL = 0.55, 0.45  # sizes of OpenCV's font
 _MARGIN_PX, _GAP_PX, _ASIDE_PX = 10, 4, 10
 _ROWS = (0, -1, 1, -2, 2, -3, 3, -4, 4, -5, 5, -6, 6)  # lines above and below its place that a label may stand in
@@ -181,9 +178,8 @@ _LARGEST_ZOOM = 4
 _RESIDUALS_TO_PX = 25.0
 _USED: Colour = (120, 220, 90)
 _UNUSED: Colour = (70, 70, 250)
-_CORNER_BGR: Colour = (40, 220, 250)
+_MEASURED_BGR: Colour = (40, 220, 250)
 _AXES: tuple[tuple[str, Colour], ...] = (("x", (80, 80, 255)), ("y", (80, 230, 80)))
-_TEXT_BGR: Colour = (255, 255, 255)
 _STRIP = 24
 _SIZE = 0.8
 
@@ -206,13 +202,13 @@ def draw_on_plate(image: Image, lens: LensSettings, found: Coincidence) -> Image
             canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), colour)
     _axes(canvas, lens, found)
     for name, uv_px, residual in zip(found.corners.names, found.corners.uv_px, found.residuals_px, strict=True):
-        canvas.circle(uv_px, 5.0, _CORNER_BGR)
-        canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), _CORNER_BGR)
+        canvas.circle(uv_px, 5.0, _MEASURED_BGR)
+        canvas.line(np.array([uv_px - residual, uv_px + (enlarged - 1) * residual]), _MEASURED_BGR)
         # Away from the middle, where the plate's points are: the fingers are darker, and of one shade.
         width, height = text_size(name, _SIZE)
         u, v = canvas.pixel(uv_px)
         aside = -width - 12 if uv_px[0] < 0.5 * lens.width_px else 12
-        write(canvas.picture, name, (u + aside, v + round(1.6 * height)), _CORNER_BGR, _SIZE)
+        write(canvas.picture, name, (u + aside, v + round(1.6 * height)), _MEASURED_BGR, _SIZE)
     left_out = int(np.count_nonzero(~used))
     legend = (
         f"{int(used.sum())} points of the plate (green), {left_out} left out (red), "

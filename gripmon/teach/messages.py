@@ -1,18 +1,30 @@
-"""What page and server say to each other: JSON, typed on the server's side.  Lengths in metres, angles in radians,
-image coordinates in px (centre of the first pixel: 0, 0), as everywhere.
+"""What the teaching page and its server send each other: JSON, typed on the server's side.  Lengths in metres, angles
+in radians, image coordinates in px (centre of the first pixel: 0, 0), as everywhere.
 """
 
 from __future__ import annotations
 
 from typing import Annotated
 
+import cv2
 import msgspec
+import numpy as np
 from msgspec import Meta
+
+from gripmon.model.records import Image
 
 Pixel = Annotated[float, Meta(ge=-1e5, le=1e5)]
 Place = tuple[Pixel, Pixel]
 Key = Annotated[str, Meta(pattern=r"^[^/*$#?@\s][^/*$#?\s]*$", max_length=100)]
 Opening = Annotated[float, Meta(ge=0.0, le=0.5)]
+
+
+class BadRequest(ValueError):
+    """A request that can't be met; one line says why."""
+
+
+class SavingRefused(Exception):
+    """Nothing was written; one line says why."""
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -87,7 +99,12 @@ class CornerReply(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Expectation(msgspec.Struct, frozen=True, kw_only=True):
-    """As :class:`gripmon.teach.session.Prospects`; ``promise`` in words, ``reachable``: it keeps the limits."""
+    """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
+    ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
+    drift test notices; ``promise``: bounds on its error beside the alert limits, in words, ``reachable``: it keeps
+    them.  ``delay_frames``: after how many frames it notices a step of the TCP by 0.1 mm along x, y and z, None for
+    never.  ``recalibration``: why the corners in view give no new pose, None if they do.
+    """
 
     edges: int
     sigma: tuple[float, ...]
@@ -140,3 +157,13 @@ class Saved(msgspec.Struct, frozen=True, kw_only=True):
 
 class Failure(msgspec.Struct, frozen=True, kw_only=True):
     error: str
+
+
+def encoded(image: Image, ending: str) -> bytes:
+    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
+    grey = image
+    if image.dtype != np.uint8:
+        low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()
+        grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1e-6)), 0.0, 255.0).astype(np.uint8)
+    _, data = cv2.imencode(ending, grey, [cv2.IMWRITE_JPEG_QUALITY, 85] if ending == ".jpg" else [])
+    return bytes(data.tobytes())

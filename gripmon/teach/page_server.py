@@ -19,6 +19,7 @@ from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from socketserver import TCPServer
 from typing import Any, TypeVar
 
 import msgspec
@@ -27,9 +28,21 @@ from gripmon import __version__
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.atomic import write_atomically
 from gripmon.teach.api import Picture
-from gripmon.teach.messages import Failure, Nothing, PictureInfo, Place, Put, Reply, Saved, SaveOrder, State
+from gripmon.teach.messages import (
+    BadRequest,
+    Failure,
+    Nothing,
+    PictureInfo,
+    Place,
+    Put,
+    Reply,
+    Saved,
+    SaveOrder,
+    State,
+    encoded,
+)
 from gripmon.teach.outlines import FINGERS, INNERMOST, POINTS, SIDES, outlines_of
-from gripmon.teach.session import BadRequest, Desk, encoded
+from gripmon.teach.session import TeachSession
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T")
@@ -59,16 +72,11 @@ _HEADERS = {
 
 
 class PageServer:
-    """Serves one desk until it is done.  OSError from the constructor if the port is taken."""
+    """Serves one session until it is done.  OSError from the constructor if the port is taken."""
 
-    def __init__(self, desk: Desk | RoughDesk, port: int = 0):
-        self.done = threading.Event()
-        token = secrets.token_urlsafe(_TOKEN_BYTES)
-        # Not with the address itself: a look-up of its name may take seconds.
-        self._http = _Http((ADDRESS, port), _Handler)
-        self.port = int(self._http.server_address[1])
-        self._http.shop = _Shop(desk, token, frozenset({f"{ADDRESS}:{self.port}", f"localhost:{self.port}"}), self.done)
-        self.url = f"http://{ADDRESS}:{self.port}/{token}/"
+    def __init__(self, session: TeachSession | OutlineSession, port: int = 0):
+        self._http = _Http(session, port)
+        self.done, self.port, self.url = self._http.done, self._http.server_port, self._http.url
         self._thread = threading.Thread(target=self._http.serve_forever, args=(0.1,), name="gripmon-teach-page")
         self._thread.start()
 
@@ -79,26 +87,25 @@ class PageServer:
         self._thread.join()
 
 
-class _Shop:
-    """What the handlers share."""
-
-    def __init__(self, desk: Desk | RoughDesk, token: str, hosts: frozenset[str], done: threading.Event):
-        self.desk, self.token, self.hosts, self.done = desk, token, hosts, done
-        folder = importlib.resources.files("gripmon.teach") / "web"
-        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
-        self.encoder = msgspec.json.Encoder()
-
-
 class _Http(ThreadingHTTPServer):
+    """With what the handlers share."""
+
     daemon_threads = True
     request_queue_size = 32
-    shop: _Shop
+
+    def __init__(self, session: TeachSession | OutlineSession, port: int):
+        self.session, self.done = session, threading.Event()
+        self.token = secrets.token_urlsafe(_TOKEN_BYTES)
+        self.encode = msgspec.json.Encoder().encode
+        folder = importlib.resources.files("gripmon.teach") / "web"
+        self.files = {name: ((folder / file).read_bytes(), kind) for name, (file, kind) in _FILES.items()}
+        super().__init__((ADDRESS, port), _Handler)
+        self.hosts = frozenset({f"{ADDRESS}:{self.server_port}", f"localhost:{self.server_port}"})
+        self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
 
     def server_bind(self) -> None:
-        """Without the look-up of the host's name that the base class makes."""
-        import socketserver
-
-        socketserver.TCPServer.server_bind(self)
+        """Without the look-up of the host's name that the base class makes: it may take seconds."""
+        TCPServer.server_bind(self)
         self.server_name, self.server_port = ADDRESS, int(self.server_address[1])
 
     def handle_error(self, request: Any, client_address: Any) -> None:
@@ -126,7 +133,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(self._post)
 
     def _answer(self, act: Callable[[str], tuple[bytes, str]]) -> None:
-        """Every way out of a request is an answer in one line."""
+        """Every request ends with an answer in one line."""
         status, kind = HTTPStatus.OK, "application/json"
         try:
             data, kind = act(self._checked_path())
@@ -145,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
         with contextlib.suppress(ConnectionError, TimeoutError):
             self._send(status, data, kind)
         if self._last:
-            self.server.shop.done.set()
+            self.server.done.set()
 
     def _send(self, status: HTTPStatus, data: bytes, kind: str) -> None:
         self.send_response(status)
@@ -159,47 +166,47 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(data)
 
     def _failure(self, text: str) -> bytes:
-        return self.server.shop.encoder.encode(Failure(error=" ".join(text.split())))
+        return self.server.encode(Failure(error=" ".join(text.split())))
 
     def _checked_path(self) -> str:
         """What is asked for, below the token."""
-        shop = self.server.shop
+        server = self.server
         hosts = self.headers.get_all("Host") or []
-        if len(hosts) != 1 or hosts[0] not in shop.hosts:
+        if len(hosts) != 1 or hosts[0] not in server.hosts:
             raise _Refused(HTTPStatus.FORBIDDEN, "this is not the host that was asked for")
         origin = self.headers.get("Origin")
-        if origin is not None and origin not in {f"http://{host}" for host in shop.hosts}:
+        if origin is not None and origin not in {f"http://{host}" for host in server.hosts}:
             raise _Refused(HTTPStatus.FORBIDDEN, "asked by another site")
         _, _, path = self.path.partition("/")
         token, slash, rest = path.partition("/")
-        if not slash or not secrets.compare_digest(token.encode(), shop.token.encode()):
+        if not slash or not secrets.compare_digest(token.encode(), server.token.encode()):
             raise _Refused(HTTPStatus.FORBIDDEN, "the address lacks its token; the one that gripmon teach printed")
         return rest
 
     def _get(self, path: str) -> tuple[bytes, str]:
-        shop = self.server.shop
-        if path in shop.files:
-            return shop.files[path]
+        server, session = self.server, self.server.session
+        if path in server.files:
+            return server.files[path]
         if path == "state":
-            return shop.encoder.encode(shop.desk.state()), "application/json"
+            return server.encode(session.state()), "application/json"
         if path.partition("?")[0] == "live.jpg":
-            return shop.desk.live(), "image/jpeg"
+            return session.live(), "image/jpeg"
         number = path.removeprefix("image/").removesuffix(".png")
         if path == f"image/{number}.png" and number.isascii() and number.isdecimal() and len(number) < 6:
-            return shop.desk.still(int(number)), "image/png"
+            return session.still(int(number)), "image/png"
         raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
 
     def _post(self, path: str) -> tuple[bytes, str]:
-        shop, desk = self.server.shop, self.server.shop.desk
+        session = self.server.session
         actions: dict[str, Callable[[], object]] = {
-            "look": lambda: desk.look(self._body(Put)),
-            "take": lambda: self._body(Nothing) and desk.take(),
-            "save": lambda: desk.save(self._body(SaveOrder)),
+            "look": lambda: session.look(self._body(Put)),
+            "take": lambda: self._body(Nothing) and session.take(),
+            "save": lambda: session.save(self._body(SaveOrder)),
             "done": lambda: self._end(self._body(Nothing)),
         }
         if path not in actions:
             raise _Refused(HTTPStatus.NOT_FOUND, "there is nothing at this address")
-        return shop.encoder.encode(actions[path]()), "application/json"
+        return self.server.encode(actions[path]()), "application/json"
 
     def _end(self, _order: Nothing) -> None:
         """The process ends once this has been answered."""
@@ -210,7 +217,7 @@ class _Handler(BaseHTTPRequestHandler):
             raise _Refused(HTTPStatus.UNSUPPORTED_MEDIA_TYPE, "application/json is understood")
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdecimal()):
-            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "a request tells its length")
+            raise _Refused(HTTPStatus.LENGTH_REQUIRED, "a request states its length")
         if len(length) > 9 or int(length) > LONGEST_REQUEST:
             raise _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"at most {LONGEST_REQUEST} bytes")
         try:
@@ -226,10 +233,10 @@ _NAMES = tuple(f"{finger}_{point}_{side}" for point in POINTS for finger in FING
 _COLUMNS = {"left": 0.06, "right": 0.8}
 
 
-class RoughDesk:
-    """As :class:`gripmon.teach.session.Desk`, without a gripper: one image, whose corners go to ``path``.
+class OutlineSession:
+    """As :class:`gripmon.teach.session.TeachSession`, without a gripper: one image, whose corners go to ``path``.
 
-    ``follows``: the command that reads that file, ``note`` what is to be said of it; ``saved``: what was last written,
+    ``follows``: the command that reads that file, ``note``: a remark on it; ``saved``: what was last written,
     None before.
     """
 

@@ -1,4 +1,5 @@
-"""What the page's requests do: images, snapping, saving.  Nothing here knows HTTP.
+"""One gripper before one camera while a person teaches it: images, corners put by hand, what follows from them down to
+the accuracy to expect, and the session behind the page's requests.  Nothing here knows HTTP.
 
 Corners put by hand stay with the page, so that two pages that are open don't disturb each other; images that were
 taken from a live camera belong to all of them.
@@ -6,6 +7,7 @@ taken from a live camera belong to all of them.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import threading
 import time
@@ -13,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-import cv2
 import msgspec
 import numpy as np
 
@@ -28,7 +29,7 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
 from gripmon.model.records import Array, Frame, Image, ReferenceRecord
 from gripmon.monitor import CORNER_COUNTS, MonitorSettings
-from gripmon.teach.accuracy import Promise, expect, promise
+from gripmon.teach.accuracy import Promise, forecast_accuracy
 from gripmon.teach.api import Picture
 from gripmon.teach.corner_pose import (
     CameraError,
@@ -42,6 +43,7 @@ from gripmon.teach.corner_pose import (
 )
 from gripmon.teach.measure import Taught, teach
 from gripmon.teach.messages import (
+    BadRequest,
     CornerReply,
     Expectation,
     PictureInfo,
@@ -51,30 +53,136 @@ from gripmon.teach.messages import (
     Reply,
     Saved,
     SaveOrder,
+    SavingRefused,
     State,
+    encoded,
 )
 from gripmon.teach.snapping import FEWEST_PUT, Snapped, SnappedCorner, Snapper
 from gripmon.teach.views import TeachingImage, TeachingRefused
-from gripmon.teach.visibility import FEWEST_EDGES
 from gripmon.track.edges import TaughtEdges
 
-MOST_PICTURES = 50
+_LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
+_MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
+_STEP_M = 1e-4  # of the TCP, for which the delay is given
 
 
-class BadRequest(ValueError):
-    """The page asks for what can't be; one line says why."""
+class Evaluation(NamedTuple):
+    """Everything that follows from corners put by hand in one image: the reference that it gives (or is known), None
+    with a reason in words; ``expected`` None where too few edges are in view to measure anything.
+    """
+
+    snapped: Snapped
+    pose: CornerPose | None
+    reference: ReferenceRecord | None
+    no_reference: str | None
+    expected: Expectation | None
 
 
-class SavingRefused(Exception):
-    """Nothing was written; one line says why."""
+@dataclass(frozen=True)
+class Setup:
+    """What is known before teaching; ``reference`` None before the hand/eye calibration."""
+
+    camera: Camera
+    gripper: Gripper
+    settings: MonitorSettings
+    reference: ReferenceRecord | None
+    camera_error: CameraError | None = None
+
+    def prior(self, jaw_opening_m: float | None) -> Prior:
+        """Where the gripper is before any corner is put."""
+        if self.reference is not None:
+            return prior_of(self.reference)
+        return usual_view(self.camera, self.gripper, jaw_opening_m)
+
+    def first_places(self, jaw_opening_m: float | None) -> dict[str, Array]:
+        """Where a person finds the corners before any is put, px."""
+        here = place(self.camera, self.gripper, jaw_opening_m, {}, self.prior(jaw_opening_m))[0].cam_T_grip
+        points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]
+        uv_px = self.camera.project(points_m @ here[:3, :3].T + here[:3, 3])
+        return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
+
+    def evaluate(
+        self, image: Image, put_px: Mapping[str, Array], by_hand: Sequence[str], jaw_opening_m: float | None
+    ) -> Evaluation:
+        """Snap, then the reference, then what may be expected.
+
+        ``put_px`` (name: (2,)): corners put by hand; those of them that are ``by_hand`` count as they stand, the others
+        are only where the search begins.
+        """
+        known = self.reference is not None
+        snapper = Snapper(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m)
+        snapped = snapper.snap(image, put_px, jaw_opening_m, self.prior(jaw_opening_m), known)
+        pose, reference, why, expected = None, self.reference, None, None
+        if reference is None:
+            try:
+                fixed = {name: put_px[name] for name in by_hand if name in put_px}
+                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error)
+                reference = _reference_of(pose)
+            except PoseRefused as refused:
+                why = str(refused)
+        if reference is not None:
+            expected = self._expected(image, reference, snapped.jaw_opening_m)
+        return Evaluation(snapped, pose, reference, why, expected)
+
+    def _expected(self, image: Image, reference: ReferenceRecord, jaw_opening_m: float | None) -> Expectation | None:
+        """The numbers that ``gripmon check`` prints, with what this image alone would teach."""
+        gripper, settings, taught = self.gripper, self.settings, None
+        opening_m = gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
+        with contextlib.suppress(TeachingRefused):
+            taught = self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
+        frame = forecast_accuracy(self.camera, gripper, settings, reference, jaw_opening_m, taught)
+        if not frame.enough:
+            return None
+        detectable = foresee(frame.covariance, settings.drift)
+        taken = gripper.innermost_corners(frame.corners, CORNER_COUNTS[settings.recalibrate_corners])
+        promise = Promise.of(frame.protection, settings.policy)
+        return Expectation(
+            edges=frame.edges,
+            sigma=tuple(frame.sigma.tolist()),
+            weakest=tuple(frame.weakest.tolist()),
+            smallest=tuple(detectable.smallest.tolist()),
+            promise=promise.text(),
+            reachable=promise.reachable,
+            delay_frames=tuple(detectable.delay_frames(_STEP_M, axis) for axis in range(3)),
+            recalibration=refusal(gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]),
+        )
+
+    def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
+        """What the images show of every edge.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
+        found = teach(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m, reference, images)
+        opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
+        return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
+
+
+def _reference_of(pose: CornerPose) -> ReferenceRecord:
+    """A pose by corners as the reference; numbers as a file holds them."""
+    transform = to_record(pose.cam_T_grip)
+    rounded = msgspec.structs.replace(
+        transform,
+        translation_m=tuple(round(v, 9) for v in transform.translation_m),
+        rotation_xyzw=tuple(round(v, 10) for v in transform.rotation_xyzw),
+    )
+    digest = hashlib.sha256(msgspec.json.encode(rounded)).hexdigest()[:8]
+    flat = tuple(float(f"{v:.6e}") for v in pose.covariance.ravel().tolist())
+    return ReferenceRecord(f"corners-{digest}", 0, 0, "configuration", rounded, flat)
+
+
+def corners_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
+    """Key, what is wrong, what would be right, of corners in a file or a request; None if nothing is."""
+    for name, uv_px in corners.items():
+        if name not in gripper.corner_ids:
+            return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"
+        if not all(np.isfinite(v) and abs(v) <= _LARGEST_PX for v in uv_px):
+            return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
+    return None
 
 
 class Saving(Protocol):
     """Writes what was taught."""
 
-    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
-        """Raises :class:`SavingRefused`; a file that is in the way is told, not replaced, unless that was agreed."""
+    def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
+        """Raises :class:`SavingRefused`; a file in the way is reported, not replaced, unless that was agreed."""
         ...
 
 
@@ -91,23 +199,23 @@ class Labels:
     live: str | None
 
 
-class Desk:
-    """One teaching session; every method may be called from any thread."""
+class TeachSession:
+    """Images, corners and files of one person's teaching; every method may be called from any thread."""
 
     def __init__(
-        self, bench: Bench, pictures: Sequence[Picture], labels: Labels, saving: Saving, live: Source | None = None
+        self, setup: Setup, pictures: Sequence[Picture], labels: Labels, saving: Saving, live: Source | None = None
     ):
-        self._bench, self._labels, self._saving, self._live = bench, labels, saving, live
+        self._setup, self._labels, self._saving, self._live = setup, labels, saving, live
         self._pictures = list(pictures)
         self._newest: Picture | None = None
         self._why_dark: str | None = None
         self._seen_s = time.monotonic()
-        self._lock = threading.Lock()  # one reckons at a time: OpenCV and NumPy would only hinder each other
+        self._lock = threading.Lock()  # one computes at a time: OpenCV and NumPy would only hinder each other
         self._arrived = threading.Condition()
         self._ended = False
         self._reader: threading.Thread | None = None
         if live is not None:
-            self._reader = threading.Thread(target=self._read, name="gripmon-teach-camera", daemon=True)
+            self._reader = threading.Thread(target=self._read, args=(live,), name="gripmon-teach-camera", daemon=True)
             self._reader.start()
 
     def close(self) -> None:
@@ -121,23 +229,23 @@ class Desk:
             self._reader.join(10.0)
 
     def state(self) -> State:
-        bench, gripper, labels = self._bench, self._bench.gripper, self._labels
+        setup, gripper, labels = self._setup, self._setup.gripper, self._labels
         opening_m = self._pictures[0].jaw_opening_m if self._pictures else None
         finger = gripper.point_finger[gripper.corner_points].tolist()
         return State(
             version=__version__,
-            width_px=bench.camera.width_px,
-            height_px=bench.camera.height_px,
+            width_px=setup.camera.width_px,
+            height_px=setup.camera.height_px,
             corners=gripper.corner_ids,
             fingers={name: gripper.finger_ids[f] for name, f in zip(gripper.corner_ids, finger, strict=True)},
-            places={name: _place(at) for name, at in bench.first_places(opening_m).items()},
+            places={name: _place(at) for name, at in setup.first_places(opening_m).items()},
             pictures=self._infos(),
             live=labels.live,
             has_jaw=gripper.has_jaw,
             jaw_m=(gripper.jaw_min_m, gripper.jaw_nominal_m, gripper.jaw_max_m),
             gripper=gripper.name,
             reference=labels.reference,
-            needed=0 if bench.reference is not None else FEWEST_PUT,
+            needed=0 if setup.reference is not None else FEWEST_PUT,
             robot=labels.robot,
             camera_name=labels.camera_name,
             fixed_names=labels.fixed_names,
@@ -147,15 +255,14 @@ class Desk:
 
     def look(self, put: Put) -> Reply:
         """Snap.  Raises :class:`BadRequest`."""
-        picture = self._picture(put.image)
-        return reply(self._found(put, picture))
+        return reply(self._evaluated(put, self._picture(put.image)))
 
     def take(self) -> tuple[PictureInfo, ...]:
         """Keep the live image.  Raises :class:`BadRequest`."""
         picture = self._picture(None)
         with self._arrived:
-            if len(self._pictures) >= MOST_PICTURES:
-                raise BadRequest(f"{MOST_PICTURES} images are enough")
+            if len(self._pictures) >= _MOST_PICTURES:
+                raise BadRequest(f"{_MOST_PICTURES} images are enough")
             name = f"live-{len(self._pictures):03d}.png"
             self._pictures.append(Picture(name, picture.image, picture.jaw_opening_m, None))
         return self._infos()
@@ -165,8 +272,7 @@ class Desk:
         if not self._pictures:
             self.take()
         number = order.put.image if order.put.image is not None else len(self._pictures) - 1
-        picture = self._picture(number)
-        found = self._found(order.put, picture)
+        found = self._evaluated(order.put, self._picture(number))
         with self._lock:
             try:
                 return self._saving.save(order, found, number, tuple(self._pictures))
@@ -188,9 +294,9 @@ class Desk:
                 return 0.0, ""
             return time.monotonic() - self._seen_s, self._why_dark or "the camera has sent nothing yet"
 
-    def _found(self, put: Put, picture: Picture) -> Found:
-        gripper = self._bench.gripper
-        fault = rough_fault(put.corners, gripper)
+    def _evaluated(self, put: Put, picture: Picture) -> Evaluation:
+        gripper = self._setup.gripper
+        fault = corners_fault(put.corners, gripper)
         if fault is not None:
             raise BadRequest("{}: {}; {}".format(*fault))
         opening_m = put.jaw_opening_m if gripper.has_jaw else None
@@ -199,7 +305,7 @@ class Desk:
             raise BadRequest(f"jaw opening {1e3 * opening_m:g} mm; the gripper's {low_mm:g} to {high_mm:g} mm")
         corners = {name: np.array(at) for name, at in put.corners.items()}
         with self._lock:
-            return self._bench.look(picture.image, corners, put.by_hand, opening_m)
+            return self._setup.evaluate(picture.image, corners, put.by_hand, opening_m)
 
     def _picture(self, number: int | None) -> Picture:
         if number is not None:
@@ -220,13 +326,12 @@ class Desk:
             for number, picture in enumerate(self._pictures)
         )
 
-    def _read(self) -> None:
-        assert self._live is not None
+    def _read(self, live: Source) -> None:
         while not self._ended:
             try:
-                frame = self._live.read()
+                frame = live.read()
             except Exception as error:  # noqa: BLE001  whatever a driver does, the page must hear of it
-                frame = Waiting(f"{self._labels.live}: {error}; gripmon teach anew")
+                frame = Waiting(f"{self._labels.live}: {error}; start gripmon teach again")
                 self._ended = True
             if frame is None:
                 break
@@ -242,19 +347,18 @@ class Desk:
                 self._arrived.notify_all()
 
     def _usable(self, frame: Frame) -> Picture | None:
-        frame = in_full_scale(frame, self._bench.settings.bit_depth)
-        fault = inspect(frame, self._bench.camera, self._bench.gripper)
+        frame = in_full_scale(frame, self._setup.settings.bit_depth)
+        fault = inspect(frame, self._setup.camera, self._setup.gripper)
+        self._why_dark = None if fault is None else f"{self._labels.live}: {fault[1]}"
         if fault is not None:
-            self._why_dark = f"{self._labels.live}: {fault[1]}"
             return None
         assert frame.image is not None
-        self._why_dark = None
         return Picture("live", frame.image, frame.jaw_opening_m, None)
 
 
-def reply(found: Found) -> Reply:
+def reply(found: Evaluation) -> Reply:
     """As JSON has it."""
-    snapped, expected = found.snapped, found.prospects
+    snapped = found.snapped
     return Reply(
         corners=tuple(_corner(corner) for corner in snapped.corners),
         outlines_px={name: _places(line) for name, line in snapped.outlines_px.items()},
@@ -263,47 +367,31 @@ def reply(found: Found) -> Reply:
         refused=snapped.refused,
         jaw_opening_m=snapped.jaw_opening_m,
         jaw_sigma_m=snapped.jaw_sigma_m,
-        reference=_reference(found),
+        reference=None if found.reference is None else _reference_reply(found.reference, found.pose),
         no_reference=found.no_reference,
-        expected=None
-        if expected is None
-        else Expectation(
-            edges=expected.edges,
-            sigma=tuple(expected.sigma.tolist()),
-            weakest=tuple(expected.weakest.tolist()),
-            smallest=tuple(expected.smallest.tolist()),
-            promise=expected.promise.text(),
-            reachable=expected.promise.reachable,
-            delay_frames=expected.delay_frames,
-            recalibration=expected.recalibration,
-        ),
+        expected=found.expected,
     )
 
 
-def _reference(found: Found) -> ReferenceReply | None:
-    if found.reference is None:
-        return None
-    transform = found.reference.cam_T_grip
+def _reference_reply(reference: ReferenceRecord, pose: CornerPose | None) -> ReferenceReply:
     return ReferenceReply(
-        id=found.reference.reference_id,
-        translation_m=transform.translation_m,
-        turn_rad=rotation_angle(from_record(transform)[:3, :3]),
-        sigma=tuple(np.sqrt(np.reshape(found.reference.covariance, (6, 6)).diagonal()).tolist()),
-        corners=None if found.pose is None else len(found.pose.corners),
-        weighted_rms=None if found.pose is None else found.pose.weighted_rms,
-        rival=found.pose is not None and found.pose.rival,
+        id=reference.reference_id,
+        translation_m=reference.cam_T_grip.translation_m,
+        turn_rad=rotation_angle(from_record(reference.cam_T_grip)[:3, :3]),
+        sigma=tuple(np.sqrt(np.reshape(reference.covariance, (6, 6)).diagonal()).tolist()),
+        corners=None if pose is None else len(pose.corners),
+        weighted_rms=None if pose is None else pose.weighted_rms,
+        rival=pose is not None and pose.rival,
     )
 
 
 def _corner(corner: SnappedCorner) -> CornerReply:
-    covariance = corner.covariance_px
+    covariance = None if corner.covariance_px is None else corner.covariance_px.ravel().tolist()
     return CornerReply(
         name=corner.name,
         model_px=_place(corner.model_px),
         uv_px=None if corner.uv_px is None else _place(corner.uv_px),
-        covariance_px2=None
-        if covariance is None
-        else (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1])),
+        covariance_px2=None if covariance is None else (covariance[0], covariance[1], covariance[3]),
         sigma_px=corner.sigma_px,
         inliers=corner.inliers,
         reason=corner.reason,
@@ -317,170 +405,3 @@ def _place(at: Array) -> Place | None:
 
 def _places(points: Array) -> tuple[Place, ...]:
     return tuple((u, v) for u, v in np.round(points, 3).tolist())
-
-
-def encoded(image: Image, ending: str) -> bytes:
-    """An image (h, w) for a browser, ``.png`` or ``.jpg``: eight bits; more are stretched over what is there."""
-    grey = image
-    if image.dtype != np.uint8:
-        low, high = np.percentile(image[::4, ::4], [0.5, 99.5]).tolist()
-        grey = np.clip((image.astype(np.float32) - low) * (255.0 / max(high - low, 1e-6)), 0.0, 255.0).astype(np.uint8)
-    _, data = cv2.imencode(ending, grey, [cv2.IMWRITE_JPEG_QUALITY, 85] if ending == ".jpg" else [])
-    return bytes(data.tobytes())
-
-
-LARGEST_OFF_PX = 100_000.0
-"""Corners are put in the image, or beside it; nothing farther is meant."""
-
-
-class Found(NamedTuple):
-    """Everything that follows from corners put by hand in one image: the reference that it gives (or is known), None
-    with a reason in words.
-    """
-
-    snapped: Snapped
-    pose: CornerPose | None
-    reference: ReferenceRecord | None
-    no_reference: str | None
-    prospects: Prospects | None
-
-
-@dataclass(frozen=True)
-class Bench:
-    """What is known before teaching; ``reference`` None where nobody has calibrated hand and eye."""
-
-    camera: Camera
-    gripper: Gripper
-    settings: MonitorSettings
-    reference: ReferenceRecord | None
-    camera_error: CameraError | None = None
-
-    def prior(self, jaw_opening_m: float | None) -> Prior:
-        """Where the gripper is before any corner is put."""
-        if self.reference is not None:
-            return prior_of(self.reference)
-        return usual_view(self.camera, self.gripper, jaw_opening_m)
-
-    def first_places(self, jaw_opening_m: float | None) -> dict[str, Array]:
-        """Where a person finds the corners before any is put, px."""
-        here = place(self.camera, self.gripper, jaw_opening_m, {}, self.prior(jaw_opening_m))[0].cam_T_grip
-        points_m = self.gripper.points_grip_m(jaw_opening_m)[self.gripper.corner_points]
-        uv_px = self.camera.project(points_m @ here[:3, :3].T + here[:3, 3])
-        return dict(zip(self.gripper.corner_ids, uv_px, strict=True))
-
-    def look(
-        self, image: Image, put_px: Mapping[str, Array], by_hand: Sequence[str], jaw_opening_m: float | None
-    ) -> Found:
-        """Snap, then the reference, then what may be expected.
-
-        ``put_px`` (name: (2,)): corners put by hand; those of them that are ``by_hand`` count as they stand, the others
-        only say about where to look.
-        """
-        known = self.reference is not None
-        snapper = Snapper(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m)
-        snapped = snapper.snap(image, put_px, jaw_opening_m, self.prior(jaw_opening_m), known)
-        pose, reference, why = None, self.reference, None
-        if reference is None:
-            try:
-                fixed = {name: put_px[name] for name in by_hand if name in put_px}
-                pose = pose_from_corners(self.camera, self.gripper, snapped, fixed, self.camera_error)
-                reference = reference_of(pose)
-            except PoseRefused as refused:
-                why = str(refused)
-        expected = None
-        if reference is not None:
-            taught = self._taught_by(image, reference, snapped.jaw_opening_m)
-            expected = prospects(self.camera, self.gripper, self.settings, reference, snapped.jaw_opening_m, taught)
-        return Found(snapped, pose, reference, why, expected)
-
-    def _taught_by(self, image: Image, reference: ReferenceRecord, jaw_opening_m: float | None) -> TaughtEdges | None:
-        """What this image alone would teach; None if nothing."""
-        opening_m = self.gripper.jaw_nominal_m if jaw_opening_m is None else jaw_opening_m
-        try:
-            return self.taught(reference, [TeachingImage(image, opening_m, "")])[1]
-        except TeachingRefused:
-            return None
-
-    def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
-        """What the images show of every edge.  Raises :class:`gripmon.teach.views.TeachingRefused`."""
-        found = teach(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m, reference, images)
-        opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
-        arrays = TaughtEdges.of(found.edges, self.gripper, _pose(reference), opening_m)
-        return found, arrays
-
-
-def reference_of(pose: CornerPose) -> ReferenceRecord:
-    """A pose by corners as the reference; numbers as a file holds them."""
-    transform = to_record(pose.cam_T_grip)
-    rounded = msgspec.structs.replace(
-        transform,
-        translation_m=tuple(round(v, 9) for v in transform.translation_m),
-        rotation_xyzw=tuple(round(v, 10) for v in transform.rotation_xyzw),
-    )
-    digest = hashlib.sha256(msgspec.json.encode(rounded)).hexdigest()[:8]
-    flat = tuple(float(f"{v:.6e}") for v in pose.covariance.ravel().tolist())
-    return ReferenceRecord(f"corners-{digest}", 0, 0, "configuration", rounded, flat)
-
-
-def _pose(reference: ReferenceRecord) -> Array:
-    from gripmon.model.geometry import from_record
-
-    return from_record(reference.cam_T_grip)
-
-
-def rough_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
-    """Key, what is wrong, what would be right, of corners that somebody wrote or sent; None if nothing is."""
-    for name, uv_px in corners.items():
-        if name not in gripper.corner_ids:
-            return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"
-        if not all(np.isfinite(v) and abs(v) <= LARGEST_OFF_PX for v in uv_px):
-            return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
-    return None
-
-
-@dataclass(frozen=True, slots=True)
-class Prospects:
-    """Expected of one frame, vectors (6,) of position, then rotation, m and rad: ``sigma`` standard deviations,
-    ``weakest`` one standard deviation along the least certain direction, ``smallest`` step along each axis that the
-    drift test notices; ``promise``: bounds on its error, beside the alert limits.  ``delay_frames``: after how many
-    frames it notices a step of the TCP by 0.1 mm along x, y and z, None for never.  ``recalibration``: why the corners
-    in view give no new pose, None if they do.
-    """
-
-    edges: int
-    sigma: Array
-    weakest: Array
-    smallest: Array
-    promise: Promise
-    delay_frames: tuple[int | None, ...]
-    recalibration: str | None
-
-
-STEP_M = 1e-4
-"""Step of the TCP for which the delay is told."""
-
-
-def prospects(
-    camera: Camera,
-    gripper: Gripper,
-    settings: MonitorSettings,
-    reference: ReferenceRecord,
-    jaw_opening_m: float | None,
-    taught: TaughtEdges | None = None,
-) -> Prospects | None:
-    """The numbers that ``gripmon check`` prints; None where too few edges are in view to measure anything."""
-    outlook = expect(camera, gripper, settings, reference, jaw_opening_m, taught)
-    if outlook.edges < FEWEST_EDGES:
-        return None
-    foresight = foresee(outlook.covariance, settings.drift)
-    taken = gripper.innermost_corners(outlook.corners, CORNER_COUNTS[settings.recalibrate_corners])
-    points_grip_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points][taken]
-    return Prospects(
-        outlook.edges,
-        outlook.sigma,
-        outlook.weakest,
-        foresight.smallest,
-        promise(outlook.protection, settings.policy),
-        tuple(foresight.delay_frames(STEP_M, axis) for axis in range(3)),
-        refusal(points_grip_m),
-    )

@@ -2,7 +2,9 @@
 are not seen.
 
 Beyond the monitor's own rule (a face must look at the camera) fingers that stand before each other are found: the
-monitor will look for such an edge, and see the other finger.
+monitor will look for such an edge, and see the other finger.  And margins: how far visible corners are from the image's
+border, how far the camera may move until too few of them are in view, and over which part of the jaw's travel the view
+suffices.
 """
 
 from __future__ import annotations
@@ -19,7 +21,6 @@ from gripmon.model.geometry import exp_rotation, invert, make_transform
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.accuracy import Promise, foresee_frame, promise
 from gripmon.track.edges import TaughtEdges
 from gripmon.track.edges.prediction import CORNER_MARGIN_PX, EdgeLayout, lay_out
 
@@ -182,10 +183,8 @@ SOUGHT_RAD = np.pi
 """How far a turn of the camera is followed."""
 
 STEP_PX = 16.0
-"""Image motion between two looks on the way: a gap in the view that is narrower than this may be passed over."""
+"""Image motion between two views on the way: a gap in the view that is narrower than this may be passed over."""
 
-_RATE_STEP = 1e-6
-_HALVINGS = 24
 _SIDES = ("left", "right", "top", "bottom")
 
 
@@ -230,88 +229,79 @@ def border(rig: Rig, sight: Sight) -> Border | None:
     u, v = sight.uv_px[which].T
     distances = np.stack([u, rig.camera.width_px - 1.0 - u, v, rig.camera.height_px - 1.0 - v])
     side, corner = np.unravel_index(int(distances.argmin()), distances.shape)
-    return Border(
-        dict(zip(_SIDES, distances.min(axis=1).tolist(), strict=True)),
-        float(distances.min()),
-        rig.gripper.corner_ids[which[corner]],
-        _SIDES[side],
-    )
+    by_side_px = dict(zip(_SIDES, distances.min(axis=1).tolist(), strict=True))
+    return Border(by_side_px, float(distances.min()), rig.gripper.corner_ids[which[corner]], _SIDES[side])
 
 
 def freedom(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> Freedom:
     """How far the camera may shift and turn along each of its axes while the jaws stand at an opening."""
-    limits, reasons = np.full((6, 2), np.nan), []
-    for axis in range(6):
-        pair: list[str | None] = []
-        for k, sign in enumerate((-1.0, 1.0)):
-            way = np.zeros(6)
-            way[axis] = sign
-            limits[axis, k], reason = _limit(rig, cam_T_grip, jaw_opening_m, way)
-            pair.append(reason)
-        reasons.append((pair[0], pair[1]))
-    return Freedom(limits, tuple(reasons))
+    found = [_limit(rig, cam_T_grip, jaw_opening_m, sign * axis) for axis in np.eye(6) for sign in (-1.0, 1.0)]
+    limits = np.reshape([amount for amount, _ in found], (6, 2))
+    return Freedom(limits, tuple((found[k][1], found[k + 1][1]) for k in range(0, 12, 2)))
 
 
 def sideways_m(rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None) -> float:
     """The shortest shift of the camera along its x or y, either way, after which the monitor can't measure; infinite
     for none.  Found in steps that are coarser than those of :func:`freedom`, to a hundredth of a step.
     """
-    ways = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
-    limits = [_limit(rig, cam_T_grip, jaw_opening_m, way, 4.0 * STEP_PX, halvings=7)[0] for way in ways]
+    axes = np.concatenate([np.eye(6)[:2], -np.eye(6)[:2]])
+    limits = [_limit(rig, cam_T_grip, jaw_opening_m, axis, 4.0 * STEP_PX, halvings=7)[0] for axis in axes]
     return float(np.nan_to_num(limits, nan=np.inf).min())
 
 
 def _limit(
-    rig: Rig,
-    cam_T_grip: Array,
-    jaw_opening_m: float | None,
-    way: Array,
-    step_px: float = STEP_PX,
-    halvings: int = _HALVINGS,
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, step_px: float = STEP_PX, halvings: int = 24
 ) -> tuple[float, str | None]:
-    """The amount of a motion ``way`` (6,), a unit along one axis, after which the view doesn't suffice, and why; NaN
-    for never.
+    """The amount of a motion along ``axis`` (6,), a unit vector, after which the view doesn't suffice, and why; NaN for
+    never.
     """
-    sought = SOUGHT_M if way[:3].any() else SOUGHT_RAD
+
+    def view(amount: float) -> Sight:
+        return see(rig, moved_camera(cam_T_grip, amount * axis), jaw_opening_m)
+
+    sought = SOUGHT_M if axis[:3].any() else SOUGHT_RAD
     good, bad = 0.0, 0.0
-    sight = see(rig, cam_T_grip, jaw_opening_m)
+    sight = view(0.0)
+    if (reason := sight.reason) is not None:
+        return 0.0, reason
     while sight.enough:
         if bad >= sought:
             return float("nan"), None
         good = bad
-        bad = min(bad + _step(rig, cam_T_grip, jaw_opening_m, way, good, sight, step_px), sought)
-        sight = see(rig, moved_camera(cam_T_grip, bad * way), jaw_opening_m)
-    for _ in range(halvings if bad > 0.0 else 0):
-        middle = 0.5 * (good + bad)
-        there = see(rig, moved_camera(cam_T_grip, middle * way), jaw_opening_m)
-        if there.enough:
-            good = middle
-        else:
-            bad, sight = middle, there
+        bad = min(bad + _step(rig, cam_T_grip, jaw_opening_m, axis, good, sight, step_px), sought)
+        sight = view(bad)
+    bad, sight = _first_failing(good, bad, sight, view, halvings)
     return bad, sight.reason
 
 
 def _step(
-    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, way: Array, amount: float, sight: Sight, step_px: float
+    rig: Rig, cam_T_grip: Array, jaw_opening_m: float | None, axis: Array, amount: float, sight: Sight, step_px: float
 ) -> float:
     """How much farther moves the visible corners by ``step_px`` at most."""
-    gripper = rig.gripper
+    gripper, small = rig.gripper, 1e-6  # m or rad, for the derivative
     points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[sight.visible]]
-    pose = moved_camera(cam_T_grip, (amount + _RATE_STEP) * way)
+    pose = moved_camera(cam_T_grip, (amount + small) * axis)
     moved_px = rig.camera.project(points_m @ pose[:3, :3].T + pose[:3, 3]) - sight.uv_px[sight.visible]
-    rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / _RATE_STEP
+    rate = float(np.nanmax(np.linalg.norm(moved_px, axis=1), initial=0.0)) / small
     # Near the lens's axis a shift along it moves nothing, yet.
-    farthest = (0.05 if way[3:].any() else 0.02) * (1.0 if way[3:].any() else 1.0 + 50.0 * amount)
+    farthest = 0.05 if axis[3:].any() else 0.02 * (1.0 + 50.0 * amount)
     return min(step_px / max(rate, 1e-12), farthest)
 
 
-OPENINGS = 121
-"""Openings that are looked at; where the view fails between two that both suffice is not seen."""
-
-CERTAINTY_AT = 13
-"""Openings at which a frame's accuracy is reckoned."""
-
-_OPENING_HALVINGS = 14
+def _first_failing(
+    good: float, bad: float, there: Sight, view: Callable[[float], Sight], halvings: int
+) -> tuple[float, Sight]:
+    """By bisection between a value whose view suffices and one whose view, ``there``, doesn't: the nearest such value
+    to the former that was found, and its view.
+    """
+    for _ in range(halvings):
+        middle = 0.5 * (good + bad)
+        sight = view(middle)
+        if sight.enough:
+            good = middle
+        else:
+            bad, there = middle, sight
+    return bad, there
 
 
 class Gap(NamedTuple):
@@ -335,75 +325,37 @@ class JawTravel:
     edges: NDArray[np.intp]
 
 
-def over_jaw(rig: Rig, cam_T_grip: Array, count: int = OPENINGS) -> JawTravel | None:
+def over_jaw(rig: Rig, cam_T_grip: Array, count: int = 121) -> JawTravel | None:
     """What is visible at ``count`` openings from end to end, the ends of gaps found between them; None for a gripper
-    whose jaw doesn't move.
+    whose jaw doesn't move.  Where the view fails only between two openings is not noticed.
     """
     gripper = rig.gripper
     if not gripper.jaw_max_m > gripper.jaw_min_m:
         return None
-    openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, count)
-    sights = [see(rig, cam_T_grip, opening_m) for opening_m in openings_m.tolist()]
 
-    def look(opening_m: float) -> Sight:
+    def view(opening_m: float) -> Sight:
         return see(rig, cam_T_grip, opening_m)
 
-    gaps = _gaps(openings_m, [s.enough for s in sights], look)
+    openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, count)
+    sights = list(map(view, openings_m.tolist()))
+    gaps = _gaps(openings_m.tolist(), sights, view)
     lost_m = sum(gap.to_m - gap.from_m for gap in gaps)
     share = 1.0 - lost_m / (gripper.jaw_max_m - gripper.jaw_min_m)
-    return JawTravel(
-        max(share, 0.0),
-        gaps,
-        openings_m,
-        np.array([s.corners for s in sights], dtype=np.intp),
-        np.array([s.edges for s in sights], dtype=np.intp),
-    )
+    corners, edges = np.array([(s.corners, s.edges) for s in sights], dtype=np.intp).T
+    return JawTravel(max(share, 0.0), gaps, openings_m, corners, edges)
 
 
-class Certainty(NamedTuple):
-    """At openings (n,) from end to end: ``sigma_m`` (n,) standard deviation of a frame's TCP along its least certain
-    direction, NaN where too little is visible, and what the frame may ``promise``, None there.
-    """
-
-    openings_m: Array
-    sigma_m: Array
-    promises: tuple[Promise | None, ...]
-
-
-def certainty(rig: Rig, cam_T_grip: Array, count: int = CERTAINTY_AT) -> Certainty:
-    """How exact a frame is over the jaw's travel."""
-    openings_m = np.linspace(rig.gripper.jaw_min_m, rig.gripper.jaw_max_m, count)
-    sigma_m = np.full(count, np.nan)
-    promises: list[Promise | None] = [None] * count
-    for k, opening_m in enumerate(openings_m.tolist()):
-        if see(rig, cam_T_grip, opening_m).enough:
-            frame = foresee_frame(rig, cam_T_grip, opening_m)
-            sigma_m[k] = np.sqrt(np.linalg.eigvalsh(frame.covariance[:3, :3])[-1])
-            promises[k] = promise(frame.protection, rig.settings.policy)
-    return Certainty(openings_m, sigma_m, tuple(promises))
-
-
-def _gaps(openings_m: Array, enough: list[bool], look: Callable[[float], Sight]) -> tuple[Gap, ...]:
+def _gaps(openings_m: list[float], sights: list[Sight], view: Callable[[float], Sight]) -> tuple[Gap, ...]:
     """The runs without enough, their ends by bisection."""
-    change = np.flatnonzero(np.diff(np.concatenate([[1], np.array(enough, dtype=np.int8), [1]])))
+    change = np.flatnonzero(np.diff([1, *(int(sight.enough) for sight in sights), 1]))
     gaps = []
     for first, beyond in change.reshape(-1, 2).tolist():
-        low_m, high_m = float(openings_m[first]), float(openings_m[beyond - 1])
+        low_m, high_m = openings_m[first], openings_m[beyond - 1]
         if first > 0:
-            low_m = _boundary(float(openings_m[first - 1]), low_m, look)
+            low_m, _ = _first_failing(openings_m[first - 1], low_m, sights[first], view, 14)
         if beyond < len(openings_m):
-            high_m = _boundary(float(openings_m[beyond]), high_m, look)
-        reason = look(float(openings_m[(first + beyond - 1) // 2])).reason
+            high_m, _ = _first_failing(openings_m[beyond], high_m, sights[beyond - 1], view, 14)
+        reason = sights[(first + beyond - 1) // 2].reason
         assert reason is not None
         gaps.append(Gap(low_m, high_m, reason))
     return tuple(gaps)
-
-
-def _boundary(good_m: float, bad_m: float, look: Callable[[float], Sight]) -> float:
-    for _ in range(_OPENING_HALVINGS):
-        middle_m = 0.5 * (good_m + bad_m)
-        if look(middle_m).enough:
-            good_m = middle_m
-        else:
-            bad_m = middle_m
-    return bad_m

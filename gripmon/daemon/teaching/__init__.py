@@ -2,7 +2,7 @@
 configuration that runs.  It stands here because it knows configurations, which the room ``teach`` does not.
 """
 
-from gripmon.daemon.teaching.inputs import Inputs, Named, live_settings, read_inputs, read_rough, rough_desk
+from gripmon.daemon.teaching.inputs import Inputs, Named, live_settings, outline_session, read_inputs, read_rough
 from gripmon.daemon.teaching.saving import FileSaving
 from gripmon.daemon.teaching.written import name_taught
 
@@ -12,7 +12,7 @@ __all__ = [
     "Named",
     "live_settings",
     "name_taught",
+    "outline_session",
     "read_inputs",
     "read_rough",
-    "rough_desk",
 ]

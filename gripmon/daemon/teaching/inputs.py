@@ -30,8 +30,8 @@ from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_any, read_picture
 from gripmon.teach.corner_pose import CameraError
 from gripmon.teach.outlines import RoughCorners
-from gripmon.teach.page_server import RoughDesk
-from gripmon.teach.session import Bench, rough_fault
+from gripmon.teach.page_server import OutlineSession
+from gripmon.teach.session import Setup, corners_fault
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 
@@ -62,7 +62,7 @@ class Inputs:
     the files of ``gripmon calibrate`` that a configuration names in place of sections, by key.
     """
 
-    bench: Bench
+    setup: Setup
     pictures: tuple[Picture, ...]
     gripper_path: Path
     folder: Path
@@ -82,26 +82,26 @@ def read_inputs(named: Named) -> Inputs:
     config, opening_m = None, named.jaw_opening_m
     if named.config is not None:
         config = load_config(named.config, check_source=False, with_taught=False)
-        bench = Bench(config.camera, config.gripper, config.settings.monitor, config.reference)
+        setup = Setup(config.camera, config.gripper, config.settings.monitor, config.reference)
         gripper_path = config.gripper_path
         if opening_m is None and config.settings.jaw.source == "fixed":
             opening_m = config.jaw_opening_m
     else:
         gripper, gripper_path = _gripper(named.gripper)
         camera, error, reference = _calibrations(named, gripper)
-        bench = Bench(camera, gripper, MonitorSettings(), reference, error)
-    if named.jaw_source is not None and not bench.gripper.has_jaw:
+        setup = Setup(camera, gripper, MonitorSettings(), reference, error)
+    if named.jaw_source is not None and not setup.gripper.has_jaw:
         raise InputError("--jaw-source: the gripper has no jaw; leave it out")
-    depth = bench.settings.bit_depth
-    pictures = tuple(read_picture(path, bench.camera, bench.gripper, depth, opening_m) for path in named.images)
+    depth = setup.settings.bit_depth
+    pictures = tuple(read_picture(path, setup.camera, setup.gripper, depth, opening_m) for path in named.images)
     folder = named.out or (Path() if config is None else config.directory)
     calibrations = {"camera": named.camera, "reference": named.reference}
     return Inputs(
-        bench=bench,
+        setup=setup,
         pictures=pictures,
         gripper_path=gripper_path,
         folder=folder,
-        source=None if config is not None else _source(named, bench.camera),
+        source=None if config is not None else _source(named, setup.camera),
         config=config,
         robot=config.settings.robot if config is not None else named.robot or ROBOT,
         camera_name=config.settings.camera_name if config is not None else named.camera_name or CAMERA_NAME,
@@ -118,13 +118,13 @@ def read_rough(path: Path, gripper: Gripper) -> dict[str, tuple[float, float]]:
         rough = to_settings(read_yaml(path), RoughCorners)
     # The file may be the one of calibrate plane --infer, which also names points on edges: they are no corners.
     corners = {n: at for n, at in rough.corners.items() if n in gripper.corner_ids or n not in gripper.point_ids}
-    fault = rough_fault(corners, gripper)
+    fault = corners_fault(corners, gripper)
     if fault is not None:
         raise InputError(f"{path}: {fault[0]}: {fault[1]}; {fault[2]}")
     return corners
 
 
-def rough_desk(image: Path, camera: Path | None, folder: Path) -> RoughDesk:
+def outline_session(image: Path, camera: Path | None, folder: Path) -> OutlineSession:
     """A page without a gripper: rough corners for ``gripmon calibrate plane --infer``, to be saved in ``folder``."""
     shown, target = read_any(image), None
     if camera is not None:
@@ -146,7 +146,7 @@ def rough_desk(image: Path, camera: Path | None, folder: Path) -> RoughDesk:
     )
     note = f"{plate}; with jaws that move also --jaw-range MIN:MAX (m)"
     picture = Picture(image.name, shown, None, str(image))
-    return RoughDesk(picture, folder / ROUGH, shlex.join(map(str, words)), note)
+    return OutlineSession(picture, folder / ROUGH, shlex.join(map(str, words)), note)
 
 
 def _gripper(path: Path | None) -> tuple[Gripper, Path]:

@@ -22,8 +22,8 @@ from gripmon.daemon.teaching.written import config_text, with_taught, yaml_value
 from gripmon.model.atomic import write_atomically
 from gripmon.model.records import ReferenceRecord
 from gripmon.teach.api import Picture, taught_model, to_yaml
-from gripmon.teach.messages import Saved, SaveOrder
-from gripmon.teach.session import Found, Labels, SavingRefused
+from gripmon.teach.messages import Saved, SaveOrder, SavingRefused
+from gripmon.teach.session import Evaluation, Labels
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtModel
 
@@ -49,7 +49,7 @@ class FileSaving:
 
     def labels(self) -> Labels:
         """What the page shows."""
-        inputs, known = self._inputs, self._inputs.bench.reference
+        inputs, known = self._inputs, self._inputs.setup.reference
         return Labels(
             robot=inputs.robot,
             camera_name=inputs.camera_name,
@@ -60,7 +60,7 @@ class FileSaving:
             live=inputs.live,
         )
 
-    def save(self, order: SaveOrder, found: Found, number: int, pictures: Sequence[Picture]) -> Saved:
+    def save(self, order: SaveOrder, found: Evaluation, number: int, pictures: Sequence[Picture]) -> Saved:
         """As :class:`gripmon.teach.session.Saving`."""
         paths = self._paths
         notes: list[str] = []
@@ -122,30 +122,30 @@ class FileSaving:
     def _taught(
         self,
         order: SaveOrder,
-        found: Found,
+        found: Evaluation,
         reference: ReferenceRecord,
         pictures: Sequence[Picture],
         files: Mapping[str, bytes],
     ) -> tuple[TaughtModel, list[str]]:
 
-        bench, opening_m = self._inputs.bench, found.snapped.jaw_opening_m
+        setup, opening_m = self._inputs.setup, found.snapped.jaw_opening_m
         given = order.put.jaw_opening_m is not None
         pictures = [replace(p, jaw_opening_m=opening_m) if given or p.jaw_opening_m is None else p for p in pictures]
-        nominal_m = bench.gripper.jaw_nominal_m
+        nominal_m = setup.gripper.jaw_nominal_m
         images = [
             TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, p.name) for p in pictures
         ]
         try:
-            taught, _ = bench.taught(reference, images)
+            taught, _ = setup.taught(reference, images)
         except TeachingRefused as refused:
             raise SavingRefused(f"no taught model: {refused}; or save without it") from None
         left = [f"{name} is not taught: {why}" for name, why in taught.untaught.items()]
         model = taught_model(
-            taught, bench.camera, bench.gripper, bench.settings, reference, pictures, self._inputs.command, files
+            taught, setup.camera, setup.gripper, setup.settings, reference, pictures, self._inputs.command, files
         )
         return model, [*(f"left out: {why}" for why in taught.left_out.values()), *taught.notes, *left]
 
-    def _corners(self, order: SaveOrder, found: Found, image: str) -> str:
+    def _corners(self, order: SaveOrder, found: Evaluation, image: str) -> str:
         """Corners as ``--corners`` reads them."""
         lines = [
             f"# Fingertip corners in {image}, written by {self._inputs.command} (gripmon {__version__})",
@@ -163,7 +163,7 @@ class FileSaving:
             lines[-1] = "corners: {}"
         return "\n".join(lines) + "\n"
 
-    def _config(self, order: SaveOrder, found: Found, reference: ReferenceRecord, taught: bool) -> str:
+    def _config(self, order: SaveOrder, found: Evaluation, reference: ReferenceRecord, taught: bool) -> str:
 
         given = self._inputs.config
         if given is not None:
@@ -185,7 +185,7 @@ class FileSaving:
         """As a configuration in ``to``, or the folder written to, names it."""
         return Path(os.path.relpath(path.resolve(), (to or self._inputs.folder).resolve())).as_posix()
 
-    def _try_out(self, order: SaveOrder, found: Found, texts: Mapping[str, str]) -> None:
+    def _try_out(self, order: SaveOrder, found: Evaluation, texts: Mapping[str, str]) -> None:
         """Whether ``gripmon check`` will take the configuration, in a folder of its own; else nothing is written."""
         if "config" not in texts:
             return

@@ -72,7 +72,7 @@ def config_text(
         parts[-1] += " to this file"
     else:
         parts.append(lines_of(source, 2))
-    if inputs.bench.gripper.has_jaw:
+    if inputs.setup.gripper.has_jaw:
         parts += ["", _jaw(inputs, jaw_opening_m, jaw_known)]
     parts += ["", _defaults()]
     return "\n".join(parts) + "\n"
@@ -82,7 +82,7 @@ def _camera(inputs: Inputs, folder: Callable[[Path], str]) -> list[str]:
     if "camera" in inputs.calibrations:
         there = yaml_value(folder(inputs.calibrations["camera"]))
         return [f"camera: {there}  # file of gripmon calibrate intrinsics, relative to this file; or a section"]
-    return ["camera:", lines_of(inputs.bench.camera.settings, 2)]
+    return ["camera:", lines_of(inputs.setup.camera.settings, 2)]
 
 
 def with_taught(path: Path, taught: str) -> str:
