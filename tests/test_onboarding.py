@@ -34,7 +34,8 @@ from gripmon.model.targets import CircleGrid, Target
 from gripmon.simulate import Simulator, make_scenario
 from gripmon.simulate.background import _TILE_PX
 from gripmon.teach.hand_eye import KnownGripper, UnknownGripper
-from gripmon.teach.outlines import inferred_model, measure_known, measure_outlines, outlines_of, points_in_gripper
+from gripmon.teach.outline_edges import measure_outlines
+from gripmon.teach.outlines import inferred_model, measure_known, outlines_of, points_in_gripper
 
 TRUE = nominal_cam_T_grip()
 TARGETS: dict[str, Target] = {"discs": DISCS, "chequerboard": CHEQUERBOARD, "charuco": CHARUCO}

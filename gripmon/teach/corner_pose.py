@@ -21,7 +21,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord
-from gripmon.teach.snapping import Snapped
+from gripmon.track.edges import Measurement
 
 BY_HAND_PX = 1.0
 """Standard deviation of a corner that a person set by hand where it wasn't measured, or against what was."""
@@ -30,6 +30,42 @@ MADE_TO_M = 2e-5
 """So exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
 
 _STEP = 0.3  # central differences reach so many standard deviations
+
+
+@dataclass(frozen=True, slots=True)
+class SnappedCorner:
+    """One corner: ``model_px`` (2,) where the pose puts it, NaN beyond the lens; ``uv_px`` (2,) where its edges meet,
+    with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused and ``reason`` says why;
+    ``inliers``: part of the profiles on its edges that agree, None without any.
+    """
+
+    name: str
+    model_px: Array
+    uv_px: Array | None
+    covariance_px: Array | None
+    sigma_px: float | None
+    inliers: float | None
+    reason: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Snapped:
+    """What the image shows near corners put by hand.
+
+    ``refused``: why nothing was found, in words; ``cam_T_grip`` (4, 4) then is the rough pose, else the measured one.
+    ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2) that agree;
+    ``share`` of the profiles that do.  ``jaw_opening_m`` with ``jaw_sigma_m``: as given, or as seen where it wasn't.
+    """
+
+    cam_T_grip: Array
+    corners: tuple[SnappedCorner, ...]
+    outlines_px: dict[str, Array]
+    edge_points_px: Array
+    share: float
+    jaw_opening_m: float | None
+    jaw_sigma_m: float | None
+    refused: str | None
+    measurement: Measurement | None
 
 
 class PoseRefused(ValueError):

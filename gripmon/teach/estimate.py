@@ -1,13 +1,15 @@
-"""From an edge's lines in the teaching images to its taught offset, depth and standard deviations.
+"""From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that refuse
+images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
 
-Noise (:func:`pool`): an edge's offset in the images is its share of what is common to all (the reference, or the
-reported opening, is off by a little; bevels make every outline lie inside of the sharp one) plus what is its own, plus
-noise, which clutter behind an outline can make large.  How much edges have of their own is read from all of them, and
-what of an offset their noise explains is taken back: a gripper with sharp edges isn't taught the clutter of its images.
+Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images is its part of what is common to all (the
+reference, or the reported opening, is off by a little; bevels make every outline lie inside of the sharp one) plus what
+is its own, plus noise, which clutter behind an outline can make large.  How much edges have of their own is estimated
+from all of them, and what of an offset their noise explains is taken back: a gripper with sharp edges isn't taught the
+clutter of its images.
 
-Depth (:func:`slopes`): images at one pose can't show it, but the shape of a bevel tells.  A bevel or a rounding cuts an
-edge off; what shows instead is its rim, which lies on one of the two faces that would have met in the sharp edge.  So
-an offset across the line of sight goes with one along it: the rim lies in the face.
+Depth (:func:`~gripmon.teach.lines.slopes`): images at one pose can't show it, but the shape of a bevel does.  A bevel
+or a rounding cuts an edge off; what shows instead is its rim, which lies on one of the two faces that would have met in
+the sharp edge.  So an offset across the line of sight goes with one along it: the rim lies in the face.
 """
 
 from __future__ import annotations
@@ -20,9 +22,8 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from gripmon.judge.smoothing import GATE
-from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array
-from gripmon.teach.lines import Line, find_line
+from gripmon.teach.lines import SLOPE_SHARE, UNKNOWN_SLOPE, Line, Pooled, find_line, pool, slopes
 from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Viewer, sampled
 from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
@@ -227,106 +228,6 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
         information[i] += np.square(away).sum() / per_image_m2
         moment[i] += float(away @ seen_m) / per_image_m2
     return moment / information, 1.0 / np.sqrt(information)
-
-
-_ROUNDS = 30
-_SETTLED = 1e-3
-
-
-@dataclass(frozen=True, slots=True)
-class Pooled:
-    """Offsets ``ends_m`` (e, 2) and their covariances (e, 2, 2), ``own_m`` (e, 2) what of them is the edges' own,
-    ``usual_own_m`` (g,) its standard deviation over edges of a kind, ``common`` (m,) what is common and
-    ``common_covariance`` (m, m).
-    """
-
-    ends_m: Array
-    covariance_m2: Array
-    own_m: Array
-    usual_own_m: Array
-    common: Array
-    common_covariance: Array
-
-
-def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp], prior_covariance: Array) -> Pooled:
-    """Posterior of the offsets ``ends_m`` (e, 2), whose noise has ``covariance_m2`` (e, 2, 2).
-
-    ``rows`` (e, 2, m): metres of offset by what is common, which is known to ``prior_covariance`` (m, m) about zero.
-    ``kind`` (e,): edges of a kind (outlines, creases) have a standard deviation of their own in common, both ends of an
-    edge the same offset but for half of it; estimated by restricted maximum likelihood (expectation maximisation).
-    """
-    kinds = int(kind.max()) + 1
-    own_m2 = np.full(kinds, float(np.mean(np.square(ends_m))) + 1e-16)
-    common = np.zeros(rows.shape[2])
-    mean, covariance, own, common_covariance = ends_m, covariance_m2, ends_m, prior_covariance
-    for _ in range(_ROUNDS):
-        shape = own_m2[kind][:, None, None] * _SHAPE
-        weight = np.linalg.inv(covariance_m2 + shape)
-        information = np.einsum("eim,eij,ejn->mn", rows, weight, rows) + np.linalg.inv(prior_covariance)
-        common_covariance = np.linalg.inv(information)
-        common = common_covariance @ np.einsum("eim,eij,ej->m", rows, weight, ends_m)
-        gain = shape @ weight  # of what isn't common this much is the edge's own
-        own = np.einsum("eij,ej->ei", gain, ends_m - np.einsum("eim,m->ei", rows, common))
-        mean = np.einsum("eim,m->ei", rows, common) + own
-        rest = np.eye(2) - gain
-        own_covariance = shape - gain @ shape + gain @ _quadratic(rows, common_covariance) @ gain.transpose(0, 2, 1)
-        lever = rest @ rows
-        covariance = shape - gain @ shape + _quadratic(lever, common_covariance)
-        whitened = np.einsum("ij,ei,ej->e", _INVERSE_SHAPE, own, own) + np.einsum(
-            "ij,eji->e", _INVERSE_SHAPE, own_covariance
-        )
-        new = np.array([np.mean(whitened[kind == k]) / 2.0 if (kind == k).any() else 0.0 for k in range(kinds)])
-        settled = np.abs(np.sqrt(new) - np.sqrt(own_m2)).max() < _SETTLED * np.sqrt(np.mean(own_m2) + 1e-16)
-        own_m2 = new + 1e-18
-        if settled:
-            break
-    return Pooled(mean, covariance, own, np.sqrt(own_m2), common, common_covariance)
-
-
-_SHAPE = np.array([[1.0, 0.5], [0.5, 1.0]])
-_INVERSE_SHAPE = np.linalg.inv(_SHAPE)
-
-
-def _quadratic(rows: Array, covariance: Array) -> Array:
-    return np.asarray(rows @ covariance @ rows.transpose(0, 2, 1))
-
-
-LARGEST_SLOPE = 5.0
-"""Depth for each metre of offset at most: a face that is seen more grazingly than 11° tells no depth."""
-
-UNKNOWN_SLOPE = 2.0
-"""Standard deviation of the depth, for each metre of offset, where faces don't tell it."""
-
-SLOPE_SHARE = 0.5
-"""Standard deviation of a depth that faces tell, as a share of it: a rounding's line lies less deep than a bevel's."""
-
-
-def slopes(
-    gripper: Gripper, points_grip_m: Array, crease: NDArray[np.bool_], axes: tuple[Array, Array], offset_m: Array
-) -> Array:
-    """(e,) depth of an edge's rim for each metre of its offset across the line of sight (e,); NaN where the gripper
-    file has no two faces at the edge.
-
-    ``axes`` as :func:`sight_axes` gives them.  An outline of equal bevels is the rim that lies
-    farther out, a crease shows the rim on the side to which it is shifted.
-    """
-    across, depth = axes
-    out = np.full(len(gripper.edge_ids), np.nan)
-    members = [set(face.points.tolist()) for face in gripper.faces]
-    for edge, (start, end) in enumerate(gripper.edge_points.tolist()):
-        faces = [face for face, m in zip(gripper.faces, members, strict=True) if {start, end} <= m]
-        if len(faces) != 2:
-            continue
-        along = points_grip_m[end] - points_grip_m[start]
-        along = along / np.linalg.norm(along)
-        into = np.array([points_grip_m[face.points].mean(axis=0) - points_grip_m[start] for face in faces])
-        into -= np.outer(into @ along, along)
-        into /= np.linalg.norm(into, axis=1)[:, None]
-        shift, deeper = into @ across[edge], into @ depth[edge]
-        rim = int(np.argmax(shift * offset_m[edge])) if crease[edge] else int(np.argmin(np.abs(shift)))
-        if shift[rim] * offset_m[edge] > 0.0:
-            out[edge] = np.clip(deeper[rim] / shift[rim], -LARGEST_SLOPE, LARGEST_SLOPE)
-    return out
 
 
 REFERENCE_SIGMAS = 3.0

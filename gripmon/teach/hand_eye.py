@@ -35,13 +35,13 @@ from gripmon.model.targets import Target, TargetError, parse_target
 from gripmon.monitor import Monitor
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.teach.drawing import draw_on_plate
+from gripmon.teach.outline_edges import measure_outlines
 from gripmon.teach.outlines import (
     Outline,
     check_rough,
     contact_height_m,
     inferred_model,
     measure_known,
-    measure_outlines,
     outlines_of,
     points_in_gripper,
     rough_pose,

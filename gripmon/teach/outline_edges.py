@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gripmon.calibrate.plane import FingerCorners
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera
 from gripmon.model.records import Array, Image
@@ -341,3 +342,15 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
     # The line's two unknowns take their part: tr(S' (I - P) S).
     basis = np.linalg.qr(design)[0]
     return float(np.square(stretch.T @ residual).sum()), float(stretch.shape[1] - np.square(basis.T @ stretch).sum())
+
+
+def measure_outlines(
+    camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
+) -> tuple[FingerCorners, FoundOutline]:
+    """Corners of fingertips that aren't known, from their rough outlines; ``printed``: see :func:`snap`.  Raises
+    :class:`CalibrationError`.
+    """
+    snapped = find_outline(camera, image, outline, printed)
+    corners = list(outline.corners)
+    names = tuple(outline.names[k] for k in corners)
+    return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped

@@ -33,8 +33,6 @@ from gripmon.model.camera import Camera
 from gripmon.model.gripper import AxisMotion, EdgeModel, FingerModel, Gripper, GripperModel, JawModel, PointModel
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Image
-from gripmon.teach.outline_edges import FoundOutline, find_outline
-from gripmon.teach.plate_print import PlatePrint
 from gripmon.track.edges import FingertipMeter, MeasurementSettings, Patience
 
 FINGERS = ("left", "right")
@@ -178,18 +176,6 @@ USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected before a plate's pattern."""
 _PATIENCE = Patience(when_doubtful=True, when_lost=True)
 _ROUGH_PX = 3.0
-
-
-def measure_outlines(
-    camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
-) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of fingertips that aren't known, from their rough outlines; ``printed``: see :func:`snap`.  Raises
-    :class:`CalibrationError`.
-    """
-    snapped = find_outline(camera, image, outline, printed)
-    corners = list(outline.corners)
-    names = tuple(outline.names[k] for k in corners)
-    return FingerCorners(names, snapped.points[corners], snapped.covariance_px2), snapped
 
 
 def rough_pose(

@@ -36,6 +36,8 @@ from gripmon.teach.corner_pose import (
     CornerPose,
     PoseRefused,
     Prior,
+    Snapped,
+    SnappedCorner,
     place,
     pose_from_corners,
     prior_of,
@@ -57,7 +59,7 @@ from gripmon.teach.messages import (
     State,
     encoded,
 )
-from gripmon.teach.snapping import FEWEST_PUT, Snapped, SnappedCorner, Snapper
+from gripmon.teach.snapping import FEWEST_PUT, Snapper
 from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.track.edges import TaughtEdges
 

@@ -7,7 +7,6 @@ measured at the best one is what the monitor itself would measure there.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper, on_a_line
 from gripmon.model.records import Array, CornerFault, Image
-from gripmon.teach.corner_pose import Placed, Prior, place, rough_sigma_px
+from gripmon.teach.corner_pose import Placed, Prior, Snapped, SnappedCorner, place, rough_sigma_px
 from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
 from gripmon.track.edges.settling import ZOOMS, Expected
 
@@ -58,42 +57,6 @@ REASONS = {
     CornerFault.UNCERTAIN: "too uncertain",
     CornerFault.NO_FIT: "no edges found",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class SnappedCorner:
-    """One corner: ``model_px`` (2,) where the pose puts it, NaN beyond the lens; ``uv_px`` (2,) where its edges meet,
-    with ``covariance_px`` (2, 2) and ``sigma_px`` of its larger axis, None where it is refused and ``reason`` says why;
-    ``inliers``: part of the profiles on its edges that agree, None without any.
-    """
-
-    name: str
-    model_px: Array
-    uv_px: Array | None
-    covariance_px: Array | None
-    sigma_px: float | None
-    inliers: float | None
-    reason: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class Snapped:
-    """What the image shows near corners put by hand.
-
-    ``refused``: why nothing was found, in words; ``cam_T_grip`` (4, 4) then is the rough pose, else the measured one.
-    ``outlines_px``: visible edges of the model at that pose, (k, 2) points each; ``edge_points_px`` (n, 2) that agree;
-    ``share`` of the profiles that do.  ``jaw_opening_m`` with ``jaw_sigma_m``: as given, or as seen where it wasn't.
-    """
-
-    cam_T_grip: Array
-    corners: tuple[SnappedCorner, ...]
-    outlines_px: dict[str, Array]
-    edge_points_px: Array
-    share: float
-    jaw_opening_m: float | None
-    jaw_sigma_m: float | None
-    refused: str | None
-    measurement: Measurement | None
 
 
 class Snapper:
