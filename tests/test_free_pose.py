@@ -73,7 +73,7 @@ def test_a_tenth_of_a_degree_is_noticed_in_an_image():
         sight = detect(image, DISCS, "leaning.png")
         assert isinstance(sight, Sighting)
         method = KnownGripper(GivenCamera(PAPER_LENS), sharp_gripper(), OPENING_M)
-        found.append(method.look(image, sight, guess).coincidence)
+        found.append(method.measure(image, sight, guess).coincidence)
     flat, tilted = found
     assert flat.apart_p is not None and tilted.apart_p is not None and tilted.tilt_rad is not None
     assert flat.apart_p > 1e-3 and tilted.apart_p < 1e-4

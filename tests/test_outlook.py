@@ -49,7 +49,7 @@ def test_expected_sigmas_are_the_spread_of_sampled_measurements(lens: LensSettin
     errors, seen_m = np.empty((samples, 6)), np.empty(samples)
     for k in range(samples):
         wrong_m = rng.normal(scale=JAW_SIGMA_M)
-        measured = sampled.foresee(nominal_cam_T_grip(), OPENING_M + wrong_m, reported)
+        measured = sampled.forecast(nominal_cam_T_grip(), OPENING_M + wrong_m, reported)
         errors[k] = difference(measured.cam_T_grip, nominal_cam_T_grip())
         seen_m[k] = measured.jaw_opening_m - OPENING_M
     expected = outlook(lens)

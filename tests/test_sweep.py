@@ -152,8 +152,8 @@ def test_a_swept_mount_scatters_as_predicted(name: str):
 def test_farther_away_less_is_noticed():
     near, far = tried(MOUNTS["near and flat"]), tried(MOUNTS["far"])
     assert near.works and far.works
-    assert far.noticed_m > near.noticed_m and far.worst_sigma_m > near.worst_sigma_m
-    assert far.margin_px > near.margin_px
+    assert far.noticed_m > near.noticed_m and far.measurable.worst_sigma_m > near.measurable.worst_sigma_m
+    assert far.measurable.margin_px > near.measurable.margin_px
 
 
 # --- why a mount would not work ---

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gripmon.daemon.config import Config
     from gripmon.model.gripper import Gripper
     from gripmon.model.provenance import Provenance
-    from gripmon.teach.hand_eye import HandEyeOnPlate, Look
+    from gripmon.teach.hand_eye import HandEyeOnPlate, ImageOnPlate
 
 _DESCRIPTION = """\
 Where the gripper is in the camera's frame, from one image of it standing on a calibration plate (the
@@ -219,9 +219,9 @@ def _report(found: HandEyeOnPlate, notes: list[str], arguments: argparse.Namespa
         print(_image_line(image, width))
     for note in notes:
         print(f"note: {note}")
-    for look in found.looks:
-        for name, reason in look.missing.items():
-            print(f"note: {look.coincidence.sighting.name}: {name} not measured: {reason}")
+    for seen in found.images:
+        for name, reason in seen.missing.items():
+            print(f"note: {seen.coincidence.sighting.name}: {name} not measured: {reason}")
     if fit.consistency_p is not None:
         print(f"the images agree with each other: probability {fit.consistency_p:.2g} of differing as much")
     sigma = (fit.covariance.diagonal() ** 0.5).tolist()
@@ -248,7 +248,7 @@ def _values(found: HandEyeOnPlate, notes: list[str], arguments: argparse.Namespa
         "consistency_p": fit.consistency_p,
         "warnings": fit.warnings,
         "notes": notes,
-        "images": [_image_values(look) for look in found.looks],
+        "images": [_image_values(image) for image in found.images],
         "written": [arguments.gripper_out, arguments.out] if found.inferred else [arguments.out],
     }
     if found.inferred:
@@ -257,8 +257,8 @@ def _values(found: HandEyeOnPlate, notes: list[str], arguments: argparse.Namespa
     return out
 
 
-def _image_values(look: Look) -> dict[str, Any]:
-    image = look.coincidence
+def _image_values(seen: ImageOnPlate) -> dict[str, Any]:
+    image = seen.coincidence
     sigma_px = (image.corners.covariance_px.diagonal() ** 0.5).reshape(-1, 2)
     rows = zip(image.corners.names, image.corners.uv_px, sigma_px, image.residuals_m, strict=True)
     return {
@@ -270,7 +270,7 @@ def _image_values(look: Look) -> dict[str, Any]:
             name: {"uv_px": uv.tolist(), "sigma_px": sigma.tolist(), "residual_m": residual.tolist()}
             for name, uv, sigma, residual in rows
         },
-        "missing": look.missing,
+        "missing": seen.missing,
         "residuals_p": image.p_value,
         "tilt_rad": None if image.tilt_rad is None else image.tilt_rad.tolist(),
         "gap_m": image.gap_m,

@@ -30,6 +30,7 @@ from gripmon.teach.drawing import draw_taught
 from gripmon.teach.measure import Taught
 from gripmon.teach.measure import teach as teach_images
 from gripmon.teach.views import TeachingImage, TeachingRefused
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
 from gripmon.track.edges.taught import Provenance, TaughtImage, TaughtModel, identity
 
@@ -123,7 +124,7 @@ def teach(
         TeachingImage(p.image, nominal_m if p.jaw_opening_m is None else p.jaw_opening_m, str(p.path)) for p in pictures
     ]
     try:
-        taught = teach_images(config.camera, gripper, settings.corners, settings.jaw_sigma_m, config.reference, shown)
+        taught = teach_images(Rig(config.camera, gripper, settings), config.reference, shown)
     except TeachingRefused as refused:
         raise NoResultError(f"teach: {refused}") from None
     model = taught_model(taught, config.camera, gripper, settings, config.reference, pictures, command)

@@ -1,14 +1,14 @@
-"""``cam_T_grip`` from the corners of one image, for who has no calibration of hand and eye yet.
+"""``cam_T_grip`` from the corners of one image, without a hand/eye calibration.
 
 It is the pose of on-line recalibration, with everything in its covariance that one image can't average out: the
 corners, the jaw opening, the camera's calibration, and how exactly the gripper was made.  A plate under the fingertips
-(``gripmon calibrate plane``) tells the distance far better than the fingertips' own small extent does.
+(``gripmon calibrate plane``) gives the distance far better than the fingertips' own small extent does.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gripmon.calibrate.intrinsics import lens_vector, model_of
 from gripmon.calibrate.lens_models import LensModel, parameter_names
-from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
+from gripmon.judge.recalibrate import Recalibration, RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import exp_rotation, from_record, make_transform, perturb, perturbation_between, skew
 from gripmon.model.gripper import Gripper
@@ -27,9 +27,9 @@ BY_HAND_PX = 1.0
 """Standard deviation of a corner that a person set by hand where it wasn't measured, or against what was."""
 
 MADE_TO_M = 2e-5
-"""So exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
+"""How exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
 
-_STEP = 0.3  # central differences reach so many standard deviations
+_STEP = 0.3  # of a standard deviation, for central differences
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,33 +122,26 @@ def pose_from_corners(
         uv_px = np.array([snapped.corners[i].model_px for i in every]).reshape(-1, 2)
         joint, of_edges = np.zeros((2 * len(every),) * 2), found.covariance[:6, :6]
     covariance_xy = _covariance(camera, uv_px, joint, found.cam_T_grip[2, 3])
-    given = _Given(camera, snapped.jaw_opening_m)
 
-    def solve(given: _Given) -> tuple[Array, Array, float]:
-        points_m = gripper.points_grip_m(given.jaw_opening_m)[gripper.corner_points[every]]
-        pose = recalibrate(points_m, given.camera.undistort(uv_px), covariance_xy, found.cam_T_grip)
-        return pose.cam_T_grip, pose.covariance, pose.weighted_rms
+    def solve(camera: Camera, jaw_opening_m: float | None) -> Recalibration:
+        points_m = gripper.points_grip_m(jaw_opening_m)[gripper.corner_points[every]]
+        return recalibrate(points_m, camera.undistort(uv_px), covariance_xy, found.cam_T_grip)
 
     try:
-        cam_T_grip, of_corners, weighted_rms = solve(given)
-        slopes = [_slope(solve, way) for way in _ways(given, gripper, snapped.jaw_sigma_m, camera_error)]
+        pose = solve(camera, snapped.jaw_opening_m)
+        slopes = [
+            perturbation_between(solve(*low).cam_T_grip, solve(*high).cam_T_grip) / (2.0 * _STEP)
+            for low, high in _error_sources(camera, gripper, snapped, camera_error)
+        ]
     except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
         raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
     # What contradicts itself is at least as wrong as it looks.
-    covariance = of_corners * max(weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
-    points_m = gripper.points_grip_m(given.jaw_opening_m)[gripper.corner_points[every]]
+    covariance = pose.covariance * max(pose.weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
+    points_m = gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]
     alike = rivals(solutions(points_m, camera.undistort(uv_px), covariance_xy), len(every))
     names = () if by_edges else tuple(snapped.corners[i].name for i in every)
-    return CornerPose(cam_T_grip, 0.5 * (covariance + covariance.T), names, weighted_rms, len(alike) > 1)
-
-
-@dataclass(frozen=True, slots=True)
-class _Given:
-    camera: Camera
-    jaw_opening_m: float | None
-
-
-_Way = Callable[[float], _Given]
+    symmetric = 0.5 * (covariance + covariance.T)
+    return CornerPose(pose.cam_T_grip, symmetric, names, pose.weighted_rms, len(alike) > 1)
 
 
 def _covariance(camera: Camera, uv_px: Array, measured: Array, depth_m: float) -> Array:
@@ -163,31 +156,32 @@ def _covariance(camera: Camera, uv_px: Array, measured: Array, depth_m: float) -
     return np.asarray(out + (MADE_TO_M / depth_m) ** 2 * np.eye(2 * count))
 
 
-def _ways(given: _Given, gripper: Gripper, jaw_sigma_m: float | None, error: CameraError | None) -> list[_Way]:
-    """What else may be wrong, by independent standard deviations."""
-    ways: list[_Way] = []
-    if jaw_sigma_m and given.jaw_opening_m is not None:
-        opening_m, low_m, high_m = given.jaw_opening_m, gripper.jaw_min_m, gripper.jaw_max_m
-        sigma_m = jaw_sigma_m
-        ways.append(lambda s: _Given(given.camera, min(max(opening_m + s * sigma_m, low_m), high_m)))
+_Seen = tuple[Camera, float | None]
+"""A camera, and a jaw opening."""
+
+
+def _error_sources(
+    camera: Camera, gripper: Gripper, snapped: Snapped, error: CameraError | None
+) -> list[tuple[_Seen, _Seen]]:
+    """What else may be wrong, by independent standard deviations: each by a part of one less and more."""
+    opening_m = snapped.jaw_opening_m
+    sources: list[tuple[_Seen, _Seen]] = []
+    if snapped.jaw_sigma_m and opening_m is not None:
+        step_m = _STEP * snapped.jaw_sigma_m
+        low_m, high_m = (float(np.clip(opening_m + s, gripper.jaw_min_m, gripper.jaw_max_m)) for s in (-step_m, step_m))
+        sources.append(((camera, low_m), (camera, high_m)))
     if error is not None and error.parameters:
-        lens = given.camera.settings
+        lens = camera.settings
         model = LensModel(model_of(lens), lens.width_px, lens.height_px)
         vector = lens_vector(lens)
         places = [parameter_names(model.name).index(name) for name in error.parameters]
         for root in np.linalg.cholesky(error.covariance).T:
             step = np.zeros(len(vector))
-            step[places] = root
+            step[places] = _STEP * root
             if "fx_px" in error.parameters and "fy_px" not in error.parameters:
                 step[1] = step[0] * vector[1] / vector[0]
-            ways.append(lambda s, step=step: _Given(model.camera(vector + s * step), given.jaw_opening_m))  # type: ignore[misc]
-    return ways
-
-
-def _slope(solve: Callable[[_Given], tuple[Array, Array, float]], way: _Way) -> Array:
-    """(6,) what the pose does for one standard deviation."""
-    up, down = solve(way(_STEP))[0], solve(way(-_STEP))[0]
-    return perturbation_between(down, up) / (2.0 * _STEP)
+            sources.append(((model.camera(vector - step), opening_m), (model.camera(vector + step), opening_m)))
+    return sources
 
 
 ROUGH_SHARE = 0.006
@@ -295,51 +289,42 @@ def _settle(start: Array, points_m: Array, xy: Array, weight: float, prior: Prio
     """
     information = np.linalg.inv(prior.covariance)
     pose, damping = start, 1e-3
-    current = _cost(pose, points_m, xy, weight, prior, information)
+    normal, side, current = _linearised(pose, points_m, xy, weight, prior, information)
     if not math.isfinite(current):
         return None
     for _ in range(_ROUNDS):
-        normal, side = _equations(pose, points_m, xy, weight, prior, information)
         tried = perturb(pose, np.linalg.solve(normal + damping * np.diag(normal.diagonal()), side))
-        cost = _cost(tried, points_m, xy, weight, prior, information)
-        if cost < current:
-            settled = current - cost < 1e-6 * (1.0 + cost)
-            pose, current, damping = tried, cost, 0.2 * damping
+        there = _linearised(tried, points_m, xy, weight, prior, information)
+        if there[2] < current:
+            settled = current - there[2] < 1e-6 * (1.0 + there[2])
+            pose, (normal, side, current), damping = tried, there, 0.2 * damping
             if settled:
                 break
         else:
             damping *= 8.0
             if damping > 1e8:
                 break
-    normal, _ = _equations(pose, points_m, xy, weight, prior, information)
     return pose, np.linalg.inv(normal), current
 
 
-def _cost(pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array) -> float:
-    seen = points_m @ pose[:3, :3].T + pose[:3, 3]
-    if not pose[2, 3] > 0.0 or (seen[:, 2] <= 0.0).any():
-        return math.inf
-    residual = xy - seen[:, :2] / seen[:, 2:]
-    away = perturbation_between(prior.cam_T_grip, pose)
-    return float(weight * (residual**2).sum() + away @ information @ away)
-
-
-def _equations(
+def _linearised(
     pose: Array, points_m: Array, xy: Array, weight: float, prior: Prior, information: Array
-) -> tuple[Array, Array]:
-    """Normal matrix (6, 6) and right-hand side (6,)."""
-    away = perturbation_between(prior.cam_T_grip, pose)
-    normal, side = information.copy(), -information @ away
-    if not len(xy):
-        return normal, side
+) -> tuple[Array, Array, float]:
+    """Normal matrix (6, 6), right-hand side (6,) and cost at a pose; infinite behind the camera."""
     levers = points_m @ pose[:3, :3].T
     seen = levers + pose[:3, 3]
+    if not pose[2, 3] > 0.0 or (seen[:, 2] <= 0.0).any():
+        return information, np.zeros(6), math.inf
+    away = perturbation_between(prior.cam_T_grip, pose)
     shown = seen[:, :2] / seen[:, 2:]
     slopes = np.zeros((len(seen), 2, 3))
     slopes[:, 0, 0] = slopes[:, 1, 1] = 1.0 / seen[:, 2]
     slopes[:, :, 2] = -shown / seen[:, 2:]
     jacobian = np.concatenate([slopes, -slopes @ skew(levers)], axis=2).reshape(-1, 6)
-    return normal + weight * jacobian.T @ jacobian, side + weight * jacobian.T @ (xy - shown).ravel()
+    residual = (xy - shown).ravel()
+    normal = information + weight * jacobian.T @ jacobian
+    side = weight * jacobian.T @ residual - information @ away
+    return normal, side, float(weight * residual @ residual + away @ information @ away)
 
 
 def _same(one: Array, other: Array) -> bool:

@@ -1,5 +1,5 @@
-"""From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that refuse
-images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
+"""From an edge's lines in the teaching images to its taught offset, depth and standard deviations; and checks that
+refuse images which can't be taught from (:class:`TeachingRefused`, with numbers and what to do).
 
 Noise (:func:`~gripmon.teach.lines.pool`): an edge's offset in the images is its part of what is common to all (the
 reference, or the reported opening, is off by a little; bevels make every outline lie inside of the sharp one) plus what

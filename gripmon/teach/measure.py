@@ -20,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import GATE
-from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between
-from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, ReferenceRecord
 from gripmon.teach.estimate import (
     SHAPE_M,
@@ -35,7 +33,8 @@ from gripmon.teach.estimate import (
 )
 from gripmon.teach.lines import find_line, of_image, settle_line
 from gripmon.teach.views import ImageRefused, Sampled, TeachingImage, TeachingRefused, View, Viewer, sampled
-from gripmon.track.edges import Measurement, MeasurementSettings
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import Measurement
 from gripmon.track.edges.prediction import STEP_PX
 from gripmon.track.edges.profiles import full_scale
 from gripmon.track.edges.taught import Look, TaughtCorner, TaughtEdge, TaughtEdges
@@ -70,14 +69,7 @@ class Taught:
         return [one for number, one in enumerate(images) if number not in self.left_out]
 
 
-def teach(
-    camera: Camera,
-    gripper: Gripper,
-    settings: MeasurementSettings,
-    jaw_sigma_m: float,
-    reference: ReferenceRecord,
-    images: Sequence[TeachingImage],
-) -> Taught:
+def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> Taught:
     """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
 
     Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
@@ -85,32 +77,32 @@ def teach(
     the others is left out while most of them remain.
     """
     assert images, "nothing to teach from"
-    viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, images)
+    viewer = Viewer(rig, reference, images)
     fits = {number: viewer.fitted(image) for number, image in enumerate(images)}
     left_out: dict[int, str] = {}
     while True:
         used = [images[number] for number in fits]
         try:
-            viewer = Viewer(camera, gripper, settings, jaw_sigma_m, reference, used)
-            return replace(_teach_or_say_where(viewer, used, list(fits.values())), left_out=left_out)
+            viewer = Viewer(rig, reference, used)
+            return replace(_teach_or_locate(viewer, used, list(fits.values())), left_out=left_out)
         except ImageRefused as refused:
             number = next(n for n in fits if images[n] is refused.image)
             if 2 * (len(fits) - 1) <= len(images):
-                raise _with_those(refused, left_out) from None
+                raise _with_reasons(refused, left_out) from None
             del fits[number]
             left_out[number] = str(refused)
         except TeachingRefused as refused:
-            raise _with_those(refused, left_out) from None
+            raise _with_reasons(refused, left_out) from None
 
 
-def _with_those(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
+def _with_reasons(refused: TeachingRefused, left_out: Mapping[int, str]) -> TeachingRefused:
     """The refusal, with the images that were left out before, each with its reason."""
     if not left_out:
         return refused
     return TeachingRefused(f"{refused}; and left out before: {'; '.join(left_out.values())}")
 
 
-def _teach_or_say_where(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
+def _teach_or_locate(viewer: Viewer, images: Sequence[TeachingImage], fits: Sequence[Measurement | None]) -> Taught:
     """What these images teach; where that fails, an image that shows the gripper elsewhere is the likelier reason."""
     try:
         return _teach(viewer, [viewer.view(image, fit) for image, fit in zip(images, fits, strict=True)])
@@ -134,7 +126,7 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     edges = estimate_edges(viewer, lines, None)
     arrays = viewer.arrays(edges)
     # Once more from where the edges really are: the profiles then lie even to both sides of them.
-    views = [viewer.view_taught(view.image, arrays, view.candidates.zoom) for view in views]
+    views = [viewer.view(view.image, None, arrays, view.candidates.zoom) for view in views]
     lines, lost = _lines(viewer, views, search=False)
     looks = {gripper.edge_ids[index]: look._asdict() for index, look in edge_looks(viewer, views, lines).items()}
     edges = estimate_edges(viewer, lines, edges)
@@ -204,7 +196,7 @@ def _closure_px(viewer: Viewer, images: Sequence[TeachingImage], arrays: TaughtE
 
 def _corners(viewer: Viewer, arrays: TaughtEdges, jaw_opening_m: float) -> dict[str, TaughtCorner]:
     """Where taught edges meet in the image: least squares of their offsets at the corner, weighted."""
-    gripper, camera = viewer.gripper, viewer.camera
+    gripper, camera = viewer.gripper, viewer.rig.camera
     points_grip_m = gripper.points_grip_m(jaw_opening_m)
     points_cam_m = points_grip_m @ viewer.ref_cam_T_grip[:3, :3].T + viewer.ref_cam_T_grip[:3, 3]
     uv_px, d_uv = camera.project_with_jacobian(points_cam_m)

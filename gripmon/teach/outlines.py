@@ -243,8 +243,3 @@ def measure_known(
     names = tuple(name for name, use in zip(gripper.corner_ids, taken, strict=True) if use)
     free = FreePose(found.cam_T_grip, found.covariance[:6, :6], camera, gripper.points_grip_m(jaw_opening_m))
     return FingerCorners(names, corners.uv_px[taken], 0.5 * (covariance + covariance.T), free), missing
-
-
-def contact_height_m(gripper: Gripper, jaw_opening_m: float | None) -> float:
-    """Where along z the gripper touches a plate that it stands on: its outermost point."""
-    return float(gripper.points_grip_m(jaw_opening_m)[:, 2].max())

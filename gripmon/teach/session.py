@@ -61,6 +61,7 @@ from gripmon.teach.messages import (
 )
 from gripmon.teach.snapping import FEWEST_PUT, Snapper
 from gripmon.teach.views import TeachingImage, TeachingRefused
+from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
 
 _LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
@@ -152,7 +153,7 @@ class Setup:
 
     def taught(self, reference: ReferenceRecord, images: Sequence[TeachingImage]) -> tuple[Taught, TaughtEdges]:
         """What the images show of every edge.  Raises :class:`~gripmon.teach.views.TeachingRefused`."""
-        found = teach(self.camera, self.gripper, self.settings.corners, self.settings.jaw_sigma_m, reference, images)
+        found = teach(Rig(self.camera, self.gripper, self.settings), reference, images)
         opening_m = float(np.mean([image.jaw_opening_m for image in found.used(images)]))
         return found, TaughtEdges.of(found.edges, self.gripper, from_record(reference.cam_T_grip), opening_m)
 

@@ -1,4 +1,4 @@
-"""One teaching image against the reference: is the gripper there, and which edge candidates lie beside its edges?"""
+"""One teaching image against the reference: whether the gripper is there, and the edge candidates beside its edges."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.camera import Camera
 from gripmon.model.geometry import from_record, invert, perturb, perturbation_between, to_record
-from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, Image, ReferenceRecord
 from gripmon.teach.lines import EdgePoints
-from gripmon.track.edges import FingertipMeter, Measurement, MeasurementSettings, Patience
+from gripmon.teach.visibility import Rig
+from gripmon.track.edges import FingertipMeter, Measurement, Patience
 from gripmon.track.edges.prediction import EdgeLayout, Prediction, lay_out, predict
 from gripmon.track.edges.profiles import (
     Candidates,
@@ -61,9 +60,9 @@ class TeachingImage:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One image, looked at along all edges in view, with their predictions at the reference.
+    """One image, sampled along all edges in view, with their predictions at the reference.
 
-    ``prediction`` from where it was looked, with its ``profiles`` (n, s) in grey levels and edge ``candidates``;
+    ``prediction`` from where it was sampled, with its ``profiles`` (n, s) in grey levels and edge ``candidates``;
     ``at_reference`` predicts the same samples at the reference and the reported opening; ``offset_m`` (k,) how far each
     candidate lies from there across the line of sight, ``expected_m`` (n,) how far the samples do, ``per_m`` (n,) how
     many px a metre is.
@@ -87,19 +86,13 @@ class Viewer:
     the line of sight to an edge differs between an image and the mean jaw opening, for which the others hold (rad).
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        gripper: Gripper,
-        settings: MeasurementSettings,
-        jaw_sigma_m: float,
-        reference: ReferenceRecord,
-        images: Sequence[TeachingImage],
-    ):
-        self.camera, self.gripper, self._settings, self._jaw_sigma_m = camera, gripper, settings, jaw_sigma_m
+    def __init__(self, rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage]):
+        self.rig, self.gripper, gripper = rig, rig.gripper, rig.gripper
+        sampling, self._jaw_sigma_m = rig.settings.corners.sampling, rig.settings.jaw_sigma_m
         self.ref_cam_T_grip = from_record(reference.cam_T_grip)
         self.reference_covariance = np.reshape(reference.covariance, (6, 6))
-        self._dense = msgspec.structs.replace(settings.sampling, samples=_DENSE, creases=True)
+        self._reach_px = sampling.reach_px
+        self._dense = msgspec.structs.replace(sampling, samples=_DENSE, creases=True)
         self.jaw_opening_m = float(np.mean([image.jaw_opening_m for image in images]))
         self.points_grip_m = gripper.points_grip_m(self.jaw_opening_m)
         edges = gripper.edge_view(self.points_grip_m, invert(self.ref_cam_T_grip)[:3, 3])
@@ -127,55 +120,59 @@ class Viewer:
         right = np.cross(ends[:, 0] - eye, ends[:, 1] - eye)
         return np.sign(np.einsum("ei,ei->e", right, inside - eye))
 
+    def measured(
+        self,
+        image: TeachingImage,
+        taught: TaughtEdges | None,
+        cam_T_grip: Array | None = None,
+        share: float = USUAL_SHARE,
+        patience: Patience = _NARROW,
+    ) -> Measurement:
+        """The image measured as in use, from a pose, the reference if None."""
+        rig = self.rig
+        meter = FingertipMeter(rig.camera, rig.gripper, rig.settings.corners, rig.settings.jaw_sigma_m, taught)
+        here = self.ref_cam_T_grip if cam_T_grip is None else cam_T_grip
+        return meter.measure(image.image, here, image.jaw_opening_m, share, patience)
+
+    def _off_reference_px(self, found: Measurement) -> float:
+        """How far the measured gripper shows from the reference."""
+        return found.prediction.moved_px(perturbation_between(self.ref_cam_T_grip, found.cam_T_grip))
+
     def fitted(self, image: TeachingImage) -> Measurement | None:
         """The sharp model fitted to the image from the reference; None where it doesn't fit, as with wide bevels."""
-        meter = self._meter(None)
-        found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, USUAL_SHARE, _NARROW)
-        near = meter.moved_px(found, self.ref_cam_T_grip) <= self._settings.sampling.reach_px
-        return found if found.trusted and near else None
+        found = self.measured(image, None)
+        return found if found.trusted and self._off_reference_px(found) <= self._reach_px else None
 
     def check_elsewhere(self, image: TeachingImage) -> None:
         """Raise :class:`ImageRefused` if the gripper clearly stands farther from the reference than the profiles
         reach.
         """
-        meter = self._meter(None)
-        found = meter.measure(image.image, self.ref_cam_T_grip, image.jaw_opening_m, _CLEAR_SHARE, _EVERYWHERE)
+        found = self.measured(image, None, None, _CLEAR_SHARE, _EVERYWHERE)
         if found.trusted:
-            # Once more from there: the first look goes by predictions at the reference, and clutter may mislead it.
-            found = meter.measure(image.image, found.cam_T_grip, image.jaw_opening_m, _CLEAR_SHARE, _EVERYWHERE)
-        away_px = meter.moved_px(found, self.ref_cam_T_grip)
-        if found.trusted and away_px > self._settings.sampling.reach_px:
+            # Once more from there: the first search goes by predictions at the reference, and clutter may mislead it.
+            found = self.measured(image, None, found.cam_T_grip, _CLEAR_SHARE, _EVERYWHERE)
+        away_px = self._off_reference_px(found)
+        if found.trusted and away_px > self._reach_px:
             motion = perturbation_between(self.ref_cam_T_grip, found.cam_T_grip)
             raise ImageRefused(
                 image,
                 f"the gripper is {away_px:.1f} px off the reference, {self.distance(motion)}; at most "
-                f"{self._settings.sampling.reach_px:g} px: {self.advice(motion)}",
+                f"{self._reach_px:g} px: {self.advice(motion)}",
             )
 
-    def view(self, image: TeachingImage, found: Measurement | None) -> View:
-        """All edges in view, as densely as pixels lie, from where the sharp model was found, or else from the
-        reference.
-        """
-        if found is None:
-            return self._view(image, self.ref_cam_T_grip, image.jaw_opening_m, None, 1)
-        return self._view(image, found.cam_T_grip, found.jaw_opening_m, None, found.candidates.zoom)
-
-    def view_taught(self, image: TeachingImage, taught: TaughtEdges, zoom: int) -> View:
-        """The edges that were taught, from the reference."""
-        return self._view(image, self.ref_cam_T_grip, image.jaw_opening_m, taught, zoom)
-
-    def _view(
-        self,
-        image: TeachingImage,
-        cam_T_grip: Array,
-        jaw_opening_m: float,
-        taught: TaughtEdges | None,
-        zoom: int,
+    def view(
+        self, image: TeachingImage, found: Measurement | None, taught: TaughtEdges | None = None, zoom: int = 1
     ) -> View:
-        sampling, grey = self._dense, image.image
+        """All edges in view, or those that were ``taught``, as densely as pixels lie: from where the sharp model was
+        found, or else from the reference at a ``zoom``.
+        """
+        cam_T_grip, jaw_opening_m = self.ref_cam_T_grip, image.jaw_opening_m
+        if found is not None:
+            cam_T_grip, jaw_opening_m, zoom = found.cam_T_grip, found.jaw_opening_m, found.candidates.zoom
+        rig, sampling, grey = self.rig, self._dense, image.image
         margins = {"reach_px": zoom * sampling.reach_px, "end_margin_px": zoom * sampling.end_margin_px}
         sampling = msgspec.structs.replace(sampling, **margins)
-        layout = lay_out(self.camera, self.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
+        layout = lay_out(rig.camera, rig.gripper, cam_T_grip, jaw_opening_m, sampling, taught)
         # Both have the same samples: those that the lens maps from both poses.
         here = self._predict(layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
         there = self._predict(here.layout, cam_T_grip, jaw_opening_m, taught, zoom)
@@ -183,40 +180,23 @@ class Viewer:
             here = self._predict(there.layout, self.ref_cam_T_grip, image.jaw_opening_m, None, zoom)
         profiles = read_profiles(grey, there.map_x, there.map_y)
         noise = estimate_noise(profiles, quantum(grey))
-        candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), self._settings.edges, zoom)
+        candidates = find_candidates(profiles, there.ok, noise, full_scale(grey), rig.settings.corners.edges, zoom)
         per_m = np.sqrt(np.einsum("ni,ni->n", here.jacobian[:, :3], here.jacobian[:, :3]))
         # Edges are straight: that a sample moves along its edge, too, doesn't matter.
         expected_px = np.einsum("ni,ni->n", there.uv_px - here.uv_px, here.normal)
         sample = candidates.sample
         across = np.einsum("ni,ni->n", there.normal, here.normal)
         offset_px = expected_px[sample] + candidates.offset_px * across[sample]
-        return View(
-            image,
-            there,
-            profiles,
-            candidates,
-            here,
-            offset_px / per_m[sample],
-            expected_px / per_m,
-            per_m,
-        )
+        return View(image, there, profiles, candidates, here, offset_px / per_m[sample], expected_px / per_m, per_m)
 
     def _predict(
         self, layout: EdgeLayout, cam_T_grip: Array, jaw_opening_m: float, taught: TaughtEdges | None, zoom: int
     ) -> Prediction:
-        offsets_px = zoom * profile_offsets_px(self._settings.sampling.reach_px)
-        return predict(self.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
-
-    def _meter(self, taught: TaughtEdges | None) -> FingertipMeter:
-        return FingertipMeter(self.camera, self.gripper, self._settings, self._jaw_sigma_m, taught)
-
-    def measured(self, image: TeachingImage, taught: TaughtEdges) -> Measurement:
-        """The image measured as in use, from the reference."""
-        here = self.ref_cam_T_grip
-        return self._meter(taught).measure(image.image, here, image.jaw_opening_m, USUAL_SHARE, _NARROW)
+        offsets_px = zoom * profile_offsets_px(self._reach_px)
+        return predict(self.rig.camera, self.gripper, layout, cam_T_grip, jaw_opening_m, offsets_px, True, taught)
 
     def allowed_px(self, view: View, edge: int, shape_m: float, sigmas: float) -> float:
-        """How far an edge may show from the reference: a bevel's offset and so many standard deviations of the
+        """How far an edge may show from the reference: a bevel's offset and a number of standard deviations of the
         reference and the reported opening; never farther than the profiles reach.
         """
         here = view.at_reference
@@ -225,7 +205,7 @@ class Viewer:
         variance = np.einsum("ni,ij,nj->n", rows, self.reference_covariance, rows).max()
         variance += np.square(self._jaw_sigma_m * here.jacobian[mine, 6]).max()
         bevel_m = max(shape_m, float(self.gripper.edge_bevel_m[edge]))
-        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self._settings.sampling.reach_px)
+        return min(bevel_m * view.per_m[mine].max() + sigmas * math.sqrt(variance), self._reach_px)
 
     @property
     def prior_covariance(self) -> Array:
