@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.smoother import SOURCES, correct, sample
+from gripmon.analyse.correction import SOURCES, correct, sample
 
 PERIOD_NS = 16_666_667
 START_NS = 1_700_000_000_000_000_000

@@ -1,4 +1,4 @@
-"""The smoother against dense least squares over all unknowns, its likelihood against the joint density, the chart."""
+"""The smoother against dense least squares over all unknowns, its likelihood against the joint density, the"""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from scipy import stats
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.smoother import changes, chart
-from gripmon.analyse.smoother.smoother import MID_S, SLOW_S, UNKNOWN, Dynamics, log_likelihood, smooth
+from gripmon.analyse.quick_motion import LENGTHS, surprises
+from gripmon.analyse.smoothing import MID_S, SLOW_S, UNKNOWN, Dynamics, log_likelihood, smooth
+from gripmon.analyse.vectors import covariances_to_poses, covariances_to_vectors, to_poses, to_vectors
 
 RNG = np.random.default_rng(1)
 STEPS = 30
@@ -83,10 +84,10 @@ def test_vectors_and_poses_are_each_others_way_back():
     vectors = RNG.normal(size=(20, 6)) * 0.5
     origin = np.eye(4)
     origin[:3, :3] = Rotation.random(rng=3).as_matrix()
-    poses = chart.to_poses(origin, vectors)
+    poses = to_poses(origin, vectors)
     expected = np.array([expm(np.cross(np.eye(3), v[3:])) @ origin[:3, :3] for v in vectors])
     np.testing.assert_allclose(poses[:, :3, :3], expected, atol=1e-12)
-    np.testing.assert_allclose(chart.to_vectors(origin, poses), vectors, atol=1e-12)
+    np.testing.assert_allclose(to_vectors(origin, poses), vectors, atol=1e-12)
 
 
 def test_covariances_follow_the_chart():
@@ -94,18 +95,18 @@ def test_covariances_follow_the_chart():
     vector = np.array([[0.0, 0.0, 0.0, 0.5, -0.3, 0.2]])
     root = np.linalg.cholesky(np.diag([1e-6, 4e-6, 1e-6, 1e-6, 9e-6, 4e-6]) + 5e-7)
     errors = np.random.default_rng(4).normal(size=(200_000, 6)) @ root.T
-    pose = chart.to_poses(np.eye(4), vector)[0]
-    off = chart.to_poses(pose, errors)
-    spread = np.cov(chart.to_vectors(np.eye(4), off).T)
-    stated = chart.covariances_to_vectors((root @ root.T)[None], vector)[0]
+    pose = to_poses(np.eye(4), vector)[0]
+    off = to_poses(pose, errors)
+    spread = np.cov(to_vectors(np.eye(4), off).T)
+    stated = covariances_to_vectors((root @ root.T)[None], vector)[0]
     np.testing.assert_allclose(stated, spread, atol=0.02 * spread.max())
-    np.testing.assert_allclose(chart.covariances_to_poses(stated[None], vector)[0], root @ root.T, atol=1e-12)
+    np.testing.assert_allclose(covariances_to_poses(stated[None], vector)[0], root @ root.T, atol=1e-12)
 
 
 def test_surprises_of_normal_noise_have_the_distribution_that_they_are_judged_by():
     noise = np.random.default_rng(5).normal(size=(40_000, 6)) @ np.random.default_rng(6).normal(size=(6, 6))
-    for length in changes.LENGTHS:
-        squares = changes.surprises(noise, length)[length:-length]
+    for length in LENGTHS:
+        squares = surprises(noise, length)[length:-length]
         for chance in (0.5, 0.1, 0.01):
             assert np.mean(squares > stats.chi2.isf(chance, 6)) < 1.35 * chance
         assert np.median(squares) > 0.75 * stats.chi2.median(6)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripmon.analyse.replay_differences import Differences
+from gripmon.analyse.comparison import Differences
 from gripmon.cli import common
 from gripmon.model.errors import InputError
 

@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif json_path is not None:
         _write(write_atomically, json_path, found.json() + b"\n", "--json")
     if page_path is not None:
-        with common.progress_bar(len(found.told), "recording") as step:
+        with common.progress_bar(len(found.analysed), "recording") as step:
             data = found.html(step)
         _write(write_atomically, page_path, data, "--out")
     if arguments.json != "-":

@@ -14,11 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.smoother import changes, chart, motion
-from gripmon.analyse.smoother.blocks import Blocks, Spread, at, held, with_gaps
-from gripmon.analyse.smoother.noise import Shares, learn_shares, likeliest_dynamics
-from gripmon.analyse.smoother.run import Bools, Ints, Run, prepare, wild_frames
-from gripmon.analyse.smoother.smoother import Dynamics, Smoothed, smooth
+from gripmon.analyse.quick_motion import LEAST_SQUARE, MARGIN, Found, find, swings, vibration
+from gripmon.analyse.smoothing import Dynamics, Shares, Smoothed, learn_shares, likeliest_dynamics, smooth
+from gripmon.analyse.vectors import (
+    Blocks,
+    Bools,
+    Ints,
+    Run,
+    Spread,
+    at,
+    covariances_to_poses,
+    held,
+    prepare,
+    to_poses,
+    to_vectors,
+    wild_frames,
+    with_gaps,
+)
 from gripmon.model.records import Array
 
 BLOCK_S = 0.13
@@ -91,7 +103,7 @@ def correct(
     found = _changes(run)
     progress()
     fit = _fit(run, found)
-    kept = [f for f, size in zip(found, _sizes(run, fit), strict=True) if size > changes.LEAST_SQUARE]
+    kept = [f for f, size in zip(found, _sizes(run, fit), strict=True) if size > LEAST_SQUARE]
     if len(kept) < len(found):
         fit = _fit(run, kept)
     progress()
@@ -101,14 +113,14 @@ def correct(
 STAGES = 3
 
 
-def _changes(run: Run) -> list[changes.Found]:
+def _changes(run: Run) -> list[Found]:
     """In frames' numbers; a gap before a change is part of where it may have happened."""
     good = np.flatnonzero(run.usable)
     y = run.y[good]
     return [
-        changes.Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
-        for found in changes.find(y, 3600.0 / run.frame_s)
-        if (found.excess > changes.MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
+        Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
+        for found in find(y, 3600.0 / run.frame_s)
+        if (found.excess > MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
 
 
@@ -146,7 +158,7 @@ def _unexplained(part: Array, law: Array) -> float:
 class _Fit:
     """Blocks at ``time_s`` (m,) of the ``segment`` (m,), smoothed; what is left of the frames; quick motion."""
 
-    found: list[changes.Found]
+    found: list[Found]
     time_s: Array
     segment: Ints
     smoothed: Smoothed
@@ -157,13 +169,13 @@ class _Fit:
     quick_error: Array
 
 
-def _segments(run: Run, found: list[changes.Found]) -> Ints:
+def _segments(run: Run, found: list[Found]) -> Ints:
     out = np.zeros(len(run.y), np.int64)
     out[[f.index for f in found]] = 1
     return np.cumsum(out)
 
 
-def _fit(run: Run, found: list[changes.Found]) -> _Fit:
+def _fit(run: Run, found: list[Found]) -> _Fit:
     segment = _segments(run, found)
     good = np.flatnonzero(run.usable)
     swing: Array = np.zeros((len(good), 6))
@@ -197,8 +209,8 @@ def _fit(run: Run, found: list[changes.Found]) -> _Fit:
         rest = run.y[good] - x
         off = (blocks.mean - smoothed.x[where]) ** 2 / (variance + shares.mid + shares.slow)
         extra = np.maximum((WILD_FREEDOM + off.sum(axis=1)) / (WILD_FREEDOM + 6.0), 1.0)
-        quick, quick_error = motion.vibration(rest)
-        swing = motion.swings(rest - quick, run.claimed[good])
+        quick, quick_error = vibration(rest)
+        swing = swings(rest - quick, run.claimed[good])
     return _Fit(found, time_s, block_segment, smoothed, shares, dynamics, swing, quick, quick_error)
 
 
@@ -240,8 +252,8 @@ def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
         _unsure_in_gap(run, fit, k, found, x, spread)
     vectors = x @ run.root.T
     covariance = np.einsum("ij,njk,lk->nil", run.root, spread, run.root, optimize=True)
-    poses = chart.to_poses(run.origin_T, vectors)
-    covariance = chart.covariances_to_poses(covariance, vectors)
+    poses = to_poses(run.origin_T, vectors)
+    covariance = covariances_to_poses(covariance, vectors)
     return Correction(
         np.asarray(stamp_ns, np.int64),
         poses,
@@ -255,7 +267,7 @@ def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
     )
 
 
-def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: changes.Found, x: Array, spread: Array) -> None:
+def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: Found, x: Array, spread: Array) -> None:
     """Where nothing was measured before a change it may have happened at any moment, all alike probable."""
     before = np.flatnonzero(run.usable[: found.index])[-1]
     gap = np.arange(before + 1, found.index)
@@ -276,8 +288,8 @@ def _point(run: Run, fit: _Fit, number: int, stamp_ns: Ints) -> ChangePoint:
     good = np.flatnonzero(run.usable[: found.first])
     at_s = run.time_s[[found.index] * 2]
     x, _ = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
-    before_T, after_T = chart.to_poses(run.origin_T, x @ run.root.T)
-    size = chart.to_vectors(before_T, after_T[None])[0]
+    before_T, after_T = to_poses(run.origin_T, x @ run.root.T)
+    size = to_vectors(before_T, after_T[None])[0]
     return ChangePoint(
         found.index,
         int(stamp_ns[found.index]),
@@ -286,3 +298,30 @@ def _point(run: Run, fit: _Fit, number: int, stamp_ns: Ints) -> ChangePoint:
         size,
         run.root @ (variance[:, None] * run.root.T),
     )
+
+
+def sample(correction: Correction, wanted_ns: Ints) -> tuple[Array, Array, Ints]:
+    """Transforms (k, 4, 4), their errors' covariances (k, 6, 6) and segments (k,) at the capture times ``wanted_ns``.
+
+    A frame's own time gives the frame's.  Between two frames the transform is taken to go from one to the other, and
+    may have done so at once, at any moment: so much is added to the covariance.  All NaN, and segment -1, before the
+    first frame and after the last.  ValueError for a recording in which time runs backwards.
+    """
+    stamps = correction.stamp_ns
+    if (np.diff(stamps) < 0).any():
+        raise ValueError("time runs backwards in the recording: an instant may lie in several places")
+    wanted_ns = np.asarray(wanted_ns, np.int64)
+    after = np.clip(np.searchsorted(stamps, wanted_ns, side="left"), 0, len(stamps) - 1)
+    before = np.where(stamps[after] == wanted_ns, after, np.maximum(after - 1, 0))
+    outside = (wanted_ns < stamps[0]) | (wanted_ns > stamps[-1])
+    span = np.maximum(stamps[after] - stamps[before], 1)
+    f = np.clip((wanted_ns - stamps[before]) / span, 0.0, 1.0)
+    poses, covariances = np.full((len(f), 4, 4), np.nan), np.full((len(f), 6, 6), np.nan)
+    for k in np.flatnonzero(~outside).tolist():
+        from_T, to_T = correction.cam_T_grip[before[k]], correction.cam_T_grip[after[k]]
+        way = to_vectors(from_T, to_T[None])[0]
+        poses[k] = to_poses(from_T, f[k] * way[None])[0]
+        own = (1.0 - f[k]) * correction.covariance[before[k]] + f[k] * correction.covariance[after[k]]
+        covariances[k] = own + f[k] * (1.0 - f[k]) * np.outer(way, way)
+    segment = np.where(f < 0.5, correction.segment[before], correction.segment[after])
+    return poses, covariances, np.where(outside, -1, segment)

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.report.content import Curve, Displacement
-from gripmon.analyse.report.formats import COVERAGE, clock_time
+from gripmon.analyse.content import COVERAGE, Curve, Displacement, clock_time
 from gripmon.model.records import Array, ReferenceRecord
 
 if TYPE_CHECKING:
@@ -178,11 +177,11 @@ def straightened(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64]) -> tuple[C
     out = (0 if absurd else int(stamp_ns[0])) + np.concatenate([np.zeros(1, np.int64), np.cumsum(steps)])
     faults = ["the first frame's time is absurd; times are shown from 1970 on"] if absurd else []
     if wrong.size:
-        faults.append(_told(seq, stamp_ns, wrong.tolist(), 1e-9 * (float(out[-1]) - float(stamp_ns[-1]))))
+        faults.append(_clock_fault(seq, stamp_ns, wrong.tolist(), 1e-9 * (float(out[-1]) - float(stamp_ns[-1]))))
     return Clock(seq, out), tuple(faults)
 
 
-def _told(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], wrong: Sequence[int], off_s: float) -> str:
+def _clock_fault(seq: NDArray[np.int64], stamp_ns: NDArray[np.int64], wrong: Sequence[int], off_s: float) -> str:
     i = wrong[0]
     by_s = 1e-9 * (float(stamp_ns[i + 1]) - float(stamp_ns[i]))
     how = f"runs backwards by {-by_s:.3f} s" if by_s < 0.0 else f"jumps ahead by {by_s:.0f} s"

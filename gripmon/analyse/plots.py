@@ -14,8 +14,7 @@ import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from gripmon.analyse.report.content import AffectedRange, Curve, RecordingReport, Stretch
-from gripmon.analyse.report.formats import clock_time, iso, span
+from gripmon.analyse.content import AffectedRange, Curve, RecordingReport, Stretch, clock_time, iso, span
 
 BLUE, ORANGE, PURPLE = "#3f7fdd", "#dd8420", "#8f63cf"
 AXES = {"x": "#dc5450", "y": "#2f9c5c", "z": "#4c7fe6"}

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
-from gripmon.analyse.smoother import changes, correction, smoother
-from gripmon.analyse.smoother.correction import SOURCES, ChangePoint, Correction, correct
-from gripmon.analyse.smoother.sampling import sample
+from gripmon.analyse.correction import BLOCK_S, SOURCES, ChangePoint, Correction, correct, sample
+from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
+from gripmon.analyse.smoothing import MID_S, SLOW_S
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Origin, Transform
 from gripmon.record.read import FrameTable, Recording
@@ -110,10 +110,10 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
 def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
     """What a file says about where it comes from."""
     settings = {
-        "false_alarms_per_hour": changes.FALSE_ALARMS_PER_HOUR,
-        "block_s": correction.BLOCK_S,
-        "slow_error_s": smoother.SLOW_S,
-        "mid_error_s": smoother.MID_S,
+        "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
+        "block_s": BLOCK_S,
+        "slow_error_s": SLOW_S,
+        "mid_error_s": MID_S,
     }
     return Provenance(__version__, tuple(inputs), settings, tuple(_run(each) for each in runs))
 

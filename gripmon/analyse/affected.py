@@ -1,19 +1,25 @@
-"""When should something not be relied on?"""
+"""When something should not be relied on; the limits for it, from the recorded configuration; and how large errors may
+have been beside them.
+"""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
-from gripmon.analyse.report.content import AffectedRange, Displacement, Event, Limits
-from gripmon.analyse.report.formats import COVERAGE
-from gripmon.analyse.report.happenings import MOTIONS
-from gripmon.analyse.report.track import SECOND_NS, Track, displacement
+from gripmon.analyse.content import COVERAGE, AffectedRange, Displacement, Event, Integrity, Limits
+from gripmon.analyse.events import MOTIONS
+from gripmon.analyse.track import SECOND_NS, Track, displacement
+from gripmon.judge.policy import PolicySettings
 from gripmon.model.records import Array
+from gripmon.record.read import FrameTable, Recording
 
 _MEDIAN_FRAMES = 9  # a single frame's noise affects nothing
 _RELIEF = 0.8  # of the limit, below which it is over
@@ -21,7 +27,7 @@ _SHORTEST_NS = SECOND_NS // 10
 _MEANING = {
     "old_calibration": "Grasps and data that used the calibration from the beginning are off by up to this much. "
     "gripmon correct gives the transform for every instant.",
-    "stale_reference": "Who used the monitor's reference instead of its live transforms was off by up to this much.",
+    "stale_reference": "What used the monitor's reference instead of its live transforms was off by up to this much.",
     "suspect": "Transforms were given as suspect: motions begun by them are doubtful.",
     "unknown": "No transform was given: what was done in this time was done without one.",
 }
@@ -112,9 +118,9 @@ def _past(
     size = np.linalg.norm(smooth[:, :3], axis=1) / limits.affected_m
     turn = np.linalg.norm(smooth[:, 3:], axis=1) / limits.affected_rad
     excess = np.maximum(size, turn)
-    told = (size >= 1.0) & _told(smooth[:, :3], track.sigma[frames, :3])
-    told |= (turn >= 1.0) & _told(smooth[:, 3:], track.sigma[frames, 3:])
-    told |= moved[frames]
+    significant = (size >= 1.0) & _significant(smooth[:, :3], track.sigma[frames, :3])
+    significant |= (turn >= 1.0) & _significant(smooth[:, 3:], track.sigma[frames, 3:])
+    significant |= moved[frames]
     out: list[tuple[int, int]] = []
     start: int | None = None
     for i, frame in enumerate(frames.tolist()):
@@ -122,17 +128,17 @@ def _past(
         if start is not None and (excess[i] < _RELIEF or not same):
             out.append((start, frame - 1))
             start = None
-        if start is None and excess[i] >= 1.0 and told[i]:
+        if start is None and excess[i] >= 1.0 and significant[i]:
             start = frame
     if start is not None:
         out.append((start, len(track) - 1))
     return [(a, b) for a, b in out if int(track.measured[a : b + 1].sum()) > _MEDIAN_FRAMES // 2]
 
 
-def _told(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
+def _significant(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
     """(n,) which vectors (n, 3) are longer than what a ± of their deviations (n, 3) stands for along them."""
     along = np.linalg.norm(vectors * sigma, axis=1)
-    out: NDArray[np.bool_] = ~(np.square(vectors).sum(axis=1) <= COVERAGE * along)  # what has no deviation is told
+    out: NDArray[np.bool_] = ~(np.square(vectors).sum(axis=1) <= COVERAGE * along)  # what has no deviation is
     return out
 
 
@@ -178,3 +184,65 @@ def _largest(track: Track, vectors: Array, first: int, last: int) -> Displacemen
     levels = np.array([np.median(vectors[block], axis=0) for block in blocks])
     i = int(np.argmax(np.linalg.norm(levels[:, :3], axis=1)))
     return displacement(levels[i], np.median(track.sigma[blocks[i]], axis=0))
+
+
+def limits_of(source: Recording, affected_m: float | None, affected_rad: float | None) -> Limits:
+    """From the recorded configuration; defaults where it names none, or is none.
+
+    ``affected_m`` and ``affected_rad`` are a person's own; None: what is worth a warning.
+    """
+    policy, origin = _policy(source)
+    if affected_m is not None or affected_rad is not None:
+        origin += "; what counts as affected was given with the command"
+    return Limits(
+        affected_m=policy.warn_m if affected_m is None else affected_m,
+        affected_rad=policy.warn_rad if affected_rad is None else affected_rad,
+        warn_m=policy.warn_m,
+        warn_rad=policy.warn_rad,
+        limit_m=policy.limit_m,
+        limit_rad=policy.limit_rad,
+        alert_limit_m=policy.position_limit_m,
+        alert_limit_rad=policy.alert_limit_rad,
+        origin=origin,
+    )
+
+
+def excess(size_m: float, turn_rad: float, limits: Limits) -> float:
+    """How many times as large as what counts as affected; NaN counts as nothing."""
+    parts = (size_m / limits.affected_m, turn_rad / limits.affected_rad)
+    return max((part for part in parts if math.isfinite(part)), default=0.0)
+
+
+def _policy(source: Recording) -> tuple[PolicySettings, str]:
+    configuration = source.configuration
+    file = None if configuration is None else configuration.files.get(configuration.main)
+    if file is None:
+        return PolicySettings(), "gripmon's defaults: the recording holds no configuration"
+    try:
+        document: Any = yaml.safe_load(file.data.decode("utf-8", "replace"))
+        known = {field.name for field in msgspec.structs.fields(PolicySettings)}
+        given = {k: v for k, v in ((document.get("monitor") or {}).get("policy") or {}).items() if k in known}
+        return msgspec.convert(given, PolicySettings), "the recording's configuration"
+    except (yaml.YAMLError, msgspec.ValidationError, AttributeError, TypeError, ValueError):
+        return PolicySettings(), "gripmon's defaults: the recording's configuration can't be read"
+
+
+def integrity_of(table: FrameTable, limits: Limits) -> Integrity | None:
+    """Of one recording; None where no frame has bounds."""
+    known = np.isfinite(table.protection_m) & np.isfinite(table.protection_rad)
+    if not known.any() or limits.alert_limit_m is None or limits.alert_limit_rad is None:
+        return None
+    position_m, rotation_rad = table.protection_m[known], table.protection_rad[known]
+    within = (position_m <= limits.alert_limit_m) & (rotation_rad <= limits.alert_limit_rad)
+    median_m, p99_m = np.percentile(position_m, (50.0, 99.0)).tolist()
+    median_rad, p99_rad = np.percentile(rotation_rad, (50.0, 99.0)).tolist()
+    return Integrity(
+        frames=int(known.sum()),
+        valid=float(np.mean(table.verdict == table.VERDICTS.index("valid"))),
+        within=float(within.sum() / len(table)),
+        median_m=median_m,
+        p99_m=p99_m,
+        median_rad=median_rad,
+        p99_rad=p99_rad,
+        risk=float(np.median(table.integrity_risk[known])),
+    )

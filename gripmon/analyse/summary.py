@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gripmon.analyse.report.content import AffectedRange, Event, RecordingReport
-from gripmon.analyse.report.formats import (
+from gripmon.analyse.affected import excess
+from gripmon.analyse.content import (
+    AffectedRange,
+    Event,
+    RecordingReport,
     clock_time,
     count,
     date,
@@ -17,8 +20,7 @@ from gripmon.analyse.report.formats import (
     size,
     span,
 )
-from gripmon.analyse.report.happenings import MOTIONS
-from gripmon.analyse.report.limits import excess
+from gripmon.analyse.events import MOTIONS
 from gripmon.model.records import AlertKind, Cause
 
 CAUSES: dict[str, str] = {

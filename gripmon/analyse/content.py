@@ -1,18 +1,19 @@
-"""What a report is made from, and what it says, as data: ``gripmon report --json`` writes it, and the page shows no
-more.
+"""What a report says, as data: ``gripmon report --json`` writes it, and the page shows no more.  And how its numbers
+and times are written for people: millimetres, degrees, UTC.
 
 SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.
 """
 
 from __future__ import annotations
 
+import math
+from datetime import UTC, datetime
 from typing import Annotated
 
 import msgspec
 from msgspec import Meta
 
 from gripmon.model.records import CauseWeight
-from gripmon.record.read import Recording
 
 Vector = tuple[float, float, float]
 
@@ -51,9 +52,9 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     number: Annotated[int, Meta(description="1, 2, … within its recording, in order of time")] = 0
     kind: Annotated[str, Meta(description="an alert's kind (step, creep, drift, lost, …), gap, command, or reference")]
     title: Annotated[str, Meta(description="a few words")]
-    severity: Annotated[str, Meta(description="info, warning or error: the worst that was said")]
+    severity: Annotated[str, Meta(description="info, warning or error: the gravest of its alerts")]
     onset: Onset
-    noticed_ns: Annotated[int | None, Meta(description="when it was first said; null: it never was an alert")] = None
+    noticed_ns: Annotated[int | None, Meta(description="of its first alert; null: it never was one")] = None
     end_ns: Annotated[int | None, Meta(description="when it was over; null: it was not when the recording ended")] = (
         None
     )
@@ -70,7 +71,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
         Displacement | None, Meta(description="by how much the event itself moved the TCP; null: it is no motion")
     ] = None
     moved_in_s: Annotated[float | None, Meta(description="time for 95 % of that; 0: at once")] = None
-    rate_m_per_min: Annotated[float | None, Meta(description="of a creep, as said last")] = None
+    rate_m_per_min: Annotated[float | None, Meta(description="of a creep, by its last alert")] = None
     alert_id: Annotated[str, Meta(description="of the alert; empty: of none")] = ""
     before_seq: Annotated[int | None, Meta(description="frame of the picture before; null: none is recorded")] = None
     at_seq: Annotated[
@@ -79,7 +80,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     after_seq: Annotated[
         int | None, Meta(description="frame of the picture after: the first that was believed, if any was")
     ] = None
-    story: Annotated[tuple[Moment, ...], Meta(description="what was said of it, in order")] = ()
+    story: Annotated[tuple[Moment, ...], Meta(description="its alerts, in order")] = ()
 
 
 class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):
@@ -105,17 +106,17 @@ class AffectedRange(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Limits(msgspec.Struct, frozen=True):
-    """What is too much."""
+    """What counts as too much."""
 
     affected_m: Annotated[float, Meta(description="a calibration that is off by more at the TCP doesn't hold")]
     affected_rad: Annotated[float, Meta(description="nor one that is turned by more")]
     warn_m: Annotated[float, Meta(description="monitor.policy.warn_m")]
     warn_rad: float
-    limit_m: Annotated[float, Meta(description="monitor.policy.limit_m: past it the reference is measured anew")]
+    limit_m: Annotated[float, Meta(description="monitor.policy.limit_m: past it the reference is measured again")]
     limit_rad: float
     origin: Annotated[str, Meta(description="where they come from, in words")]
     alert_limit_m: Annotated[
-        float | None, Meta(description="monitor.policy.alert_limit_m: bounds on a position's error are held against it")
+        float | None, Meta(description="monitor.policy.alert_limit_m: a position's error bound is compared with it")
     ] = None
     alert_limit_rad: float | None = None
 
@@ -196,7 +197,7 @@ class Running(msgspec.Struct, frozen=True, kw_only=True):
     frames: int
     frames_dropped: Annotated[int, Meta(description="numbers missing between the first frame and the last")]
     dropped: Annotated[
-        tuple[str, ...], Meta(description="where frames are missing that nobody recorded; damage is among the faults")
+        tuple[str, ...], Meta(description="where frames are missing that were not recorded; damage is among the faults")
     ]
     frames_refused: Annotated[int, Meta(description="that couldn't be measured")]
     monitor_dropped: Annotated[
@@ -278,13 +279,114 @@ class Report(msgspec.Struct, frozen=True, tag_field="schema", tag="gripmon.repor
     faults: Annotated[tuple[str, ...], Meta(description="files that could not be used at all, a line each")]
 
 
-def main_text(source: Recording) -> str | None:
-    """The text of the recorded configuration's main file; None if there is none."""
-    configuration = source.configuration
-    file = None if configuration is None else configuration.files.get(configuration.main)
-    if file is None:
-        return None
-    try:
-        return file.data.decode("utf-8", "replace")
-    except ValueError:
-        return None
+COVERAGE = 2.0
+"""Standard deviations that a ± stands for."""
+
+
+_FIRST_YEAR_NS = 365 * 86_400 * 1_000_000_000
+
+
+def clock_time(stamp_ns: int, digits: int = 1) -> str:
+    """``12:34:56.7``, UTC, cut, not rounded: no such time lies after the event."""
+    whole, part = divmod(stamp_ns, 1_000_000_000)
+    return f"{_at(whole):%H:%M:%S}" + (f".{part:09d}"[: digits + 1] if digits else "")
+
+
+def date(stamp_ns: int) -> str:
+    """``2026-11-21``, UTC."""
+    return f"{_at(stamp_ns // 1_000_000_000):%Y-%m-%d}"
+
+
+def period(start_ns: int, end_ns: int) -> str:
+    """``2026-11-21, 12:34:56 to 12:34:58 UTC``; images without time stamps count from 0, which is no date."""
+    times = f"{clock_time(start_ns, 0)} to {clock_time(end_ns, 0)}"
+    if 0 <= start_ns < _FIRST_YEAR_NS:
+        return f"{times} by a clock that began with the images, or with 1970"
+    return f"{date(start_ns)}, {times} UTC"
+
+
+def iso(stamp_ns: int) -> str:
+    """``2026-11-21T12:34:56.789Z``."""
+    return f"{date(stamp_ns)}T{clock_time(stamp_ns, 3)}Z"
+
+
+def _at(seconds: int) -> datetime:
+    """Years that the calendar doesn't have are shown as its ends."""
+    return datetime.fromtimestamp(min(max(seconds, -62_135_596_800), 253_402_300_799), UTC)
+
+
+def duration(seconds: float) -> str:
+    """In the two units that fit."""
+    if seconds < 0.0995:
+        return f"{1e3 * seconds:.0f} ms"
+    if seconds < 59.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60} s"
+    minutes = round(seconds / 60.0)
+    if minutes < 1440:
+        return f"{minutes // 60} h {minutes % 60} min"
+    hours = round(seconds / 3600.0)
+    return f"{hours // 24} d {hours % 24} h"
+
+
+def span(start_ns: int, end_ns: int) -> str:
+    """How long from one time to another."""
+    return duration(1e-9 * (end_ns - start_ns))
+
+
+def millimetres(metres: float, sigma_m: float | None = None) -> str:
+    """``4.21 ± 0.02 mm``: ± is two standard deviations, and says how many digits there are."""
+    if not math.isfinite(metres):
+        return "unknown"
+    return f"{_measured(1e3 * metres, None if sigma_m is None else 1e3 * sigma_m)} mm"
+
+
+def degrees(radians: float | None, sigma_rad: float | None = None) -> str:
+    """``1.63 ± 0.04°``."""
+    if radians is None or not math.isfinite(radians):
+        return "unknown"
+    sigma = None if sigma_rad is None else math.degrees(sigma_rad)
+    return f"{_measured(math.degrees(radians), sigma)}°"
+
+
+def size(moved: Displacement | None) -> str:
+    """Both of a displacement."""
+    if moved is None:
+        return "–"
+    text = millimetres(moved.size_m, moved.sigma_m)
+    if moved.rotation_rad is None:
+        return text
+    return f"{text}, {degrees(moved.rotation_rad, moved.rotation_sigma_rad)}"
+
+
+def signed_mm(values_m: tuple[float, float, float]) -> str:
+    """``+1.178 +0.389 +0.040``."""
+    return " ".join(f"{1e3 * value:+.3f}".replace("-", "−") for value in values_m)
+
+
+def percent(share: float) -> str:
+    """A share that isn't whole is never shown as 0 or 100 %."""
+    text = f"{100.0 * share:.1f}"
+    if text == "100.0" and share < 1.0:
+        return "> 99.9 %"
+    if text == "0.0" and share > 0.0:
+        return "< 0.1 %"
+    return f"{text.removesuffix('.0')} %"
+
+
+def count(number: int, one: str, many: str | None = None) -> str:
+    """``1 frame``, ``2 frames``."""
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _measured(value: float, sigma: float | None) -> str:
+    if sigma is None or not math.isfinite(sigma) or sigma <= 0.0:
+        return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+    spread = COVERAGE * sigma
+    digits = min(max(1 - math.floor(math.log10(spread)), 0), 4) if spread < 10.0 else 0
+    digits = (
+        digits - 1 if digits > 1 and round(spread, digits - 1) > 0.0 and spread * 10 ** (digits - 1) >= 2.0 else digits
+    )
+    return f"{value:.{digits}f} ± {spread:.{digits}f}"
