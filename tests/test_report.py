@@ -16,7 +16,7 @@ from support.reported import FPS, NOISE_M, PERIOD_NS, REFERENCE, START_NS, Run, 
 from gripmon.analyse.build import build
 from gripmon.analyse.content import Report
 from gripmon.analyse.correction import correct
-from gripmon.analyse.page import JudgedPicture, page
+from gripmon.analyse.page import JudgedPicture, cut_alike, page
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
