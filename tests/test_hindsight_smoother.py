@@ -7,8 +7,8 @@ from scipy import stats
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.quick_motion import LENGTHS, surprises
-from gripmon.analyse.smoothing import MID_S, SLOW_S, UNKNOWN, Dynamics, log_likelihood, smooth
+from gripmon.analyse.quick_motion import SIDE_FRAMES, squared_changes
+from gripmon.analyse.smoothing import MID_S, SLOW_S, UNKNOWN_VARIANCE, Dynamics, log_likelihood, smooth
 from gripmon.analyse.vectors import covariances_to_poses, covariances_to_vectors, to_poses, to_vectors
 
 RNG = np.random.default_rng(1)
@@ -32,8 +32,8 @@ def dense(axis: int) -> tuple[np.ndarray, np.ndarray]:
         for j in range(count):
             low, high = min(t[i], t[j]), max(t[i], t[j])
             # A random walk, a rate that began with a variance, and a random walk's integral.
-            x[i, j] = UNKNOWN + wander * low + rate * t[i] * t[j] + turn * low**2 * (3.0 * high - low) / 6.0
-            x[i, j] += UNKNOWN * min(after[i], after[j])
+            x[i, j] = UNKNOWN_VARIANCE + wander * low + rate * t[i] * t[j] + turn * low**2 * (3.0 * high - low) / 6.0
+            x[i, j] += UNKNOWN_VARIANCE * min(after[i], after[j])
             gone = high - low
             errors[i, j] = DYNAMICS.slow[axis] * np.exp(-gone / SLOW_S) + DYNAMICS.mid[axis] * np.exp(-gone / MID_S)
     return x, errors
@@ -103,10 +103,10 @@ def test_covariances_follow_the_chart():
     np.testing.assert_allclose(covariances_to_poses(stated[None], vector)[0], root @ root.T, atol=1e-12)
 
 
-def test_surprises_of_normal_noise_have_the_distribution_that_they_are_judged_by():
+def test_squared_changes_of_normal_noise_have_the_distribution_that_they_are_judged_by():
     noise = np.random.default_rng(5).normal(size=(40_000, 6)) @ np.random.default_rng(6).normal(size=(6, 6))
-    for length in LENGTHS:
-        squares = surprises(noise, length)[length:-length]
+    for length in SIDE_FRAMES:
+        squares = squared_changes(noise, length)[length:-length]
         for chance in (0.5, 0.1, 0.01):
             assert np.mean(squares > stats.chi2.isf(chance, 6)) < 1.35 * chance
         assert np.median(squares) > 0.75 * stats.chi2.median(6)

@@ -14,17 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.analyse.quick_motion import LEAST_SQUARE, MARGIN, Found, find, swings, vibration
-from gripmon.analyse.smoothing import Dynamics, Shares, Smoothed, learn_shares, likeliest_dynamics, smooth
+from gripmon.analyse.quick_motion import BURST_MARGIN, MIN_CHANGE_CHI2, Found, find, swings, vibration
+from gripmon.analyse.smoothing import Bools, Dynamics, Ints, Shares, Smoothed, learn_shares, likeliest_dynamics, smooth
 from gripmon.analyse.vectors import (
     Blocks,
-    Bools,
-    Ints,
     Run,
-    Spread,
     at,
     covariances_to_poses,
-    held,
     prepare,
     to_poses,
     to_vectors,
@@ -34,14 +30,14 @@ from gripmon.analyse.vectors import (
 from gripmon.model.records import Array
 
 BLOCK_S = 0.13
-WILD_FREEDOM = 12.0
+BLOCK_DOF = 12.0
 """Student's degrees of freedom of a block's error."""
-SURELY_MOVED = 60.0
+SURE_CHANGE_CHI2 = 60.0
 """Squared size of a change, in units of what frames claim, that no background explains."""
-LEAST_KEPT = 0.3
+MIN_VARIANCE = 0.3
 """Least variance over the reported one: a background that stays as long as the recording shows nothing of its error."""
 RAMP_FRAMES = 32
-PASSES = 2
+FIT_PASSES = 2
 
 SMOOTHED, FOLLOWED, DISBELIEVED, GAP = range(4)
 SOURCES = ("smoothed", "followed", "disbelieved", "gap")
@@ -92,9 +88,9 @@ def correct(
     progress: Callable[[], None] = lambda: None,
 ) -> Correction:
     """Correct one run: ``stamp_ns`` (n,), transforms (n, 4, 4) and covariances (n, 6, 6) as recorded, and whether each
-    was ``measured`` (n,); what isn't, is not looked at.  ``progress`` is called :data:`STAGES` times.
+    was ``measured`` (n,); what isn't, is not used.  ``progress`` is called :data:`STAGES` times.
 
-    ValueError when fewer than :data:`.run.LEAST_FRAMES` frames were measured.
+    ValueError when fewer than :data:`.run.MIN_FRAMES` frames were measured.
     """
     run = prepare(stamp_ns, cam_T_grip, covariance, measured)
     wild = wild_frames(run)
@@ -103,7 +99,8 @@ def correct(
     found = _changes(run)
     progress()
     fit = _fit(run, found)
-    kept = [f for f, size in zip(found, _sizes(run, fit), strict=True) if size > LEAST_SQUARE]
+    jumps = [np.diff(_around(run, fit, k)[0], axis=0) for k in range(len(found))]
+    kept = [f for f, jump in zip(found, jumps, strict=True) if float((jump**2).sum()) > MIN_CHANGE_CHI2]
     if len(kept) < len(found):
         fit = _fit(run, kept)
     progress()
@@ -120,13 +117,13 @@ def _changes(run: Run) -> list[Found]:
     return [
         Found(int(good[found.index]), int(good[found.first]), int(good[found.last]), found.excess)
         for found in find(y, 3600.0 / run.frame_s)
-        if (found.excess > MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
+        if (found.excess > BURST_MARGIN or _surely_moved(y, found.index)) and _is_sharp(y, found.index)
     ]
 
 
 def _surely_moved(y: Array, index: int) -> bool:
     before, after = y[max(index - RAMP_FRAMES, 0) : index].mean(axis=0), y[index : index + RAMP_FRAMES].mean(axis=0)
-    return float(((after - before) ** 2).sum()) > SURELY_MOVED
+    return float(((after - before) ** 2).sum()) > SURE_CHANGE_CHI2
 
 
 def _is_sharp(y: Array, index: int) -> bool:
@@ -183,58 +180,47 @@ def _fit(run: Run, found: list[Found]) -> _Fit:
     quick_error: Array = np.zeros_like(quick)
     extra = np.ones(0)
     size = int(np.clip(round(BLOCK_S / run.frame_s), 1, 16))
-    for number in range(PASSES + 1):
+    for number in range(FIT_PASSES + 1):
         blocks = Blocks(run, good, segment[good], size, run.y[good] - quick, swing)
         if number == 0:
             extra = np.ones(len(blocks.time_s))
-        if number < PASSES:
+        if number < FIT_PASSES:
             trimmed = number > 0 or not found
             shares = learn_shares(blocks.time_s, blocks.mean, blocks.segment, blocks.frame_variance(), trimmed)
         variance = blocks.variance(shares.white) * extra[:, None]
         restarts = np.diff(blocks.segment, prepend=0) > 0
-        if number < PASSES:
+        if number < FIT_PASSES:
             dynamics, kinks_s = likeliest_dynamics(blocks.time_s, blocks.mean, variance, restarts, shares)
         time_s, where = with_gaps(run, blocks.time_s)
-        full = Spread(where, len(time_s))
-        smoothed = smooth(
-            time_s,
-            full.of(blocks.mean, np.nan),
-            full.of(variance, np.inf),
-            full.of(restarts.astype(float)[:, None], 0.0)[:, 0] > 0.5,
-            _nearest(time_s, kinks_s),
-            dynamics,
-        )
-        block_segment = held(blocks.segment, where, len(time_s))
+        y, noise = np.full((len(time_s), 6), np.nan), np.full((len(time_s), 6), np.inf)
+        y[where], noise[where] = blocks.mean, variance
+        begins, kinks = np.zeros((2, len(time_s)), bool)
+        begins[where[restarts]] = True
+        kinks[np.minimum(np.searchsorted(time_s, kinks_s), len(time_s) - 1)] = True
+        smoothed = smooth(time_s, y, noise, begins, kinks, dynamics)
+        index = np.zeros(len(time_s), np.int64)
+        index[where] = np.arange(len(where))
+        block_segment = blocks.segment[np.maximum.accumulate(index)]
         x = at(time_s, block_segment, smoothed, run.time_s[good], segment[good])[0]
         rest = run.y[good] - x
         off = (blocks.mean - smoothed.x[where]) ** 2 / (variance + shares.mid + shares.slow)
-        extra = np.maximum((WILD_FREEDOM + off.sum(axis=1)) / (WILD_FREEDOM + 6.0), 1.0)
+        extra = np.maximum((BLOCK_DOF + off.sum(axis=1)) / (BLOCK_DOF + 6.0), 1.0)
         quick, quick_error = vibration(rest)
         swing = swings(rest - quick, run.claimed[good])
     return _Fit(found, time_s, block_segment, smoothed, shares, dynamics, swing, quick, quick_error)
 
 
-def _nearest(time_s: Array, wanted_s: list[float]) -> Bools:
-    out = np.zeros(len(time_s), bool)
-    out[np.minimum(np.searchsorted(time_s, wanted_s), len(time_s) - 1)] = True
-    return out
-
-
-def _jump(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
-    """x after less before the change (6,), and its variance."""
+def _around(run: Run, fit: _Fit, number: int) -> tuple[Array, Array]:
+    """x just before and after a change (2, 6), and the variance (6,) of their difference."""
     at_s = run.time_s[[fit.found[number].index] * 2]
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
-    return x[1] - x[0], variance.sum(axis=0)
-
-
-def _sizes(run: Run, fit: _Fit) -> list[float]:
-    return [float((_jump(run, fit, k)[0] ** 2).sum()) for k in range(len(fit.found))]
+    return x, variance.sum(axis=0)
 
 
 def _conclude(run: Run, fit: _Fit, stamp_ns: Ints, wild: Bools) -> Correction:
     segment = _segments(run, fit.found)
     x, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s, segment)
-    variance = np.maximum(variance + fit.shares.unseen, LEAST_KEPT)
+    variance = np.maximum(variance + fit.shares.unseen, MIN_VARIANCE)
     good = np.flatnonzero(run.usable)
     source = np.full(len(x), GAP, np.int8)
     source[good], source[wild] = SMOOTHED, DISBELIEVED
@@ -276,26 +262,22 @@ def _unsure_in_gap(run: Run, fit: _Fit, number: int, found: Found, x: Array, spr
     begin_s, end_s = run.time_s[before], run.time_s[found.index]
     passed = ((run.time_s[gap] - begin_s) / max(end_s - begin_s, 1e-9))[:, None]
     later, variance = at(fit.time_s, fit.segment, fit.smoothed, run.time_s[gap], np.full(len(gap), number + 1))
-    way = later - x[gap]
-    x[gap] += passed * way
-    apart = (passed * (1.0 - passed))[:, :, None] * (way[:, :, None] * way[:, None, :])
+    jump = later - x[gap]
+    x[gap] += passed * jump
+    apart = (passed * (1.0 - passed))[:, :, None] * (jump[:, :, None] * jump[:, None, :])
     spread[gap] += apart + passed[:, :, None] * (variance[:, :, None] * np.eye(6))
 
 
 def _point(run: Run, fit: _Fit, number: int, stamp_ns: Ints) -> ChangePoint:
     found = fit.found[number]
-    _, variance = _jump(run, fit, number)
-    good = np.flatnonzero(run.usable[: found.first])
-    at_s = run.time_s[[found.index] * 2]
-    x, _ = at(fit.time_s, fit.segment, fit.smoothed, at_s, np.array([number, number + 1]))
+    x, variance = _around(run, fit, number)
     before_T, after_T = to_poses(run.origin_T, x @ run.root.T)
-    size = to_vectors(before_T, after_T[None])[0]
     return ChangePoint(
         found.index,
         int(stamp_ns[found.index]),
-        int(stamp_ns[good[-1]]),
+        int(stamp_ns[np.flatnonzero(run.usable[: found.first])[-1]]),
         int(stamp_ns[found.last]),
-        size,
+        to_vectors(before_T, after_T[None])[0],
         run.root @ (variance[:, None] * run.root.T),
     )
 
@@ -304,7 +286,7 @@ def sample(correction: Correction, wanted_ns: Ints) -> tuple[Array, Array, Ints]
     """Transforms (k, 4, 4), their errors' covariances (k, 6, 6) and segments (k,) at the capture times ``wanted_ns``.
 
     A frame's own time gives the frame's.  Between two frames the transform is taken to go from one to the other, and
-    may have done so at once, at any moment: so much is added to the covariance.  All NaN, and segment -1, before the
+    may have done so at once, at any moment: that is added to the covariance.  All NaN, and segment -1, before the
     first frame and after the last.  ValueError for a recording in which time runs backwards.
     """
     stamps = correction.stamp_ns
@@ -319,9 +301,9 @@ def sample(correction: Correction, wanted_ns: Ints) -> tuple[Array, Array, Ints]
     poses, covariances = np.full((len(f), 4, 4), np.nan), np.full((len(f), 6, 6), np.nan)
     for k in np.flatnonzero(~outside).tolist():
         from_T, to_T = correction.cam_T_grip[before[k]], correction.cam_T_grip[after[k]]
-        way = to_vectors(from_T, to_T[None])[0]
-        poses[k] = to_poses(from_T, f[k] * way[None])[0]
+        motion = to_vectors(from_T, to_T[None])[0]
+        poses[k] = to_poses(from_T, f[k] * motion[None])[0]
         own = (1.0 - f[k]) * correction.covariance[before[k]] + f[k] * correction.covariance[after[k]]
-        covariances[k] = own + f[k] * (1.0 - f[k]) * np.outer(way, way)
+        covariances[k] = own + f[k] * (1.0 - f[k]) * np.outer(motion, motion)
     segment = np.where(f < 0.5, correction.segment[before], correction.segment[after])
     return poses, covariances, np.where(outside, -1, segment)

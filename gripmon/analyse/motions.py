@@ -19,7 +19,7 @@ from gripmon.analyse.content import Displacement, Event, Limits, Moment, Onset
 from gripmon.analyse.correction import ChangePoint, correct
 from gripmon.analyse.events import MOTIONS, AlertHistory, TimedAlert, explained, probability, worst
 from gripmon.analyse.track import SECOND_NS, Track, displacement
-from gripmon.analyse.vectors import LEAST_FRAMES
+from gripmon.analyse.vectors import MIN_FRAMES
 from gripmon.model.records import AlertKind, Array, Severity
 from gripmon.record.read import Recording
 
@@ -336,7 +336,7 @@ def change_points_of(source: Recording, track: Track, alerted_ns: Sequence[int],
     points: list[ChangePoint] = []
     matrices = None
     for part in _parts(track, alerted_ns, limits):
-        if track.measured[part].sum() < LEAST_FRAMES:
+        if track.measured[part].sum() < MIN_FRAMES:
             continue
         matrices = table.matrices() if matrices is None else matrices
         try:

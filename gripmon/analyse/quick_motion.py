@@ -1,9 +1,16 @@
-"""Where the pose changed within a frame or a few: found from both sides, placed to the frame.
+"""Quick motion: where the pose changed within a frame or a few, a mount that vibrates, a camera that swings after a
+knock.  What is left of the frames after the slow motion is noise and quick motion.
+
+Changes are found from both sides and placed to the frame.
 
 At each place the mean of the frames after is compared with that of those before, over several lengths.  A steady creep
 is taken away (the running median of the differences), and the covariance of the rest is the recording's own, without
-its wildest tenth; where all of it is larger for a while, less counts as surprising.  The threshold keeps the chance of
+its wildest tenth; where all of it is larger for a while, more is needed.  The threshold keeps the chance of
 one false alarm in an hour's frames at :data:`FALSE_ALARMS_PER_HOUR` for Student's errors.
+
+A line in the spectrum that stands out of the floor is a vibration, and is given back as far as it stands out (Wiener's
+filter, all six axes together at each frequency).  Where frames scatter far more than they claim for a while, the
+transform follows them.
 """
 
 from __future__ import annotations
@@ -16,34 +23,34 @@ from scipy.ndimage import median_filter, uniform_filter1d
 
 from gripmon.model.records import Array
 
-LENGTHS = (4, 8, 16)
+SIDE_FRAMES = (4, 8, 16)
 """Frames on each side."""
 FALSE_ALARMS_PER_HOUR = 0.02
-FREEDOM, FREEDOM_GROWTH = 12.0, 1.0 / 3.0
+STUDENT_DOF, STUDENT_DOF_POWER = 12.0, 1.0 / 3.0
 """Student's degrees of freedom of a frame's error before clutter, on simulated images, and the power of the number of
 frames with which those of a mean grow: as in the drift test.
 """
-MARGIN = 2.5
+BURST_MARGIN = 2.5
 """Factor on the threshold for changes that are no larger than what frames claim may explain: errors come in bursts (in
 streams simulated after images 2.2 was reached in 1.8 hours).
 """
-CALM = 0.9
+CALM_FRACTION = 0.9
 """Part of the squared differences that is taken for noise, whatever happens in the rest."""
-LOCAL = 48
+LOCAL_WINDOWS = 48
 """Neighbouring lengths over which the local size of differences is the median's."""
-LEAST_SQUARE = 4.0
-"""A change is at least so large, squared, in units of what frames claim: a background's passing isn't told from it."""
-SAME = 12
+MIN_CHANGE_CHI2 = 4.0
+"""Squared size, in units of what frames claim, below which a change may as well be a background's passing."""
+SAME_CHANGE_FRAMES = 12
 """Frames within which there is one change only."""
-LIKELY = 0.95
-LEAST_NOISE = 1e-9
+PLACE_PROBABILITY = 0.95
+MIN_NOISE_VARIANCE = 1e-9
 """Variance, in units of what frames claim, that is never doubted: frames may repeat one another to the bit."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A change between the frames ``index - 1`` and ``index``; in all probability (:data:`LIKELY`) between the one
-    before ``first`` and ``last``.  ``excess``: how many times its threshold it reached.
+    """A change between the frames ``index - 1`` and ``index``; with :data:`PLACE_PROBABILITY` between the one before
+    ``first`` and ``last``.  ``excess``: how many times its threshold it reached.
     """
 
     index: int
@@ -54,8 +61,8 @@ class Found:
 
 def threshold(length: int, frames_per_hour: float, dof: int = 6) -> float:
     """For squared distances of ``dof`` numbers, means of ``length`` frames."""
-    chance = FALSE_ALARMS_PER_HOUR / max(frames_per_hour, 1.0) / len(LENGTHS)
-    return float(dof * stats.f.isf(chance, dof, FREEDOM * length**FREEDOM_GROWTH))
+    chance = FALSE_ALARMS_PER_HOUR / max(frames_per_hour, 1.0) / len(SIDE_FRAMES)
+    return float(dof * stats.f.isf(chance, dof, STUDENT_DOF * length**STUDENT_DOF_POWER))
 
 
 def differences(y: Array, length: int) -> Array:
@@ -67,7 +74,7 @@ def differences(y: Array, length: int) -> Array:
     return out
 
 
-def surprises(y: Array, length: int) -> Array:
+def squared_changes(y: Array, length: int) -> Array:
     """Squared size (n,) of the differences in units of their usual spread; 0 at the ends."""
     out = np.zeros(len(y))
     if len(y) < 8 * length:
@@ -76,41 +83,43 @@ def surprises(y: Array, length: int) -> Array:
     moved = differences(y, length)[inside]
     stride = max(length // 2, 1)
     # Of a slow creep, which is the same all around; a running median of every few.
-    window = 2 * LOCAL + 1
+    window = 2 * LOCAL_WINDOWS + 1
     coarse = median_filter(moved[::stride], size=(min(window, len(moved[::stride]) | 1), 1), mode="nearest")
     moved = moved - np.repeat(coarse, stride, axis=0)[: len(moved)]
     squared = _mahalanobis(moved)
     usual = _local_median(squared, stride)
-    out[inside] = squared / np.maximum(usual / max(float(np.median(squared)), LEAST_NOISE), 1.0)
+    out[inside] = squared / np.maximum(usual / max(float(np.median(squared)), MIN_NOISE_VARIANCE), 1.0)
     return out
 
 
 def _mahalanobis(moved: Array) -> Array:
     """By the covariance of the calm part, made right for normal numbers."""
     dof = moved.shape[1]
-    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + LEAST_NOISE)
+    covariance: Array = np.diag(np.median(moved * moved, axis=0) / 0.4549 + MIN_NOISE_VARIANCE)
     for _ in range(6):
         squared = np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True)
-        calm = squared <= np.quantile(squared, CALM)
-        kept = stats.chi2.cdf(stats.chi2.ppf(CALM, dof), dof + 2) / CALM
-        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept + LEAST_NOISE * np.eye(dof)
+        calm = squared <= np.quantile(squared, CALM_FRACTION)
+        kept = stats.chi2.cdf(stats.chi2.ppf(CALM_FRACTION, dof), dof + 2) / CALM_FRACTION
+        covariance = (moved[calm].T @ moved[calm]) / calm.sum() / kept + MIN_NOISE_VARIANCE * np.eye(dof)
     return np.asarray(np.einsum("ni,ij,nj->n", moved, np.linalg.inv(covariance), moved, optimize=True))
 
 
 def _local_median(squared: Array, stride: int) -> Array:
     some = squared[::stride]
-    smooth = median_filter(some, size=min(2 * LOCAL + 1, len(some) | 1), mode="nearest")
+    smooth = median_filter(some, size=min(2 * LOCAL_WINDOWS + 1, len(some) | 1), mode="nearest")
     return np.repeat(smooth, stride)[: len(squared)]
 
 
 def find(y: Array, frames_per_hour: float) -> list[Found]:
     """Changes in the frames ``y`` (n, a), whitened by what they claim."""
-    limits = [threshold(length, frames_per_hour, y.shape[1]) for length in LENGTHS]
-    statistic = np.stack([surprises(y, length) / limit for length, limit in zip(LENGTHS, limits, strict=True)])
+    limits = [threshold(length, frames_per_hour, y.shape[1]) for length in SIDE_FRAMES]
+    statistic = np.stack(
+        [squared_changes(y, length) / limit for length, limit in zip(SIDE_FRAMES, limits, strict=True)]
+    )
     found: list[Found] = []
     for index in _peaks(statistic.max(axis=0), 1.0):
-        place = _place(y, index, int(LENGTHS[int(statistic[:, index].argmax())]))
-        if place is not None and (not found or place.index - found[-1].index >= SAME // 2):
+        place = _place(y, index, int(SIDE_FRAMES[int(statistic[:, index].argmax())]))
+        if place is not None and (not found or place.index - found[-1].index >= SAME_CHANGE_FRAMES // 2):
             found.append(replace(place, excess=float(statistic[:, index].max())))
     return found
 
@@ -123,7 +132,7 @@ def _peaks(statistic: Array, limit: float) -> list[int]:
     for index in above[np.argsort(-left[above])].tolist():
         if left[index] > limit:
             taken.append(index)
-            left[max(index - SAME, 0) : index + SAME] = 0.0
+            left[max(index - SAME_CHANGE_FRAMES, 0) : index + SAME_CHANGE_FRAMES] = 0.0
     return sorted(taken)
 
 
@@ -143,7 +152,7 @@ def _place(y: Array, index: int, length: int) -> Found | None:
     probability = np.exp(gain)
     probability /= probability.sum()
     low = high = best
-    while probability[low : high + 1].sum() < LIKELY:
+    while probability[low : high + 1].sum() < PLACE_PROBABILITY:
         left = probability[low - 1] if low > 0 else -1.0
         right = probability[high + 1] if high + 1 < len(candidates) else -1.0
         low, high = (low - 1, high) if left >= right else (low, high + 1)
@@ -153,43 +162,43 @@ def _place(y: Array, index: int, length: int) -> Found | None:
 def _own_noise(part: Array) -> Array:
     """Variance (a,) of frames about their neighbours."""
     step = np.diff(part, axis=0)
-    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + LEAST_NOISE)
+    return np.asarray(np.median(step * step, axis=0) / 0.4549 / 2.0 + MIN_NOISE_VARIANCE)
 
 
-WINDOW, HOP = 256, 64
-AVERAGED = 32
+SPECTRUM_FRAMES, SPECTRUM_STEP_FRAMES = 256, 64
+AVERAGED_SPECTRA = 32
 """Windows over which a spectrum is averaged."""
-BESIDE = (3, 12)
+FLOOR_BINS = (3, 12)
 """Frequencies beside a line whose median is the floor; the higher one of both sides: the spectrum may fall steeply."""
-STANDS_OUT = 8.0
-"""So many times the floor the largest of six parts is by more than chance (of about twelve windows that don't overlap
+LINE_OVER_FLOOR = 8.0
+"""Times the floor from which the largest of six parts is more than chance (of about twelve windows that don't overlap
 it is three times the floor on average).
 """
 LOWEST_BIN = 5
 SWING_FRAMES = 12
-SWING_FROM, SWING_CLAIM = 8.0, 5.0
-"""Frames scatter so many times more than usual, and than they claim: the camera swings."""
+SWING_OVER_USUAL, SWING_OVER_CLAIMED = 8.0, 5.0
+"""How many times more than usual, and than they claim, frames scatter where the camera swings."""
 
 
 def vibration(rest: Array) -> tuple[Array, Array]:
     """The vibration in what is left (n, a) of frames, and the mean squares (n, a) of its error."""
     none = np.zeros_like(rest)
-    if len(rest) < 2 * WINDOW:
+    if len(rest) < 2 * SPECTRUM_FRAMES:
         return none, none.copy()
-    shape = signal.get_window("hann", WINDOW)
-    transform = signal.ShortTimeFFT(shape, HOP, 1.0)
+    shape = signal.get_window("hann", SPECTRUM_FRAMES)
+    transform = signal.ShortTimeFFT(shape, SPECTRUM_STEP_FRAMES, 1.0)
     spectra = transform.stft(rest.T)
     spectra = np.moveaxis(spectra, 0, -1)  # (frequencies, windows, a)
     frequencies, windows, series = spectra.shape
     kept = np.zeros_like(spectra)
     lost = np.zeros((frequencies, windows, series))
-    for begin in range(0, windows, AVERAGED):
-        part = slice(begin, min(begin + AVERAGED, windows))
-        own, variance = _stands_out(spectra[:, max(part.stop - AVERAGED, 0) : part.stop])
+    for begin in range(0, windows, AVERAGED_SPECTRA):
+        part = slice(begin, min(begin + AVERAGED_SPECTRA, windows))
+        own, variance = _stands_out(spectra[:, max(part.stop - AVERAGED_SPECTRA, 0) : part.stop])
         kept[:, part] = np.einsum("fij,fwj->fwi", own, spectra[:, part])
         lost[:, part] = variance[:, None]
     back = transform.istft(np.moveaxis(kept, -1, 0), k1=len(rest)).T
-    power = (lost.sum(axis=0) * 2.0) / (WINDOW * float((shape**2).sum()))
+    power = (lost.sum(axis=0) * 2.0) / (SPECTRUM_FRAMES * float((shape**2).sum()))
     at = np.clip(transform.t(len(rest)), 0, len(rest) - 1)
     error = np.stack([np.interp(np.arange(len(rest)), at, power[:, j]) for j in range(series)], axis=1)
     return np.real(back), error
@@ -203,7 +212,7 @@ def _stands_out(spectra: Array) -> tuple[Array, Array]:
     floor = _floor(power) + 1e-300
     root = np.sqrt(floor)
     values, directions = np.linalg.eigh(cross / (root[:, :, None] * root[:, None, :]))
-    share = np.where(values > STANDS_OUT, 1.0 - 1.0 / np.maximum(values, 1.0), 0.0)
+    share = np.where(values > LINE_OVER_FLOOR, 1.0 - 1.0 / np.maximum(values, 1.0), 0.0)
     share[:LOWEST_BIN] = 0.0
     gain = np.einsum("fik,fk,fjk->fij", directions, share, directions.conj())
     gain = root[:, :, None] * gain / root[:, None, :]
@@ -213,7 +222,7 @@ def _stands_out(spectra: Array) -> tuple[Array, Array]:
 
 def _floor(power: Array) -> Array:
     """(f, a) what the spectrum is without lines."""
-    near, far = BESIDE
+    near, far = FLOOR_BINS
     size = far - near
     # The median of what lies around a place ``offset`` away.
     middle = median_filter(power, size=(size, 1), mode="nearest")
@@ -229,5 +238,5 @@ def swings(rest: Array, claimed: Array) -> Array:
     local = uniform_filter1d(squares, SWING_FRAMES, axis=0, mode="nearest")
     usual = np.median(local, axis=0)
     ratio = (local / np.maximum(claimed, 1e-12)).mean(axis=1)
-    swinging = (ratio > SWING_CLAIM) & ((local / (usual + 1e-12)).mean(axis=1) > SWING_FROM)
+    swinging = (ratio > SWING_OVER_CLAIMED) & ((local / (usual + 1e-12)).mean(axis=1) > SWING_OVER_USUAL)
     return np.where(swinging[:, None], np.maximum(local - usual, 0.0), 0.0)

@@ -1,8 +1,8 @@
-"""What the recording itself shows of its errors, axis by axis in units of the reported variance.
+"""The smoother, and what the recording itself shows of its errors, axis by axis in units of the reported variance.
 
 Second differences ``y(t) - 2 y(t + l) + y(t + 2 l)`` hardly see a pose that stands still or creeps steadily.  Their
-mean squares at growing lags tell how much of the error is new in each block, how much lasts for half a second, and how
-much for as long as a background stays.  What frames claim and nobody has seen is kept as an error that never averages
+mean squares at growing lags show how much of the error is new in each block, how much lasts for half a second, and how
+much for as long as a background stays.  What frames claim and none shows is kept as an error that never averages
 out.  How the pose itself wanders is the likeliest of a list.
 """
 
@@ -14,35 +14,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gripmon.analyse.vectors import Bools
 from gripmon.model.records import Array
 
-LONGEST_LAG_S = 30.0
-TRIM, TRIMMED_MEAN = 0.98, 0.8735
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+MAX_LAG_S = 30.0
+TRIMMED_FRACTION, TRIMMED_MEAN = 0.98, 0.8735
 """Part of the squares that is averaged (the rest may be wild), and the mean of that part for normal errors."""
-MEDIAN = 0.4549
-LEAST_WHITE = 1e-4
-LEAST_SLOW = 0.3
+CHI2_MEDIAN = 0.4549
+MIN_WHITE_VARIANCE = 1e-4
+MIN_SLOW_VARIANCE = 0.3
 """The error that lasts is believed to be as large as the reported one, and this at least, if differences show it."""
 PRIOR_BACKGROUNDS = 3.0
-"""So many backgrounds' worth it counts that all that is claimed, and seen nowhere else, lasts."""
+"""How many backgrounds the assumption counts as that all that is claimed, and seen nowhere else, lasts."""
 
-WANDERS = (1e-6, 1e-3, 1e-1)
-TURNS = ((1e-9, 1e-6), (1e-7, 1e-2), (1e-6, 1e2), (1e-4, 1e2), (1e-2, 1e2), (1.0, 1e2))
+WANDER_VARIANCES = (1e-6, 1e-3, 1e-1)
+TURN_VARIANCES = ((1e-9, 1e-6), (1e-7, 1e-2), (1e-6, 1e2), (1e-4, 1e2), (1e-2, 1e2), (1.0, 1e2))
 """Variances that are tried, a second: of x, of its rate together with that of the first rate (reported sd/s, squared).
 """
 SLOW_FACTORS = (1.0, 2.5, 6.0)
-WORTH_WANDER, WORTH_TURN, WORTH_SLOW = 6.0, 1.5, 1.0
-"""By so much the logarithm of the likelihood has to grow for each step to the next.  Backgrounds that change look like
+WANDER_STEP_COST, TURN_STEP_COST, SLOW_STEP_COST = 6.0, 1.5, 1.0
+"""What the logarithm of the likelihood has to grow by for each step to the next.  Backgrounds that change look like
 wandering, hardly like a rate.
 """
-KINK_PLACES, MOST_KINKS, WORTH_KINK = 48, 6, 20.0
+KINK_PLACES, MAX_KINKS, KINK_COST = 48, 6, 20.0
 """Places where the rate may have become another one that are tried, how many are believed at most, and by how much the
 logarithm of the likelihood has to grow for one.
 """
-LIKELIHOOD_S, LIKELIHOOD_BLOCKS = 2.0, 600
-"""Means of so many seconds at least, and no more of them, are what the likelihood is reckoned of: a background passes
-to the next one meanwhile.
+LIKELIHOOD_STEP_S, MAX_LIKELIHOOD_STEPS = 2.0, 600
+"""Of the means that the likelihood is computed of: their length at least, in which a background passes to the next one,
+and how many at most.
 """
 
 
@@ -74,8 +76,8 @@ def mean_squares(differences: Array, trimmed: bool) -> Array:
     """(a,) of columns, steps and gross errors left out."""
     squares = differences * differences
     if not trimmed:
-        return np.asarray(np.median(squares, axis=0) / MEDIAN)
-    inside = squares <= np.quantile(squares, TRIM, axis=0)
+        return np.asarray(np.median(squares, axis=0) / CHI2_MEDIAN)
+    inside = squares <= np.quantile(squares, TRIMMED_FRACTION, axis=0)
     return np.asarray((squares * inside).sum(axis=0) / inside.sum(axis=0) / TRIMMED_MEAN)
 
 
@@ -94,7 +96,7 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
     step_s = step_of(time_s)
     rows, values, weights = [], [], []
     lag = 1
-    while 2 * lag < 0.75 * len(time_s) and lag * step_s <= LONGEST_LAG_S:
+    while 2 * lag < 0.75 * len(time_s) and lag * step_s <= MAX_LAG_S:
         differences = second_differences(time_s, y, segment, lag)
         if len(differences) >= 8:
             lasting = [_seen(lag * step_s, correlation_s) for correlation_s in (MID_S, SLOW_S)]
@@ -108,11 +110,11 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
         out[0], out[2] = 0.25, 0.5
     else:
         for axis in range(series):
-            seen = np.maximum([v[axis] for v in values], LEAST_WHITE)
+            seen = np.maximum([v[axis] for v in values], MIN_WHITE_VARIANCE)
             relative = np.array(weights) / seen
             out[:, axis], _ = nnls(np.array(rows) * relative[:, None], seen * relative)
-    white, mid = np.maximum(out[0], LEAST_WHITE), out[1]
-    expected = np.maximum(1.0 - frame - white - mid, LEAST_SLOW)
+    white, mid = np.maximum(out[0], MIN_WHITE_VARIANCE), out[1]
+    expected = np.maximum(1.0 - frame - white - mid, MIN_SLOW_VARIANCE)
     backgrounds = step_s * len(time_s) / (2.0 * SLOW_S)
     slow = (backgrounds * np.minimum(out[2], 2.0 * expected) + PRIOR_BACKGROUNDS * expected) / (
         backgrounds + PRIOR_BACKGROUNDS
@@ -132,10 +134,10 @@ def likeliest_dynamics(
     series = _Series(*_for_likelihood(time_s, y, variance, restarts, shares), shares.slow)
     kinks: list[float] = []
     dynamics, best = series.likeliest(kinks)
-    while len(kinks) < MOST_KINKS and len(series.time_s) > 8:
+    while len(kinks) < MAX_KINKS and len(series.time_s) > 8:
         at_s = series.likeliest_kink(kinks)
         other, likelihood = series.likeliest([*kinks, at_s])
-        if likelihood < best + WORTH_KINK:
+        if likelihood < best + KINK_COST:
             break
         kinks, dynamics, best = [*kinks, at_s], other, likelihood
     return Dynamics(dynamics.slow, shares.mid, dynamics.wander, dynamics.turn, dynamics.rate), kinks
@@ -145,7 +147,7 @@ def _for_likelihood(
     time_s: Array, y: Array, variance: Array, restarts: Bools, shares: Shares
 ) -> tuple[Array, Array, Array, Bools, Array]:
     """Coarser means; what errors that last for less make of them is white."""
-    group = max(round(LIKELIHOOD_S / step_of(time_s)), -(-len(time_s) // LIKELIHOOD_BLOCKS), 1)
+    group = max(round(LIKELIHOOD_STEP_S / step_of(time_s)), -(-len(time_s) // MAX_LIKELIHOOD_STEPS), 1)
     if group == 1 or len(time_s) < 8 * group:
         return time_s, y, variance, restarts, shares.mid
     variance = variance + shares.mid * 2.0 * MID_S / step_of(time_s)
@@ -173,7 +175,7 @@ class _Series:
     def likeliest_kink(self, kinks_s: list[float]) -> float:
         """Where one more helps most, with rates that are nearly constant between."""
         places = np.unique(np.linspace(1, len(self.time_s) - 2, KINK_PLACES).astype(int))
-        tried = np.array([(WANDERS[0], turn, UNKNOWN_RATE, 1.0) for turn in (1e-6, 1e-2)])
+        tried = np.array([(WANDER_VARIANCES[0], turn, UNKNOWN_RATE_VARIANCE, 1.0) for turn in (1e-6, 1e-2)])
         kinks = np.repeat(self._kinks(kinks_s)[:, None], len(places), axis=1)
         kinks[places, np.arange(len(places))] = True
         kinks = np.repeat(kinks, len(tried), axis=1)
@@ -200,11 +202,11 @@ class _Series:
 def _candidates() -> tuple[Array, Array]:
     """Rows of wander, turn, first rate's variance, factor on the slow error (c, 4), and what each costs (c,)."""
     rows, costs = [], []
-    for i, wander in enumerate(WANDERS):
-        for j, turn in enumerate(TURNS):
+    for i, wander in enumerate(WANDER_VARIANCES):
+        for j, turn in enumerate(TURN_VARIANCES):
             for k, factor in enumerate(SLOW_FACTORS):
                 rows.append((wander, *turn, factor))
-                costs.append(WORTH_WANDER * i + WORTH_TURN * j + WORTH_SLOW * k)
+                costs.append(WANDER_STEP_COST * i + TURN_STEP_COST * j + SLOW_STEP_COST * k)
     return np.array(rows), np.array(costs)
 
 
@@ -229,10 +231,10 @@ def _coarser(
 SLOW_S, MID_S = 15.0, 0.5
 """Correlation times of the two errors: a background that stays for a while, and what passes behind the edges."""
 
-UNKNOWN = 1e7
-"""Variance of a state that nothing is known of, in units of the reported variance."""
+UNKNOWN_VARIANCE = 1e7
+"""Variance of an unknown state, in units of the reported variance."""
 
-UNKNOWN_RATE = 100.0
+UNKNOWN_RATE_VARIANCE = 100.0
 """Likewise of a rate (1/s²)."""
 
 
@@ -309,13 +311,13 @@ def _filter(time_s: Array, y: Array, variance: Array, restarts: Bools, kinks: Bo
             # Of the state all but the rate is measured.
             towards = covariance[..., 0] + covariance[..., 2] + covariance[..., 3]
             expected = towards[:, 0] + towards[:, 2] + towards[:, 3] + noise[k]
-            surprise = values[k] - (mean[:, 0] + mean[:, 2] + mean[:, 3])
+            innovation = values[k] - (mean[:, 0] + mean[:, 2] + mean[:, 3])
             gain = towards / expected[:, None]
             if not all_known[k]:
                 gain = gain * known[k][:, None]
-            mean = mean + gain * surprise[:, None]
+            mean = mean + gain * innovation[:, None]
             covariance = covariance - gain[:, :, None] * towards[:, None, :]
-            log_density -= known[k] * (np.log(expected) + surprise * surprise / expected)
+            log_density -= known[k] * (np.log(expected) + innovation * innovation / expected)
         out.mean[k], out.covariance[k] = mean, covariance
     out.log_likelihood = 0.5 * (log_density - np.log(2.0 * np.pi) * known.sum(axis=0))
     return out
@@ -337,10 +339,10 @@ def _steps(time_s: Array, restarts: Bools, kinks: Bools, dynamics: Dynamics, ser
     added[..., 1, 1] = dynamics.turn * t
     added[..., 2, 2] = dynamics.slow * (1.0 - fade[:, :1] ** 2)
     added[..., 3, 3] = dynamics.mid * (1.0 - fade[:, 1:] ** 2)
-    added[restarts, :, 0, 0] += UNKNOWN
-    added[..., 1, 1] += UNKNOWN_RATE * (kinks if kinks.ndim == 2 else kinks[:, None])
+    added[restarts, :, 0, 0] += UNKNOWN_VARIANCE
+    added[..., 1, 1] += UNKNOWN_RATE_VARIANCE * (kinks if kinks.ndim == 2 else kinks[:, None])
     added[0] = 0.0
-    added[0, :, 0, 0], added[0, :, 1, 1] = UNKNOWN, dynamics.rate
+    added[0, :, 0, 0], added[0, :, 1, 1] = UNKNOWN_VARIANCE, dynamics.rate
     added[0, :, 2, 2], added[0, :, 3, 3] = dynamics.slow, dynamics.mid
     return transition, added
 

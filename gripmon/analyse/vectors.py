@@ -1,4 +1,10 @@
-"""A recording as whitened vectors about one pose, the frames that are plainly wrong left out."""
+"""A recording as whitened vectors about one pose, the frames that are plainly wrong left out; poses as vectors
+``xi = (rho, omega)`` about one of them, and back; means of blocks of frames, and what lies between them.
+
+About the pose ``T0`` a pose T is ``t = t0 + rho``, ``R = exp(omega) R0``.  The error that a covariance speaks of is
+applied after that; to first order ``exp(e) exp(omega) = exp(omega + J(omega)^-1 e)`` with the left Jacobian J of SO(3)
+(Solà, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018, eq. 145).
+"""
 
 from __future__ import annotations
 
@@ -6,27 +12,22 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.spatial.transform import Rotation
 
-from gripmon.analyse.smoothing import Smoothed
+from gripmon.analyse.smoothing import Bools, Ints, Smoothed
 from gripmon.model.geometry import skew
 from gripmon.model.records import Array
 
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.int64]
-
-LEAST_FRAMES = 3
-LONGEST_GAP_S = 3600.0
+MIN_FRAMES = 3
+MAX_GAP_S = 3600.0
 """Beyond, everything may have happened: more time in a gap says no more, and ends what numbers can hold."""
-FARTHEST_M = 1e6
+MAX_DISTANCE_M = 1e6
 """A transform that reaches farther is none, and its squares end what numbers can hold."""
-LEAST_VARIANCE, LEAST_EIGENVALUE = 1e-24, 1e-9
+MIN_COVARIANCE_DIAGONAL, MIN_CORRELATION_EIGENVALUE = 1e-24, 1e-9
 """Of a covariance (m², rad²: a picometre, no camera's) and of its correlations: below, it is taken for none."""
-WILD, WILD_NEIGHBOURS, WILD_RUN = 8.0, 9, 2
-"""A frame so many standard deviations off the median of its neighbours is wrong if no more than this many in a row
-are, and few are around."""
+WILD_SIGMAS, WILD_WINDOW_FRAMES, WILD_MAX_FRAMES = 8.0, 9, 2
+"""A frame farther off the median of its window is wrong if no more than this many in a row are, and few are around."""
 
 
 @dataclass
@@ -53,26 +54,28 @@ def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bool
     stamp_ns = np.asarray(stamp_ns, np.int64)
     usable = np.asarray(measured, bool) & np.isfinite(cam_T_grip).all(axis=(1, 2))
     faults = []
-    near = usable & (np.abs(cam_T_grip[:, :3, 3]) < FARTHEST_M).all(axis=1)
+    near = usable & (np.abs(cam_T_grip[:, :3, 3]) < MAX_DISTANCE_M).all(axis=1)
     if (bad := int((usable & ~near).sum())) > 0:
-        faults.append(f"the transforms of {bad} frames reach {FARTHEST_M:.0e} m or farther: these frames were not used")
+        faults.append(
+            f"the transforms of {bad} frames reach {MAX_DISTANCE_M:.0e} m or farther: these frames were not used"
+        )
     usable = near
     known = usable & are_definite(covariance)
     if (bad := int((usable & ~known).sum())) > 0:
         faults.append(f"the covariances of {bad} frames aren't positive definite: these frames were not used")
     usable = known
-    if usable.sum() < LEAST_FRAMES:
-        raise ValueError("; ".join([f"only {usable.sum()} frames were measured; at least {LEAST_FRAMES}", *faults]))
+    if usable.sum() < MIN_FRAMES:
+        raise ValueError("; ".join([f"only {usable.sum()} frames were measured; at least {MIN_FRAMES}", *faults]))
     step_ns = np.diff(stamp_ns)
     back = int((step_ns < 0).sum())
     if back:
         faults.append(f"time runs backwards {back} times: frames count in the order of their numbers there")
     ahead = step_ns[step_ns > 0]
     usual_ns = int(np.median(ahead)) if len(ahead) else 1
-    if len(ahead) and ahead.max() > 1e9 * LONGEST_GAP_S:
-        often = int((ahead > 1e9 * LONGEST_GAP_S).sum())
-        faults.append(f"{often} gaps are longer than {LONGEST_GAP_S:.0f} s: each counts as that long")
-    step_ns = np.minimum(np.where(step_ns < 0, usual_ns, step_ns), round(1e9 * LONGEST_GAP_S))
+    if len(ahead) and ahead.max() > 1e9 * MAX_GAP_S:
+        often = int((ahead > 1e9 * MAX_GAP_S).sum())
+        faults.append(f"{often} gaps are longer than {MAX_GAP_S:.0f} s: each counts as that long")
+    step_ns = np.minimum(np.where(step_ns < 0, usual_ns, step_ns), round(1e9 * MAX_GAP_S))
     time_s = 1e-9 * np.concatenate([[0.0], np.cumsum(step_ns, dtype=float)])
     good = np.flatnonzero(usable)
     origin_T = np.eye(4)
@@ -95,12 +98,14 @@ def prepare(stamp_ns: Ints, cam_T_grip: Array, covariance: Array, measured: Bool
 def are_definite(covariance: Array) -> Bools:
     """Which of the matrices (n, 6, 6) are finite and positive definite, by the eigenvalues of their correlations."""
     out = np.isfinite(covariance).all(axis=(1, 2))
-    out &= (np.einsum("nii->ni", covariance) > LEAST_VARIANCE).all(axis=1)
+    out &= (np.einsum("nii->ni", covariance) > MIN_COVARIANCE_DIAGONAL).all(axis=1)
     index = np.flatnonzero(out)
     sigma = np.sqrt(np.einsum("nii->ni", covariance[index]))
     correlation = covariance[index] / (sigma[:, :, None] * sigma[:, None, :])
-    symmetric = (np.abs(correlation - np.swapaxes(correlation, 1, 2)) < LEAST_EIGENVALUE**0.5).all(axis=(1, 2))
-    out[index] = symmetric & (np.linalg.eigvalsh(correlation)[:, 0] > LEAST_EIGENVALUE)
+    symmetric = (np.abs(correlation - np.swapaxes(correlation, 1, 2)) < MIN_CORRELATION_EIGENVALUE**0.5).all(
+        axis=(1, 2)
+    )
+    out[index] = symmetric & (np.linalg.eigvalsh(correlation)[:, 0] > MIN_CORRELATION_EIGENVALUE)
     return out
 
 
@@ -108,17 +113,17 @@ def wild_frames(run: Run) -> Bools:
     """Frames that lie off their neighbours on both sides, alone or in pairs."""
     out = np.zeros(len(run.y), bool)
     good = np.flatnonzero(run.usable)
-    if len(good) < 2 * WILD_NEIGHBOURS:
+    if len(good) < 2 * WILD_WINDOW_FRAMES:
         return out
     y = run.y[good]
-    off = y - median_filter(y, size=(WILD_NEIGHBOURS, 1), mode="nearest")
+    off = y - median_filter(y, size=(WILD_WINDOW_FRAMES, 1), mode="nearest")
     usual = np.sqrt(np.median(off * off, axis=0) / 0.4549) + 1e-9
     local = np.sqrt(median_filter(off * off, size=(65, 1), mode="nearest") / 0.4549)
-    far = (np.abs(off) > WILD * np.maximum(usual, local)).any(axis=1)
+    far = (np.abs(off) > WILD_SIGMAS * np.maximum(usual, local)).any(axis=1)
     far &= (off * off / run.claimed[good]).max(axis=1) > 4.0
     crowd = np.convolve(far, np.ones(17), mode="same")
     # A short swing is motion; a frame by itself is not.
-    out[good[far & (crowd <= WILD_RUN)]] = True
+    out[good[far & (crowd <= WILD_MAX_FRAMES)]] = True
     return out
 
 
@@ -169,7 +174,7 @@ def _mapped(covariance: Array, turn: Array) -> Array:
 
 GAP_BLOCKS = 4.0
 """Times the usual interval of blocks from which there is a gap, which gets places of its own."""
-MOST_GAP_PLACES = 200
+MAX_GAP_PLACES = 200
 
 
 class Blocks:
@@ -208,25 +213,6 @@ class Blocks:
         return np.asarray((off * inside).sum(axis=0) / inside.sum(axis=0) / 0.8735)
 
 
-class Spread:
-    """Puts blocks among places of gaps."""
-
-    def __init__(self, where: Ints, count: int):
-        self._where, self._count = where, count
-
-    def of(self, values: Array, else_value: float) -> Array:
-        out = np.full((self._count, *values.shape[1:]), else_value)
-        out[self._where] = values
-        return out
-
-
-def held(values: Ints, where: Ints, count: int) -> Ints:
-    index = np.zeros(count, np.int64)
-    index[where] = np.arange(len(where))
-    out: Ints = values[np.maximum.accumulate(index)]
-    return out
-
-
 def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
     """Times with more of them in long gaps, and before the first and after the last block; where the blocks are."""
     steps = np.diff(time_s)
@@ -236,7 +222,7 @@ def with_gaps(run: Run, time_s: Array) -> tuple[Array, Ints]:
     edges = np.concatenate([[min(run.time_s[0], time_s[0])], time_s, [max(run.time_s[-1], time_s[-1])]])
     for begin, end in pairwise(edges.tolist()):
         if end - begin > GAP_BLOCKS * usual:
-            places = min(int((end - begin) / usual), MOST_GAP_PLACES)
+            places = min(int((end - begin) / usual), MAX_GAP_PLACES)
             extra.append(np.linspace(begin, end, places + 2)[1:-1])
     both = np.concatenate([time_s, *extra])
     order = np.argsort(both, kind="stable")
@@ -253,10 +239,10 @@ def at(time_s: Array, segment: Ints, smoothed: Smoothed, wanted_s: Array, wanted
     before = np.clip(after - 1, first, last)
     inside = (after > before) & (wanted_s >= time_s[before]) & (wanted_s <= time_s[after])
     nearest = np.where(np.abs(time_s[after] - wanted_s) < np.abs(wanted_s - time_s[before]), after, before)
-    way = (wanted_s - time_s[nearest])[:, None]
+    elapsed_s = (wanted_s - time_s[nearest])[:, None]
     p = smoothed.covariance[nearest]
-    x = smoothed.x[nearest] + way * smoothed.rate[nearest]
-    variance = p[..., 0, 0] + 2.0 * way * p[..., 0, 1] + way * way * p[..., 1, 1]
+    x = smoothed.x[nearest] + elapsed_s * smoothed.rate[nearest]
+    variance = p[..., 0, 0] + 2.0 * elapsed_s * p[..., 0, 1] + elapsed_s * elapsed_s * p[..., 1, 1]
     span = np.where(inside, time_s[after] - time_s[before], 1.0)
     f = (np.where(inside, wanted_s - time_s[before], 0.0) / np.where(span > 0.0, span, 1.0))[:, None]
     between = (1.0 - f) * smoothed.x[before] + f * smoothed.x[after]
