@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import msgspec
 import numpy as np
 import yaml
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from gripmon.analyse.content import COVERAGE, AffectedRange, Displacement, Event, Integrity, Limits
 from gripmon.analyse.events import MOTIONS
@@ -34,38 +35,29 @@ _MEANING = {
 
 
 def motion_ranges(
-    track: Track, table_keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
+    track: Track, keys: Sequence[tuple[str, int]], events: Sequence[Event], limits: Limits
 ) -> list[AffectedRange]:
     """Where a calibration didn't hold: the one from the beginning, and, if that was replaced, the one in force.
 
-    ``table_keys``: id and revision of the references, as ``track.reference`` counts them.
+    ``keys``: id and revision of the references, as ``track.reference`` counts them.
     """
     if not track.measured.any():
         return []
     onsets = [event.onset.stamp_ns for event in events if event.kind in MOTIONS]
     moved = track.stamp_ns >= min(onsets, default=np.iinfo(np.int64).max)
-    old = _past(track, track.against_first, limits, np.zeros(len(track), np.int64), moved)
-    out = [_motion_range("old_calibration", track, track.against_first, run, table_keys[0], events) for run in old]
-    out = _apart(out)
-    if len(table_keys) > 1:
-        stale = _past(track, track.against_reference, limits, track.reference, moved)
-        keys = [table_keys[int(track.reference[run[0]])] for run in stale]
-        out += _apart(
-            _motion_range("stale_reference", track, track.against_reference, run, key, events)
-            for run, key in zip(stale, keys, strict=True)
-        )
-    return out
-
-
-def _apart(ranges: Iterable[AffectedRange]) -> list[AffectedRange]:
-    """In order of time, without overlaps: of two runs past the limit by one motion only the first counts from its
-    beginning.
-    """
+    kinds = [("old_calibration", track.against_first, np.zeros(len(track), np.int64))]
+    if len(keys) > 1:
+        kinds.append(("stale_reference", track.against_reference, track.reference))
     out: list[AffectedRange] = []
-    for each in ranges:
-        if out and each.start_ns < out[-1].end_ns and each.limit_ns is not None:
-            each = msgspec.structs.replace(each, start_ns=each.limit_ns)
-        out.append(each)
+    for what, vectors, reference in kinds:
+        before_ns = 0
+        for run in _past(track, vectors, limits, reference, moved):
+            each = _motion_range(what, track, vectors, run, keys[int(reference[run[0]])], events)
+            # Of two runs past the limit by one motion only the first counts from its beginning.
+            if each.start_ns < before_ns and each.limit_ns is not None:
+                each = msgspec.structs.replace(each, start_ns=each.limit_ns)
+            out.append(each)
+            before_ns = each.end_ns
     return out
 
 
@@ -75,7 +67,10 @@ def verdict_ranges(
     """Where transforms were suspect or there were none, for a tenth of a second or more."""
     out = []
     for name in ("suspect", "unknown"):
-        for first, last in runs(verdict == names.index(name)):
+        for part in runs_of_equal(verdict == names.index(name)):
+            first, last = part.start, part.stop - 1
+            if verdict[first] != names.index(name):
+                continue
             open_end = last + 1 >= len(track)
             end_ns = int(track.stamp_ns[last if open_end else last + 1])
             if end_ns - int(track.stamp_ns[first]) < _SHORTEST_NS:
@@ -96,12 +91,6 @@ def verdict_ranges(
     return out
 
 
-def runs(where: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """First and last index of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(np.int8)))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
 def _past(
     track: Track, vectors: Array, limits: Limits, group: NDArray[np.int64], moved: NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
@@ -109,8 +98,6 @@ def _past(
     that is clearly within.  Before anything has ``moved`` (n,) it begins only where it is more than a frame's transform
     is uncertain by: where that is as much as the limit, being past it says nothing.
     """
-    from scipy.ndimage import median_filter
-
     frames = np.flatnonzero(track.measured)
     smooth = np.empty((len(frames), 6))
     for part in runs_of_equal(group[frames]):  # a median over a change of reference would mix two
@@ -124,8 +111,7 @@ def _past(
     out: list[tuple[int, int]] = []
     start: int | None = None
     for i, frame in enumerate(frames.tolist()):
-        same = start is None or group[frame] == group[start]
-        if start is not None and (excess[i] < _RELIEF or not same):
+        if start is not None and (excess[i] < _RELIEF or group[frame] != group[start]):
             out.append((start, frame - 1))
             start = None
         if start is None and excess[i] >= 1.0 and significant[i]:
@@ -138,11 +124,10 @@ def _past(
 def _significant(vectors: Array, sigma: Array) -> NDArray[np.bool_]:
     """(n,) which vectors (n, 3) are longer than what a ± of their deviations (n, 3) stands for along them."""
     along = np.linalg.norm(vectors * sigma, axis=1)
-    out: NDArray[np.bool_] = ~(np.square(vectors).sum(axis=1) <= COVERAGE * along)  # what has no deviation is
-    return out
+    return np.asarray(~(np.square(vectors).sum(axis=1) <= COVERAGE * along))  # also where there is no deviation
 
 
-def runs_of_equal(values: NDArray[np.int64]) -> list[slice]:
+def runs_of_equal(values: NDArray[np.int64] | NDArray[np.bool_]) -> list[slice]:
     """Slices over which a value stays the same."""
     cuts = [0, *(np.flatnonzero(np.diff(values)) + 1).tolist(), len(values)]
     return [slice(a, b) for a, b in itertools.pairwise(cuts) if b > a]

@@ -7,14 +7,14 @@ colours here are those of what is shown, of middle lightness.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from gripmon.analyse.content import AffectedRange, Curve, RecordingReport, Stretch, clock_time, iso, span
+from gripmon.analyse.content import Curve, RecordingReport, Stretch, clock_time, iso, span
 
 BLUE, ORANGE, PURPLE = "#3f7fdd", "#dd8420", "#8f63cf"
 AXES = {"x": "#dc5450", "y": "#2f9c5c", "z": "#4c7fe6"}
@@ -38,9 +38,7 @@ _STRIP_PX = 15
 
 def drift_figure(report: RecordingReport) -> go.Figure:
     """The TCP's way from the calibration and the reference, its parts, its turn, and what it meant."""
-    figure = make_subplots(
-        rows=4, cols=1, shared_xaxes=True, vertical_spacing=0.035, row_heights=[0.36, 0.27, 0.16, 0.21]
-    )
+    figure = _figure(0.035, 0.36, 0.27, 0.16, 0.21)
     curves = {curve.name: curve for curve in report.curves}
     if len(report.references) > 1:
         _line(figure, curves["tcp_from_reference_m"], 1, ORANGE, "from the reference in force", _MM)
@@ -52,9 +50,8 @@ def drift_figure(report: RecordingReport) -> go.Figure:
     _strips(figure, report, 4)
     _marks(figure, report)
     for row, title in enumerate(("TCP off by (mm)", "TCP shift (mm)", "turn (°)"), 1):
-        figure.update_yaxes(
-            title_text=title, title_standoff=8, row=row, col=1, rangemode="tozero" if row != 2 else "normal"
-        )
+        from_zero = "tozero" if row != 2 else "normal"
+        figure.update_yaxes(title_text=title, title_standoff=8, row=row, col=1, rangemode=from_zero)
     figure.update_xaxes(title_text="UTC", row=4, col=1, title_standoff=4)
     return _styled(figure, 720)
 
@@ -63,13 +60,7 @@ def overview_figure(reports: Sequence[RecordingReport]) -> go.Figure:
     """All recordings on one time axis: how far each TCP was off, and the verdicts."""
     names = list(dict.fromkeys(f"{r.robot} / {r.camera}" for r in reports))
     strips = 26 * len(names) + 40
-    figure = make_subplots(
-        rows=2,
-        cols=1,
-        shared_xaxes=True,
-        vertical_spacing=0.06,
-        row_heights=[280 / (280 + strips), strips / (280 + strips)],
-    )
+    figure = _figure(0.06, 280 / (280 + strips), strips / (280 + strips))
     shown: set[str] = set()
     for report in reports:
         name = f"{report.robot} / {report.camera}"
@@ -88,7 +79,7 @@ def overview_figure(reports: Sequence[RecordingReport]) -> go.Figure:
 def running_figure(report: RecordingReport) -> go.Figure:
     """Verdicts, rate and latency over time."""
     slices = report.running.slices
-    figure = make_subplots(rows=3, cols=1, shared_xaxes=True, vertical_spacing=0.06, row_heights=[0.34, 0.33, 0.33])
+    figure = _figure(0.06, 0.34, 0.33, 0.33)
     middle = _times([(s.start_ns + s.end_ns) // 2 for s in slices])
     width = [1e-6 * (s.end_ns - s.start_ns) for s in slices]
     for name, colour in VERDICTS.items():
@@ -98,14 +89,16 @@ def running_figure(report: RecordingReport) -> go.Figure:
             hovertemplate=f"{name} %{{y:.1f}} %<extra></extra>",
         )  # fmt: skip
     rate = np.array([s.frames / (1e-9 * (s.end_ns - s.start_ns)) for s in slices])
-    figure.add_scatter(
-        x=middle, y=rate, mode="lines", line={"color": BLUE, "shape": "hvh"}, name="frames/s", row=2, col=1
+    p99_ms, median_ms = (
+        1e3 * _numbers([getattr(s, name) for s in slices]) for name in ("latency_p99_s", "latency_median_s")
     )
-    for name, label, colour in (("latency_p99_s", "99 %", ORANGE), ("latency_median_s", "median", BLUE)):
-        latency_ms = np.array([np.nan if (v := getattr(s, name)) is None else 1e3 * v for s in slices])
-        figure.add_scatter(
-            x=middle, y=latency_ms, mode="lines", line={"color": colour, "shape": "hvh"}, name=label, row=3, col=1
-        )
+    for row, y, name, colour in (
+        (2, rate, "frames/s", BLUE),
+        (3, p99_ms, "99 %", ORANGE),
+        (3, median_ms, "median", BLUE),
+    ):
+        line = {"color": colour, "shape": "hvh"}
+        figure.add_scatter(x=middle, y=y, mode="lines", line=line, name=name, row=row, col=1)
     for row, title in enumerate(("verdicts (%)", "frames/s", "latency (ms)"), 1):
         figure.update_yaxes(title_text=title, rangemode="tozero", row=row, col=1)
     figure.update_yaxes(range=[0, 100], row=1, col=1)
@@ -115,7 +108,7 @@ def running_figure(report: RecordingReport) -> go.Figure:
 
 def protection_figure(report: RecordingReport) -> go.Figure:
     """Bounds on the errors of position and rotation, logarithmic, with the alert limits."""
-    figure = make_subplots(rows=2, cols=1, shared_xaxes=True, vertical_spacing=0.07, row_heights=[0.6, 0.4])
+    figure = _figure(0.07, 0.6, 0.4)
     curves = {curve.name: curve for curve in report.curves}
     limits = report.limits
     for row, name, scale, limit in (
@@ -168,7 +161,7 @@ def _band(x: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray,
 
 
 def _limits(figure: go.Figure, report: RecordingReport, curves: dict[str, Curve]) -> None:
-    """Dashed: what counts as affected, and where the monitor measures the reference anew, if that is in sight."""
+    """Dashed: what counts as affected, and where the monitor measures the reference again, if that is in sight."""
     limits = report.limits
     levels = (
         (1, "tcp_from_beginning_m", _MM, limits.affected_m, limits.limit_m),
@@ -176,13 +169,10 @@ def _limits(figure: go.Figure, report: RecordingReport, curves: dict[str, Curve]
     )
     for row, name, scale, affected, limit in levels:
         top = max((v for v in curves[name].high if v is not None), default=0.0)
-        for level, colour, text in (
-            (affected, SEVERITIES["warning"], "affected"),
-            (limit, SEVERITIES["error"], "limit"),
-        ):
+        for level, severity, text in ((affected, "warning", "affected"), (limit, "error", "limit")):
             if level <= 1.6 * top or level == affected:
                 figure.add_hline(
-                    y=scale * level, line={"color": colour, "width": 1.2, "dash": "dash"}, row=row, col=1,
+                    y=scale * level, line={"color": SEVERITIES[severity], "width": 1.2, "dash": "dash"}, row=row, col=1,
                     annotation={"text": text, "font": {"size": 11}, "xanchor": "right", "yanchor": "bottom"},
                 )  # fmt: skip
 
@@ -192,54 +182,33 @@ def _strips(figure: go.Figure, report: RecordingReport, row: int) -> None:
     _strip(figure, row, "state", report.running.state_history, STATES)
     labels = {"old_calibration": "calibration off", "stale_reference": "reference off"}
     for what, label in labels.items():
-        ranges = [a for a in report.affected if a.what == what]
+        ranges = [Stretch(a.what, a.start_ns, a.end_ns) for a in report.affected if a.what == what]
         if ranges:
-            _strip(figure, row, label, [_stretch(a) for a in ranges], {what: AFFECTED[what]}, legend=False)
+            _strip(figure, row, label, ranges, {what: AFFECTED[what]})
     figure.update_yaxes(type="category", autorange="reversed", showgrid=False, row=row, col=1)
 
 
-def _stretch(affected: AffectedRange) -> Stretch:
-    return Stretch(affected.what, affected.start_ns, affected.end_ns)
-
-
-def _strip(
-    figure: go.Figure,
-    row: int,
-    label: str,
-    stretches: Sequence[Stretch],
-    colours: dict[str, str],
-    *,
-    legend: bool = False,
-) -> None:
+def _strip(figure: go.Figure, row: int, label: str, stretches: Sequence[Stretch], colours: dict[str, str]) -> None:
     """One line of a strip chart, a colour a name."""
     for name in dict.fromkeys(s.name for s in stretches):
         mine = [s for s in stretches if s.name == name]
         x = np.array([t for s in mine for t in (1e-6 * s.start_ns, 1e-6 * max(s.end_ns, s.start_ns + 1), np.nan)])
-        text = [
-            t
-            for s in mine
-            for t in [f"{name.replace('_', ' ')}, {clock_time(s.start_ns)}, {span(s.start_ns, s.end_ns)}"] * 2 + [""]
-        ]
+        words = [f"{name.replace('_', ' ')}, {clock_time(s.start_ns)}, {span(s.start_ns, s.end_ns)}" for s in mine]
+        text = [t for each in words for t in (each, each, "")]
         figure.add_scatter(
             x=x, y=[label] * len(x), mode="lines", line={"color": colours.get(name, _OTHER), "width": _STRIP_PX},
-            name=name, text=text, hovertemplate="%{text}<extra></extra>", showlegend=legend, row=row, col=1,
+            name=name, text=text, hovertemplate="%{text}<extra></extra>", showlegend=False, row=row, col=1,
         )  # fmt: skip
 
 
 def _marks(figure: go.Figure, report: RecordingReport) -> None:
     """A thin line for every event that is more than information, with its number; references dotted."""
-    told = [
-        e
-        for e in report.events
-        if e.kind != "gap" and (e.severity != "info" or e.kind in ("recalibrated", "restored", "reference"))
-    ]
-    for event in told:
+    for event in report.events:
         renewed = event.kind in ("recalibrated", "restored", "reference")
-        line = {
-            "color": "#a86bd0" if renewed else SEVERITIES.get(event.severity, _OTHER),
-            "width": 1.2,
-            "dash": "dot" if renewed else "solid",
-        }
+        if event.kind == "gap" or not (renewed or event.severity != "info"):
+            continue
+        colour = "#a86bd0" if renewed else SEVERITIES.get(event.severity, _OTHER)
+        line = {"color": colour, "width": 1.2, "dash": "dot" if renewed else "solid"}
         x = 1e-6 * event.onset.stamp_ns
         figure.add_shape(
             type="line", x0=x, x1=x, y0=0, y1=1, xref="x4", yref="paper", line=line, layer="below", name="event"
@@ -250,41 +219,36 @@ def _marks(figure: go.Figure, report: RecordingReport) -> None:
         )  # fmt: skip
 
 
+def _figure(spacing: float, *heights: float) -> go.Figure:
+    """Rows of plots on one axis of time."""
+    rows = len(heights)
+    return make_subplots(rows=rows, cols=1, shared_xaxes=True, vertical_spacing=spacing, row_heights=list(heights))
+
+
 def _styled(figure: go.Figure, height_px: int) -> go.Figure:
+    clear, grid = "rgba(0,0,0,0)", "rgba(128,128,128,0.18)"
+    family = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif"
+    above = 1.0 + 24 / max(height_px - 96, 1)
     figure.update_layout(
         height=height_px,
         margin={"l": 62, "r": 16, "t": 52, "b": 44},
-        paper_bgcolor="rgba(0,0,0,0)",
-        plot_bgcolor="rgba(0,0,0,0)",
-        font={
-            "family": "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, sans-serif",
-            "size": 12.5,
-        },
+        paper_bgcolor=clear,
+        plot_bgcolor=clear,
+        font={"family": family, "size": 12.5},
         legend={
-            "orientation": "h",
-            "x": 0,
-            "y": 1.0,
-            "yanchor": "bottom",
-            "yref": "paper",
-            "title": None,
+            "orientation": "h", "x": 0, "y": above, "yanchor": "bottom", "yref": "paper", "title": None,
             "itemsizing": "constant",
         },
         hovermode="closest",
         hoverlabel={"namelength": -1},
         dragmode="zoom",
-        modebar={"bgcolor": "rgba(0,0,0,0)", "color": "#8d94a1", "activecolor": "#3f7fdd"},
+        modebar={"bgcolor": clear, "color": "#8d94a1", "activecolor": BLUE},
         uirevision="kept",
-    )
-    figure.update_layout(legend={"y": 1.0 + 24 / max(height_px - 96, 1)})
+    )  # fmt: skip
     figure.update_xaxes(
-        type="date",
-        showline=False,
-        ticks="outside",
-        ticklen=4,
-        gridcolor="rgba(128,128,128,0.18)",
-        hoverformat="%H:%M:%S.%L",
+        type="date", showline=False, ticks="outside", ticklen=4, gridcolor=grid, hoverformat="%H:%M:%S.%L"
     )
-    figure.update_yaxes(zeroline=False, gridcolor="rgba(128,128,128,0.18)", automargin=True)
+    figure.update_yaxes(zeroline=False, gridcolor=grid, automargin=True)
     return figure
 
 
@@ -305,9 +269,6 @@ def _pale(colour: str) -> str:
 def _plain(text: str) -> str:
     """Plotly reads some HTML in its texts: what a person has named stays as it is."""
     return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
-
-
-Figure = Callable[[RecordingReport], go.Figure]
 
 
 def as_json(figure: go.Figure) -> str:
