@@ -96,7 +96,7 @@ def _past(
 ) -> list[tuple[int, int]]:
     """First and last frame of each time past the limits, in one group each; it is over only when a frame was measured
     that is clearly within.  Before anything has ``moved`` (n,) it begins only where it is more than a frame's transform
-    is uncertain by: where that is as much as the limit, being past it says nothing.
+    is uncertain by: where that is as much as the limit, being past it means nothing.
     """
     frames = np.flatnonzero(track.measured)
     smooth = np.empty((len(frames), 6))

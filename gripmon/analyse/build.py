@@ -212,7 +212,7 @@ _NEIGHBOURS_NS = SECOND_NS // 2
 
 
 def _dropped(source: Recording) -> tuple[str, ...]:
-    """Those of the faults that tell of frames which the monitor or its recorder had no time for, or nothing is wrong
+    """Those of the faults that are about frames which the monitor or its recorder had no time for, or nothing is wrong
     with the files: these are no damage.
     """
     seq = source.frames.seq
@@ -228,7 +228,7 @@ def _dropped(source: Recording) -> tuple[str, ...]:
 def _running(
     table: FrameTable, clock: Clock, track: Track, states: Sequence[StateRecord], dropped: tuple[str, ...]
 ) -> Running:
-    """Of one recording; ``states`` tell how much the recorder dropped, ``dropped`` where."""
+    """Of one recording; ``states`` hold how much the recorder dropped, ``dropped`` where."""
     steps_s = 1e-9 * np.diff(clock.stamp_ns)
     latency_s = 1e-9 * table.latency_ns[table.latency_ns > 0]
     pauses_s = steps_s[steps_s > 1.0]
@@ -281,7 +281,7 @@ def _slices(table: FrameTable, clock: Clock) -> tuple[Slice, ...]:
         return ()
     number = max(min(_SLICES, len(table) // _FEWEST), 1)
     length_ns = int(clock.stamp_ns[-1] - clock.stamp_ns[0]) + 1
-    # Reckoned from the first: Unix nanoseconds have more digits than a float.
+    # Counted from the first: Unix nanoseconds have more digits than a float.
     edges = clock.stamp_ns[0] + np.linspace(0, length_ns, number + 1).astype(np.int64)
     edges[-1] = clock.stamp_ns[-1] + 1
     cuts = np.searchsorted(clock.stamp_ns, edges)
@@ -314,6 +314,6 @@ def _history(names: Sequence[str], codes: NDArray[np.int8], clock: Clock) -> tup
         out.append(Stretch(names[int(codes[part.start])], int(clock.stamp_ns[part.start]), end_ns))
     if len(out) <= _MOST_STRETCHES:
         return tuple(out)
-    # Of a recording that never rests the longest tell the story; the data themselves are in the recording.
+    # Of a recording that never rests the longest are given; the data themselves are in the recording.
     shortest = sorted((s.end_ns - s.start_ns for s in out), reverse=True)[_MOST_STRETCHES - 1]
     return tuple(s for s in out if s.end_ns - s.start_ns >= shortest)

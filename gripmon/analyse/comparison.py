@@ -82,23 +82,23 @@ class _Pair(NamedTuple):
 
 
 class _Alarms:
-    """Tells bad news from what else alerts say: that something is over, or goes on."""
+    """Separates bad news from other alerts: that something is over, or goes on."""
 
     def __init__(self) -> None:
-        self._said: dict[str, tuple[AlertKind, Severity]] = {}
+        self._known: dict[str, tuple[AlertKind, Severity]] = {}
 
     def among(self, alerts: Iterable[Alert]) -> bool:
-        """Whether alerts, of one frame, say of something new, or of something that has become another or worse."""
+        """Whether alerts of one frame report something new, or something that has become another or worse."""
         alarms = [self._is_one(alert) for alert in alerts]  # each of them counts for what follows
         return any(alarms)
 
     def _is_one(self, alert: Alert) -> bool:
-        before = self._said.get(alert.alert_id)
+        before = self._known.get(alert.alert_id)
         if alert.event is AlertEvent.CLEARED or alert.kind in NO_ALARMS:
             return False
         if alert.event is AlertEvent.NOTED:
             return alert.severity is not Severity.INFO
-        self._said[alert.alert_id] = (alert.kind, alert.severity)
+        self._known[alert.alert_id] = (alert.kind, alert.severity)
         if before is None:
             return True
         ranks = list(Severity)

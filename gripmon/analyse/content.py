@@ -1,4 +1,4 @@
-"""What a report says, as data: ``gripmon report --json`` writes it, and the page shows no more.  And how its numbers
+"""A report as data: ``gripmon report --json`` writes it, and the page shows no more.  And how its numbers
 and times are written for people: millimetres, degrees, UTC.
 
 SI units, radians, Unix nanoseconds.  Within a major version of the schema fields may be added, not renamed.
@@ -58,7 +58,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     onset: Onset
     noticed_ns: Annotated[int | None, _is("of its first alert; null: it never was one")] = None
     end_ns: Annotated[int | None, _is("when it was over; null: it was not when the recording ended")] = None
-    end_text: Annotated[str, _is("how it ended; empty where there is nothing to say")] = ""
+    end_text: Annotated[str, _is("how it ended; may be empty")] = ""
     cause: Annotated[str, _is("the most probable cause by name; unknown if none is probable enough")] = "unknown"
     cause_probability: Annotated[float | None, _is("of that cause, 0 to 1; null: it was not weighed")] = None
     part: Annotated[str | None, _is("the finger that the cause is about")] = None
@@ -133,7 +133,7 @@ class Noise(msgspec.Struct, frozen=True):
 
     position_m: Vector
     rotation_rad: Vector
-    claimed_position_m: Annotated[Vector, _is("median of what the covariances say; more than noise")]
+    claimed_position_m: Annotated[Vector, _is("median by the covariances; more than noise")]
     claimed_rotation_rad: Vector
     frames: Annotated[int, _is("pairs of successive frames")]
 
@@ -326,7 +326,7 @@ def span(start_ns: int, end_ns: int) -> str:
 
 
 def millimetres(metres: float, sigma_m: float | None = None) -> str:
-    """``4.21 ± 0.02 mm``: ± is two standard deviations, and says how many digits there are."""
+    """``4.21 ± 0.02 mm``: ± is two standard deviations, and decides the digits."""
     if not math.isfinite(metres):
         return "unknown"
     return f"{_measured(1e3 * metres, None if sigma_m is None else 1e3 * sigma_m)} mm"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon import __version__
-from gripmon.analyse.correction import BLOCK_S, SOURCES, ChangePoint, Correction, correct, sample
+from gripmon.analyse.correction import BLOCK_S, SOURCES, Correction, correct, sample
 from gripmon.analyse.quick_motion import FALSE_ALARMS_PER_HOUR
 from gripmon.analyse.smoothing import MID_S, SLOW_S
 from gripmon.model.errors import NoResultError
@@ -108,7 +109,7 @@ class CorrectedFrame(msgspec.Struct, frozen=True, tag_field="schema", tag="gripm
 
 
 def provenance(runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]]) -> Provenance:
-    """What a file says about where it comes from."""
+    """Where a file comes from."""
     settings = {
         "false_alarms_per_hour": FALSE_ALARMS_PER_HOUR,
         "block_s": BLOCK_S,
@@ -129,56 +130,48 @@ def _run(each: CorrectedRun) -> WrittenRun:
         recording.camera,
         tuple(path.name for path in recording.files),
         len(seqs),
-        tuple(_change(point, int(seqs[point.index])) for point in made.change_points),
+        tuple(
+            WrittenChangePoint(
+                int(seqs[point.index]),
+                point.stamp_ns,
+                point.earliest_ns,
+                point.latest_ns,
+                tuple(point.size.tolist()),
+                tuple(point.size_covariance.ravel().tolist()),
+            )
+            for point in made.change_points
+        ),
         {name: tuple(values.tolist()) for name, values in learnt.items()},
         (*recording.faults, *made.faults),
     )
 
 
-def _change(point: ChangePoint, seq: int) -> WrittenChangePoint:
-    return WrittenChangePoint(
-        seq,
-        point.stamp_ns,
-        point.earliest_ns,
-        point.latest_ns,
-        tuple(point.size.tolist()),
-        tuple(point.size_covariance.ravel().tolist()),
-    )
-
-
-class _Rows:
-    """Columns of one run."""
-
-    def __init__(self, each: CorrectedRun):
-        made, frames = each.correction, each.recording.frames
-        if each.wanted_ns is None:
-            self.stamp_ns, self.seq, self.segment = made.stamp_ns, frames.seq, made.segment
-            self.poses, self.covariance = made.cam_T_grip, made.covariance
-            self.source = [SOURCES[code] for code in made.source.tolist()]
-        else:
-            self.stamp_ns = each.wanted_ns
-            self.poses, self.covariance, self.segment = sample(made, each.wanted_ns)
-            at = np.minimum(np.searchsorted(made.stamp_ns, self.stamp_ns), len(made.stamp_ns) - 1)
-            own = made.stamp_ns[at] == self.stamp_ns
-            self.seq = np.where(own, frames.seq[at], -1)
-            codes = made.source[at].tolist()
-            self.source = [SOURCES[c] if mine else BETWEEN for c, mine in zip(codes, own.tolist(), strict=True)]
-        self.rotation_xyzw = Rotation.from_matrix(self.poses[:, :3, :3]).as_quat(canonical=True)
-        self.sigma_tcp_m = np.sqrt(np.einsum("nii->ni", self.covariance)[:, :3].sum(axis=1))
-
-
-def _frames(number: int, rows: _Rows) -> Iterator[CorrectedFrame]:
-    for k in range(len(rows.stamp_ns)):
-        yield CorrectedFrame(
-            number,
-            int(rows.seq[k]),
-            int(rows.stamp_ns[k]),
-            Transform(tuple(rows.poses[k, :3, 3].tolist()), tuple(rows.rotation_xyzw[k].tolist())),
-            tuple(rows.covariance[k].ravel().tolist()),
-            int(rows.segment[k]),
-            rows.source[k],
-            float(rows.sigma_tcp_m[k]),
-        )
+def _columns(each: CorrectedRun) -> dict[str, Any]:
+    """One run's instants: arrays, and the sources as text."""
+    made, frames = each.correction, each.recording.frames
+    if each.wanted_ns is None:
+        stamp_ns, seq, segment, poses, covariance = (
+            made.stamp_ns, frames.seq, made.segment, made.cam_T_grip, made.covariance
+        )  # fmt: skip
+        source = [SOURCES[code] for code in made.source.tolist()]
+    else:
+        stamp_ns = each.wanted_ns
+        poses, covariance, segment = sample(made, stamp_ns)
+        at = np.minimum(np.searchsorted(made.stamp_ns, stamp_ns), len(made.stamp_ns) - 1)
+        own = made.stamp_ns[at] == stamp_ns
+        seq = np.where(own, frames.seq[at], -1)
+        codes = made.source[at].tolist()
+        source = [SOURCES[code] if mine else BETWEEN for code, mine in zip(codes, own.tolist(), strict=True)]
+    return {
+        "seq": seq,
+        "stamp_ns": stamp_ns,
+        "segment": segment,
+        "source": source,
+        "sigma_tcp_m": np.sqrt(np.einsum("nii->ni", covariance)[:, :3].sum(axis=1)),
+        "translation_m": poses[:, :3, 3],
+        "rotation_xyzw": Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True),
+        "covariance": covariance.reshape(-1, 36),
+    }
 
 
 def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, str]], number: int = 0) -> None:
@@ -211,8 +204,14 @@ def _write_jsonl(path: Path, runs: Sequence[CorrectedRun], about: Provenance) ->
     encode = msgspec.json.Encoder().encode
     with path.open("wb") as file:
         file.write(encode(about) + b"\n")
-        for number, each in enumerate(runs):
-            for frame in _frames(number, _Rows(each)):
+        for run, each in enumerate(runs):
+            columns = _columns(each)
+            rows = (columns[name] if name == "source" else columns[name].tolist() for name in columns)
+            for seq, stamp_ns, segment, source, sigma_tcp_m, translation_m, rotation_xyzw, covariance in zip(
+                *rows, strict=True
+            ):
+                transform = Transform(tuple(translation_m), tuple(rotation_xyzw))
+                frame = CorrectedFrame(run, seq, stamp_ns, transform, tuple(covariance), segment, source, sigma_tcp_m)
                 file.write(encode(frame) + b"\n")
 
 
@@ -223,21 +222,19 @@ def _write_parquet(path: Path, runs: Sequence[CorrectedRun], about: Provenance) 
 
 
 def _table(number: int, each: CorrectedRun) -> pa.Table:
-    rows, recording = _Rows(each), each.recording
-    count = len(rows.stamp_ns)
-    flat = pa.array(np.ascontiguousarray(rows.covariance).ravel())
+    columns = _columns(each)
+    count = len(columns["source"])
+    plain = {name: columns[name] for name in ("seq", "stamp_ns", "segment", "source", "sigma_tcp_m")}
+    parts = [(f"translation_{axis}_m", columns["translation_m"][:, k]) for k, axis in enumerate("xyz")]
+    parts += [(f"rotation_{axis}", columns["rotation_xyzw"][:, k]) for k, axis in enumerate("xyzw")]
     return pa.table(
         {
-            "run": pa.array(np.full(count, number, np.int32)),
-            "robot": pa.array([recording.robot] * count),
-            "camera": pa.array([recording.camera] * count),
-            "seq": rows.seq,
-            "stamp_ns": rows.stamp_ns,
-            "segment": rows.segment,
-            "source": pa.array(rows.source, pa.string()),
-            "sigma_tcp_m": rows.sigma_tcp_m,
-            **{f"translation_{axis}_m": np.ascontiguousarray(rows.poses[:, k, 3]) for k, axis in enumerate("xyz")},
-            **{f"rotation_{axis}": np.ascontiguousarray(rows.rotation_xyzw[:, k]) for k, axis in enumerate("xyzw")},
-            "covariance": pa.FixedSizeListArray.from_arrays(flat, 36),
+            "run": np.full(count, number, np.int32),
+            "robot": pa.array([each.recording.robot] * count, pa.string()),
+            "camera": pa.array([each.recording.camera] * count, pa.string()),
+            **plain,
+            "source": pa.array(columns["source"], pa.string()),
+            **{name: np.ascontiguousarray(values) for name, values in parts},
+            "covariance": pa.FixedSizeListArray.from_arrays(pa.array(columns["covariance"].ravel()), 36),
         }
     )

@@ -175,8 +175,8 @@ def _sentences(event: Event) -> str:
     if event.cause != "unknown":
         parts.append(f"Cause: {cause_words(event)}.")
     if event.moved is None and event.story:
-        said = event.story[0].text.removeprefix("raised: ")
-        parts.insert(0, f"{said[:1].upper()}{said[1:]}.".replace("..", "."))
+        text = event.story[0].text.removeprefix("raised: ")
+        parts.insert(0, f"{text[:1].upper()}{text[1:]}.".replace("..", "."))
     if event.end_text:
         parts.append(
             f"It was over at {clock_time(event.end_ns, 1)}: {event.end_text}."

@@ -106,7 +106,7 @@ def learn_shares(time_s: Array, y: Array, segment: NDArray[np.int64], frame: Arr
         lag *= 2
     out = np.zeros((3, series))
     if len(rows) < 3:
-        # Too short to tell: a half of what is claimed is new, the other half lasts.
+        # Too short to estimate: a half of what is claimed is new, the other half lasts.
         out[0], out[2] = 0.25, 0.5
     else:
         for axis in range(series):

@@ -39,7 +39,7 @@ CAUSES: dict[str, str] = {
     Cause.TOO_SLOW: "the monitor was too slow for the camera",
     Cause.UNKNOWN: "cause unknown",
 }
-_MOST_TOLD = 3
+_MAX_SHOWN = 3
 _ACCEPTERS = ("monitor", "operator")
 
 
@@ -57,7 +57,7 @@ def paragraph(report: RecordingReport) -> str:
     """When did the camera move, how far, what did it, is it still so, what is affected, what was lost?"""
     who = f"{report.robot} / {report.camera}"
     if not report.running.frames:
-        return f"{who}: no frame could be read, so nothing can be said about its camera."
+        return f"{who}: no frame could be read, so nothing is known about its camera."
     motions = [event for event in report.events if event.kind in MOTIONS]
     parts = [_motions(report, motions), _at_end(report, motions), _affected(report), _lost(report)]
     return " ".join(part for part in parts if part)
@@ -84,12 +84,12 @@ def _motions(report: RecordingReport, motions: Sequence[Event]) -> str:
     when = period(report.start_ns, report.end_ns)
     if not motions:
         if report.last_measured_ns is None:
-            return f"Whether t{who} moved can't be said: in no frame ({when}) could it be measured."
+            return f"Whether t{who} moved isn't known: in no frame ({when}) could it be measured."
         return f"T{who} did not move ({when}): no motion was reported in {span(report.start_ns, report.end_ns)}."
-    told = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MOST_TOLD]
-    told.sort(key=lambda e: e.onset.stamp_ns)
-    largest = " The largest:" if len(told) < len(motions) else ""
-    sentences = " ".join(_motion(event, i == 0) for i, event in enumerate(told))
+    shown = sorted(motions, key=lambda e: -(e.moved.size_m if e.moved else 0.0))[:_MAX_SHOWN]
+    shown.sort(key=lambda e: e.onset.stamp_ns)
+    largest = " The largest:" if len(shown) < len(motions) else ""
+    sentences = " ".join(_motion(event, i == 0) for i, event in enumerate(shown))
     return f"T{who} moved {_times(len(motions))} ({when}).{largest} {sentences}"
 
 
@@ -138,7 +138,7 @@ def _affected(report: RecordingReport) -> str:
 
 
 def _listed(ranges: Sequence[AffectedRange], report: RecordingReport) -> str:
-    worst = sorted(ranges, key=lambda a: a.start_ns - a.end_ns)[:_MOST_TOLD]
+    worst = sorted(ranges, key=lambda a: a.start_ns - a.end_ns)[:_MAX_SHOWN]
     worst.sort(key=lambda a: a.start_ns)
     texts = []
     for each in worst:

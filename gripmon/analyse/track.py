@@ -28,7 +28,7 @@ _ALLOWED_SIGMA = 4.0  # as the monitor's own baseline
 class Track:
     """Arrays over the n frames of a recording; (n, 6) are TCP shift (m) and turn (rad) in camera axes.
 
-    ``measured`` (n,): the frame has a transform of its own, which isn't held.  ``against_reference`` is reckoned from
+    ``measured`` (n,): the frame has a transform of its own, which isn't held.  ``against_reference`` is counted from
     the reference that the frame names, ``against_first`` from the one in force at the beginning; both less that first
     one's own error, if it is a configured one and the first frames show it within its uncertainty.  ``sigma`` (n, 6)
     standard deviations.  NaN where nothing was measured.  ``error`` (6,) is what was subtracted.
@@ -107,7 +107,7 @@ def _pose_of(
     measured: NDArray[np.bool_],
     mine: NDArray[np.bool_],
 ) -> Array:
-    """(7,) of a reference; of one that isn't recorded what its own frames say: the turn only from the first of them."""
+    """(7,) of a reference; of one that isn't recorded by its own frames: the turn only from the first of them."""
     record = known.get((table.reference_ids[key[0]], key[1]))
     if record is not None:
         return np.array([*record.cam_T_grip.translation_m, *record.cam_T_grip.rotation_xyzw])
@@ -148,7 +148,7 @@ class Clock:
     stamp_ns: NDArray[np.int64]
 
     def of(self, seq: int, stamp_ns: int) -> int:
-        """When something was that belongs to a frame, or else to no frame: then as it says itself, brought among the
+        """When something was that belongs to a frame, or else to no frame: then by its own stamp, brought among the
         frames if it lies far outside.
         """
         i = int(np.searchsorted(self.seq, seq))

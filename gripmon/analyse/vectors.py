@@ -21,9 +21,9 @@ from gripmon.model.records import Array
 
 MIN_FRAMES = 3
 MAX_GAP_S = 3600.0
-"""Beyond, everything may have happened: more time in a gap says no more, and ends what numbers can hold."""
+"""Beyond, everything may have happened: more time in a gap means no more, and overflows."""
 MAX_DISTANCE_M = 1e6
-"""A transform that reaches farther is none, and its squares end what numbers can hold."""
+"""A transform that reaches farther is none, and its squares overflow."""
 MIN_COVARIANCE_DIAGONAL, MIN_CORRELATION_EIGENVALUE = 1e-24, 1e-9
 """Of a covariance (m², rad²: a picometre, no camera's) and of its correlations: below, it is taken for none."""
 WILD_SIGMAS, WILD_WINDOW_FRAMES, WILD_MAX_FRAMES = 8.0, 9, 2

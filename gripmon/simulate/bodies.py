@@ -26,7 +26,7 @@ COVER_HALF = 1.35
 
 
 class Bodies:
-    """Shapes only, no looks.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
+    """Shapes only, no textures.  Raises ValueError for a gripper whose fingers are not closed convex solids."""
 
     def __init__(self, gripper: Gripper, scenario: Scenario, view_half: Array) -> None:
         self.gripper = gripper
@@ -101,8 +101,8 @@ class Bodies:
         for k, finger in enumerate(self.fingers):
             if finger is solid:
                 return Hidden.OTHER_FINGER, self._corner_finger == k
-        nobody = np.zeros(len(self._corner_finger), dtype=bool)
-        return (Hidden.CARRIER if any(solid is c for c in self.carriers) else Hidden.OBJECT), nobody
+        none = np.zeros(len(self._corner_finger), dtype=bool)
+        return (Hidden.CARRIER if any(solid is c for c in self.carriers) else Hidden.OBJECT), none
 
 
 def _behind(outline: Array, points_cam_m: Array) -> NDArray[np.bool_]:

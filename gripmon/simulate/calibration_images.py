@@ -47,7 +47,7 @@ _FREE_VIEWS, _FINGER_VIEWS = 6, 6
 _ROBOT_POSES = 12
 _ORIENTATIONS, _FRESH_ORIENTATIONS = 5, 2
 _BORDER_PX = 15.0
-"""Spots stay so far from the image's border: three times their radius."""
+"""Distance of spots from the image's border: three times their radius."""
 _ARM_SIGMAS = np.array([5e-5] * 3 + [1e-4] * 3)
 """How exact the robot's reported poses are, each axis (m, rad): a good arm's repeatability."""
 _CAMERA_MOTION = np.array([2e-3, -1e-3, 1e-3, 0.002, 0.004, -0.003])
@@ -257,7 +257,7 @@ def _without_gripper(camera: Camera, plate: Plate, seed: int, number: int) -> Im
 
 
 _CONTACT_M = 2e-4
-"""So close to the foremost point a point touches the plate."""
+"""Distance from the foremost point within which a point touches the plate."""
 _RISE = 0.35
 """Of the rising edge's length: some way up, where the edge still shows."""
 

@@ -295,7 +295,7 @@ def _plane_frame(solid: Solid, face: int) -> tuple[Array, Array]:
     sides = np.roll(corners, -1, axis=0) - corners
     longest = int(np.linalg.norm(sides, axis=1).argmax())
     x = sides[longest] / np.linalg.norm(sides[longest])
-    y = np.cross(x, solid.normals[face])  # down for somebody who looks at the face with x to the right
+    y = np.cross(x, solid.normals[face])  # down, seen from in front of the face with x to the right
     along, across = corners @ x, corners @ y
     body_T_plane = np.eye(4)
     body_T_plane[:3, :3] = np.column_stack([x, y, -solid.normals[face]])

@@ -126,7 +126,7 @@ class Simulator:
         return self.scenario.start_ns + round(index * 1e9 / self.scenario.fps)
 
     def _reported(self, index: int, opening_m: float) -> float | None:
-        """What the robot says: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
+        """What the robot reports: true opening plus offset and noise; like an encoder's it stays in the jaw's range."""
         jaw = self.scenario.jaw
         if not jaw.reported or not self.gripper.has_jaw:
             return None

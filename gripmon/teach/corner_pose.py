@@ -135,7 +135,7 @@ def pose_from_corners(
         ]
     except (RecalibrationRefused, np.linalg.LinAlgError) as refused:
         raise PoseRefused(f"{refused}; more corners, or a calibration with a plate") from None
-    # What contradicts itself is at least as wrong as it looks.
+    # Corners that contradict each other are at least as wrong as their residuals.
     covariance = pose.covariance * max(pose.weighted_rms, 1.0) ** 2 + sum((np.outer(s, s) for s in slopes), of_edges)
     points_m = gripper.points_grip_m(snapped.jaw_opening_m)[gripper.corner_points[every]]
     alike = rivals(solutions(points_m, camera.undistort(uv_px), covariance_xy), len(every))

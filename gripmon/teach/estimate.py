@@ -28,16 +28,16 @@ from gripmon.teach.views import ImageRefused, Sampled, TeachingRefused, View, Vi
 from gripmon.track.edges.taught import TaughtEdge, sight_axes
 
 SHAPE_M = 5e-4
-"""So far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""
+"""How far a real edge may lie from the sharp model's: a bevel of 0.7 mm, a rounding of 1.2 mm radius."""
 
 INSET_SIGMA_M = 0.5 * SHAPE_M
 """Of what bevels shift all outlines by alike, to the finger's side (standard deviation)."""
 
 PLAUSIBLE_OWN_M = 0.1 * SHAPE_M
-"""By so much bevels differ from edge to edge (standard deviation)."""
+"""How much bevels differ from edge to edge (standard deviation)."""
 
 SINGLE_SIGMA_PX = 0.03
-"""By so much the background and the pixel grid move a whole edge in one image (standard deviation)."""
+"""How far the background and the pixel grid move a whole edge in one image (standard deviation)."""
 
 GRID_SIGMA_PX = 0.01
 """What of that is the pixel grid's, and the same in all images of a standing camera."""
@@ -47,9 +47,9 @@ BACKGROUND_SHARE = 0.3
 outline by depends on the background's shade (bevels of the simulator before grey levels of 60 to 230)."""
 
 _SMALLEST_DEPTH_M = 1e-6
-_NOTHING_M = 1.0  # standard deviation of an offset that isn't seen: what all edges together say of it remains
+_NOTHING_M = 1.0  # standard deviation of an offset that isn't seen: what all edges together show of it remains
 
-_SHRINKAGE = 2  # the usual scatter of all edges counts as so many images more of each edge
+_SHRINKAGE = 2  # images of each edge that the usual scatter of all edges counts as
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,9 +215,9 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
     offset_of_all_m[indices] = shape_m
     axes = sight_axes(gripper, viewer.points_grip_m, viewer.ref_cam_T_grip)
     slope = slopes(gripper, viewer.points_grip_m, viewer.crease, axes, offset_of_all_m)[indices]
-    told = np.isfinite(slope)
-    wished_m = np.where(told, slope, 0.0) * shape_m
-    unsure_m = np.where(told, SLOPE_SHARE * np.abs(wished_m), UNKNOWN_SLOPE * np.abs(shape_m))
+    known = np.isfinite(slope)
+    wished_m = np.where(known, slope, 0.0) * shape_m
+    unsure_m = np.where(known, SLOPE_SHARE * np.abs(wished_m), UNKNOWN_SLOPE * np.abs(shape_m))
     information = 1.0 / (np.square(unsure_m) + np.square(offset_m) + _SMALLEST_DEPTH_M**2)
     moment = information * wished_m
     for i, (angle, ends_m) in enumerate(zip(measured.turned, measured.ends_m, strict=True)):
@@ -231,13 +231,13 @@ def _depths(viewer: Viewer, measured: _Measured, offset_m: Array, shape_m: Array
 
 
 REFERENCE_SIGMAS = 3.0
-"""So many standard deviations of the reference and of the reported opening are allowed on top."""
+"""Standard deviations of the reference and of the reported opening that are allowed on top."""
 
 JAW_SIGMAS = 5.0
-"""So many standard deviations the seen opening may be from the reported one, as in the monitor."""
+"""Standard deviations that the seen opening may be from the reported one, as in the monitor."""
 
 NOTED_PX = 1.0
-"""A reference that is off by more than this is worth a word: a view turned by 3° makes a twentieth of it an error."""
+"""A reference that is off by more than this is worth a note: a view turned by 3° makes a twentieth of it an error."""
 
 TAUGHT_SHARE = 0.5
 """Part of the outlines in view, by profiles, that must be seen: with fewer, something hides the gripper."""
@@ -246,7 +246,7 @@ LOST_SHARE = 0.25
 """With a smaller part the gripper, or a finger, isn't there."""
 
 AGREEING_PX = 0.5
-"""So far the edges of an image may lie from where all images show them, in the median; else something has moved."""
+"""How far the edges of an image may lie from where all images show them, in the median; else something has moved."""
 
 _FEWEST_SHARED = 4
 
@@ -282,7 +282,7 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
             line = None if seen is None else find_line(seen.points, seen.expected_px, SHAPE_M * seen.per_m)
             if line is not None:
                 places_px[number, k] = line.ends_px.mean()
-    # By edges that most images show: one that shows nothing says nothing about the others.
+    # By edges that most images show.
     places_px = places_px[:, 2 * np.isfinite(places_px).sum(axis=0) > len(views)]
     enough = np.isfinite(places_px).sum(axis=1) >= _FEWEST_SHARED
     if not enough.any():
@@ -301,7 +301,7 @@ def check_standing(views: Sequence[View], edges: Sequence[int]) -> None:
 def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -> str | None:
     """Refuse a gripper that stands elsewhere, or opens its jaw otherwise, than the stated deviations allow.
 
-    Each is tried with the other one taken as stated, since together they can hardly be told apart; what leaves less of
+    Each is tried with the other one taken as stated, since together they can hardly be separated; what leaves less of
     their own to the edges is named first.  What is allowed, but more than a pixel, is returned in words.
     """
     stated = viewer.prior_covariance
@@ -314,20 +314,20 @@ def check_reference(viewer: Viewer, name: str, lines: Mapping[int, EdgeLines]) -
     jaw_m, jaw_sigma_m = float(opened.common[6]), float(np.sqrt(opened.common_covariance[6, 6] + stated[6, 6]))
     # Bevels on the inner sides alone look like a wider opening.
     allowed_m = JAW_SIGMAS * jaw_sigma_m + SHAPE_M
-    said = []
+    faults = []
     if pose_square > GATE:
-        said.append(
+        faults.append(
             f"the gripper is off the reference, {viewer.distance(pose)}, {np.sqrt(pose_square / GATE):.1f} times what "
             f"position_sigma_m and rotation_sigma_rad allow: {viewer.advice(pose)}"
         )
     if viewer.gripper.has_jaw and abs(jaw_m) > allowed_m:
-        said.append(
+        faults.append(
             f"the jaw shows an opening of {viewer.jaw_opening_m + jaw_m:.6f} m, {viewer.jaw_opening_m:.6f} m is "
             f"reported, at most {1e3 * allowed_m:.3f} mm may be between them: the opening corrected "
             "(timestamps.csv, --jaw-opening), or a larger monitor.jaw_sigma_m"
         )
-    if said:
-        likelier_first = said if moved.usual_own_m[0] <= opened.usual_own_m[0] else said[::-1]
+    if faults:
+        likelier_first = faults if moved.usual_own_m[0] <= opened.usual_own_m[0] else faults[::-1]
         raise TeachingRefused(f"{name}: {'; or '.join(likelier_first)}")
     away_px = max(float(np.abs(e.sampled.rows[:, :6] @ pose).max()) * e.sampled.per_m for e in lines.values())
     if away_px <= NOTED_PX:

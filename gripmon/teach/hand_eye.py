@@ -299,7 +299,7 @@ def _sighting(image: Image, target: Target, name: str) -> Sighting:
 
 
 def gripper_values(model: GripperModel) -> dict[str, Any]:
-    """A gripper as a file has it: without keys that only say what goes without saying."""
+    """A gripper as a file has it: without keys that have their default."""
     out: dict[str, Any] = msgspec.to_builtins(model)
     out["fingers"] = {
         name: {k: v for k, v in finger.items() if v is not None} for name, finger in out["fingers"].items()

@@ -1,5 +1,5 @@
 """The line that one edge shows in the teaching images, among everything else that looks like an edge beside it; what
-all edges' lines say together; and how deep an edge lies.
+all edges have in common; and how deep an edge lies.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gripmon.track.edges.prediction import STRETCH
 
 _START_PX = 1.0  # half width of a line while it is looked for: two lines closer than this are one to a blurred image
 _FLOOR_PX = 0.05  # the scatter of edge points is never taken to be less: pixels are that coarse
-_GATE_PX = 0.5  # a profile shows the line if it has an edge point so close to it
+_GATE_PX = 0.5  # a profile shows the line if it has an edge point closer to it
 _STEP_PX = 0.5
 _TILTS_PX = (-1.0, 0.0, 1.0)
 _FEWEST = 6
@@ -193,13 +193,13 @@ def pool(ends_m: Array, covariance_m2: Array, rows: Array, kind: NDArray[np.intp
 
 
 LARGEST_SLOPE = 5.0
-"""Depth for each metre of offset at most: a face that is seen more grazingly than 11° tells no depth."""
+"""Depth for each metre of offset at most: a face that is seen more grazingly than 11° shows no depth."""
 
 UNKNOWN_SLOPE = 2.0
-"""Standard deviation of the depth, for each metre of offset, where faces don't tell it."""
+"""Standard deviation of the depth, for each metre of offset, where faces don't show it."""
 
 SLOPE_SHARE = 0.5
-"""Standard deviation of a depth that faces tell, as a share of it: a rounding's line lies less deep than a bevel's."""
+"""Standard deviation of a depth that faces show, as a share of it: a rounding's line lies less deep than a bevel's."""
 
 
 def slopes(

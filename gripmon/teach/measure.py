@@ -1,6 +1,6 @@
 """What a gripper's edges look like in images at the reference calibration: the measuring half of ``gripmon teach``.
 
-By definition the gripper stands in the teaching images where the reference says, its jaws open as reported.  So the
+By definition the gripper stands in the teaching images at the reference, its jaws open as reported.  So the
 taught offsets hold everything by which the images differ from the sharp model there: bevels, shading and blur, but
 also what the reference and the reported opening are off by.  All of it cancels later, as it does for the method's own
 reference corners, which are measured in the reference image.  A reference or an opening that is off by more than its
@@ -45,7 +45,7 @@ SEEN_SHARE = 0.6
 """Part of an edge's profiles that must show its line, in at least half of the images."""
 
 CLOSED_PX = 0.3
-"""So far the gripper may show from the reference when the images are measured again with what was taught; farther only
+"""How far the gripper may show from the reference when the images are measured again with what was taught; farther only
 if that measurement is as uncertain."""
 
 
@@ -73,8 +73,8 @@ def teach(rig: Rig, reference: ReferenceRecord, images: Sequence[TeachingImage])
     """Measure every edge in view against its prediction at the reference.  Raises :class:`TeachingRefused`.
 
     Several images, with different backgrounds, are averaged, and their scatter gives the standard deviations; in one
-    image alone a straight line of the background beside an outline can't be told from it.  An image that contradicts
-    the others is left out while most of them remain.
+    image alone a straight line of the background beside an outline may be taken for it.  An image that contradicts the
+    others is left out while most of them remain.
     """
     assert images, "nothing to teach from"
     viewer = Viewer(rig, reference, images)
@@ -128,9 +128,9 @@ def _teach(viewer: Viewer, views: Sequence[View]) -> Taught:
     # Once more from where the edges really are: the profiles then lie even to both sides of them.
     views = [viewer.view(view.image, None, arrays, view.candidates.zoom) for view in views]
     lines, lost = _lines(viewer, views, search=False)
-    looks = {gripper.edge_ids[index]: look._asdict() for index, look in edge_looks(viewer, views, lines).items()}
+    seen = {gripper.edge_ids[index]: one._asdict() for index, one in _appearances(viewer, views, lines).items()}
     edges = estimate_edges(viewer, lines, edges)
-    edges = {name: msgspec.structs.replace(edge, **looks.get(name, {})) for name, edge in edges.items()}
+    edges = {name: msgspec.structs.replace(edge, **seen.get(name, {})) for name, edge in edges.items()}
     arrays = viewer.arrays(edges)
     return Taught(
         edges,
@@ -254,8 +254,8 @@ DIFFERENT_SHARE = 0.1
 Side = Literal["left", "right", "any"]
 
 
-class EdgeLook(NamedTuple):
-    """``brighter`` side, and the look of those sides that are the finger's."""
+class _Appearance(NamedTuple):
+    """``brighter`` side, and the appearance of those sides that are the finger's."""
 
     brighter: Side
     left: Look | None
@@ -271,23 +271,23 @@ class _Sides(NamedTuple):
     image: NDArray[np.intp]
 
 
-def edge_looks(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> dict[int, EdgeLook]:
-    """The looks of all edges that have lines.
+def _appearances(viewer: Viewer, views: Sequence[View], lines: Mapping[int, EdgeLines]) -> dict[int, _Appearance]:
+    """The appearance of all edges that have lines.
 
     Levels count relative to the median over all edges of an image, which takes exposure out.
     """
     sides = {index: _sides(views, edge) for index, edge in lines.items() if edge.line is not None}
     gains = [_usual_level(viewer, sides, number) for number in range(len(views))]
     scale = full_scale(views[0].image.image)
-    looks = {}
+    found = {}
     for index, side in sides.items():
         gain = np.array(gains)[side.image]
         inside, crease = viewer.inside[index], viewer.crease[index]
         left = _look(side.left / gain) if crease or inside < 0.0 else None
         right = _look(side.right / gain) if crease or inside > 0.0 else None
         sure = crease or (inside != 0.0 and _shows_on_any_background(side, inside, scale))
-        looks[index] = EdgeLook(_brighter(side.step) if sure else "any", left, right)
-    return looks
+        found[index] = _Appearance(_brighter(side.step) if sure else "any", left, right)
+    return found
 
 
 def _sides(views: Sequence[View], edge: EdgeLines) -> _Sides:

@@ -133,7 +133,7 @@ class Fault(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Measurable:
-    """Of a mount from which the monitor can measure at the usual opening, all there unless said otherwise.
+    """Of a mount from which the monitor can measure at the usual opening, all there unless stated otherwise.
 
     ``frame``: the accuracy of one.  ``worst_sigma_m``: standard deviation of the TCP along its least certain direction,
     the largest at some openings, ``worst_at_m``.  ``promise`` of a frame; ``smallest`` (6,) steps that are noticed,

@@ -33,7 +33,7 @@ from gripmon.track.edges.profiles import (
 )
 
 REACH_PX = 10.0
-"""So far from its rough ends an edge is looked for."""
+"""Search distance from the rough ends of an edge."""
 LARGEST_REACH_SHARE = 0.25
 """Of the edge's length: beyond that it is more likely another one."""
 FINAL_REACH_PX = 5.0
@@ -308,7 +308,7 @@ def line_covariances(seen: Sequence[SeenEdge]) -> list[Array]:
     """(2, 2) of each line's offsets at both ends, px.
 
     Neighbouring points err together where there is texture, independently where there is only noise.  Which it is, the
-    residuals' sums over stretches of an edge tell: divided by the root of their counts they have the variance v of a
+    residuals' sums over stretches of an edge show it: divided by the root of their counts they have the variance v of a
     point if all are independent, and up to :data:`STRETCH` times that if those of a stretch are one.  Either way the
     line's covariance is ``v (A' A)^-1``, A being its design (Huber, "Robust statistics", 1981, section 6.3, for groups
     that err together).  v comes from all edges together, as one alone has few stretches, or from the edge itself where

@@ -2,7 +2,7 @@
 
 A page of another site that is open in the same browser can send requests here, too, or have its name resolve to
 127.0.0.1 (DNS rebinding).  So every request must name this very host, carry the token in its path, and come from this
-page where the browser says where from; no header allows other sites anything.
+page where the browser names an origin; no header allows other sites anything.
 
 By the standard library: with starlette and uvicorn these checks, which are most of this file, would stay the same, and
 five more packages would be installed.

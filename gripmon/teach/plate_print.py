@@ -16,7 +16,7 @@ from gripmon.model.targets import Charuco, Chequerboard, Target
 from gripmon.track.edges.profiles import read_profiles
 
 _BESIDE = 0.1
-"""Of a square, from a corner along both axes: so near a square shows its own colour, before any mark in it."""
+"""Of a square, from a corner along both axes: a square shows its own colour there, before any mark in it."""
 _MARK_PX = 12
 """Size of a mark's cells in the picture that is looked up."""
 
@@ -68,7 +68,7 @@ def plate_print(
     camera: Camera, cam_T_plate: Array, sighting: Sighting, target: Target | None, image: Image
 ) -> PlatePrint | None:
     """The print of a chequerboard or ChArUco board, its colours from the image about its corners; None for discs, whose
-    outlines nobody takes for a finger's, and where dark and light can't be told.
+    outlines aren't mistaken for a finger's, and where dark and light can't be distinguished.
     """
     if not isinstance(target, Chequerboard | Charuco) or sighting.disc_radius_m > 0.0:
         return None
@@ -138,7 +138,7 @@ _WINDOW_PX = 2.0
 _USUAL_BLUR_PX = 1.0
 _BLURS = np.geomspace(0.5, 3.0, 10)
 _LEAST_DIFFERENCE = 0.1
-"""Of the print's contrast: by so much levels near the line may differ from what they were taken to be."""
+"""Of the print's contrast: what levels near the line may differ by from what they were taken to be."""
 _GRID_PX = 0.5
 
 

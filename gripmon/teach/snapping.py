@@ -1,6 +1,6 @@
 """From corners put by hand to the edges and corners that the image really shows, with what is wrong where it isn't.
 
-The corners only say about where the gripper is; many poses that agree with them are tried, coarsely first, and what is
+The corners are only rough; many poses that agree with them are tried, coarsely first, and what is
 measured at the best one is what the monitor itself would measure there.
 """
 
@@ -25,23 +25,25 @@ SURE_SHARE = 0.8
 """Share of agreeing profiles from which no other pose is tried."""
 
 FARTHEST_SIGMAS = 6.0
-"""The gripper may show so far from the corners put by hand, in their standard deviations (root mean square)."""
+"""How far the gripper may show from the corners put by hand, in their standard deviations (root mean square)."""
 
 MISFIT_SIGMAS = (4.0, 12.0)
-"""A corner so far from where all together put it is named where nothing is found; so far, it has another one's name."""
+"""Distance of a corner from where all together put it, in its standard deviations: from which it is named where nothing
+is found, and from which it must have another one's name.
+"""
 
 CLEARLY = 1.25
-"""So much more has to agree with mirrored corners before they are said to be meant."""
+"""How many times more has to agree with mirrored corners before they are reported as exchanged."""
 
-_SPREAD = 24  # poses about what the corners say
+_SPREAD = 24  # poses about that of the corners
 _KEPT = (6, 3)  # of them, that are followed to the next finer zoom
 _USUAL_SHARE = 0.6
-_OPENINGS, _TOLD = 9, 4.0  # jaw openings tried, where nobody reports it; by so much another cost (χ²) tells one
+_OPENINGS, _OPENING_CHI2 = 9, 4.0  # openings tried where none is reported; the gain in χ² from which another is taken
 _ALIKE = 0.25  # of the smallest distance between two corners
 _NARROW = Patience(when_doubtful=False, when_lost=False)
 
 ON_A_LINE = (
-    "the corners lie on a line, which doesn't say how the gripper is turned about it; one more beside it, or "
+    "the corners lie on a line, which leaves open how the gripper is turned about it; one more beside it, or "
     "a calibration of hand and eye (--reference FILE)"
 )
 MIRRORED = "mirrored, these corners fit better; the fingers, or near and far, have each other's names?"
@@ -70,7 +72,7 @@ class Snapper:
     ) -> Snapped:
         """Look for the gripper.
 
-        ``put_px`` (name: (2,)) the corners put by hand; ``jaw_opening_m`` None where nobody reports it; ``known``: the
+        ``put_px`` (name: (2,)) the corners put by hand; ``jaw_opening_m`` None where it isn't reported; ``known``: the
         prior is a calibration, so that no corner need be put.  Never raises for what the image shows or doesn't.
         """
         start_m = self._opening(put_px, prior) if jaw_opening_m is None else jaw_opening_m
@@ -80,7 +82,7 @@ class Snapper:
             return self._rough(placed[0], start_m, f"put {left} more corner{'s' * (left > 1)} on the fingertips")
         if (misfit := self._misfit(placed[0], MISFIT_SIGMAS[1])) is not None:
             return self._rough(placed[0], start_m, misfit)
-        # Which way the gripper is turned about such a line only the edges can say; where they don't, that is why.
+        # Only the edges can show how the gripper is turned about such a line; where they don't, that is why.
         line = None if known or not self._on_a_line(put_px) else ON_A_LINE
         found = self._found(image, placed, start_m, jaw_opening_m is not None)
         if not known and self._mirrored_fits(image, put_px, start_m, jaw_opening_m is not None, prior, found):
@@ -115,14 +117,14 @@ class Snapper:
         return best
 
     def _opening(self, put_px: Mapping[str, Array], prior: Prior) -> float:
-        """The jaw opening that the corners put by hand fit best, where they tell it from the nominal one."""
+        """The jaw opening that the corners put by hand fit best, where it differs clearly from the nominal one."""
         gripper = self.gripper
         if not gripper.has_jaw or len(put_px) < FEWEST_PUT:
             return gripper.jaw_nominal_m
         tried = [gripper.jaw_nominal_m, *np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, _OPENINGS).tolist()]
         costs = [place(self.camera, gripper, opening_m, put_px, prior)[0].cost for opening_m in tried]
         best = int(np.argmin(costs))
-        return tried[best] if costs[best] < costs[0] - _TOLD else tried[0]
+        return tried[best] if costs[best] < costs[0] - _OPENING_CHI2 else tried[0]
 
     def _mirrored_fits(
         self,

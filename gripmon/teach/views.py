@@ -31,7 +31,7 @@ from gripmon.track.edges.taught import TaughtEdge, TaughtEdges, sight_axes
 USUAL_SHARE = 0.6
 """Share of agreeing profiles that is expected: before clutter, or with bevels, fewer agree than in quiet images."""
 
-_CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is looked for elsewhere
+_CLEAR_SHARE = 0.9  # with less where it was expected, the gripper is searched for elsewhere
 _DENSE = 4096  # profiles: as many as there are pixels along the edges
 _EVERYWHERE = Patience(when_doubtful=True, when_lost=True)
 _NARROW = Patience(when_doubtful=False, when_lost=False)

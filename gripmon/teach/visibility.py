@@ -38,7 +38,7 @@ TOUCHING_M = 1e-4
 
 
 class Rig(NamedTuple):
-    """A camera, a gripper, and how the monitor looks at it; everything but the pose between them."""
+    """A camera, a gripper, and the monitor's settings; everything but the pose between them."""
 
     camera: Camera
     gripper: Gripper
