@@ -162,9 +162,9 @@ def test_what_is_expected_is_what_check_says(rig: Rig, setup: Setup):
     assert found.reference is not None and found.expected is not None
     # As of the configuration that is saved then, which names what this image teaches.
     _, taught = setup.taught(found.reference, [TeachingImage(rig.image, found.snapped.jaw_opening_m, "")])
-    outlook = forecast_accuracy(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M, taught)
-    np.testing.assert_allclose(found.expected.sigma, outlook.sigma)
-    assert min(found.expected.smallest) > 0.0 and found.expected.edges == outlook.edges
+    expected = forecast_accuracy(rig.camera, rig.gripper, MonitorSettings(), found.reference, OPENING_M, taught)
+    np.testing.assert_allclose(found.expected.sigma, expected.sigma)
+    assert min(found.expected.smallest) > 0.0 and found.expected.edges == expected.edges
 
 
 @pytest.mark.slow("11 s: sampled; the corners' spread is in the default run")

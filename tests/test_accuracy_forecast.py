@@ -23,7 +23,7 @@ from gripmon.teach.accuracy import AccuracyForecast, forecast_accuracy, weakest_
 from gripmon.track.edges import MeasurementSettings
 
 
-def outlook(lens: LensSettings = PAPER_LENS, **settings: object) -> AccuracyForecast:
+def forecast(lens: LensSettings = PAPER_LENS, **settings: object) -> AccuracyForecast:
     known = MonitorSettings(**{"floor_m": 0.0, "floor_rad": 0.0, "corners": INDEPENDENT, **settings})  # type: ignore[arg-type]
     return forecast_accuracy(make_camera(lens), box_gripper(), known, reference_of(nominal_cam_T_grip()), OPENING_M)
 
@@ -52,7 +52,7 @@ def test_expected_sigmas_are_the_spread_of_sampled_measurements(lens: LensSettin
         measured = sampled.forecast(nominal_cam_T_grip(), OPENING_M + wrong_m, reported)
         errors[k] = difference(measured.cam_T_grip, nominal_cam_T_grip())
         seen_m[k] = measured.jaw_opening_m - OPENING_M
-    expected = outlook(lens)
+    expected = forecast(lens)
     sigma = expected.sigma if reported else expected.jaw.sigma
     # A sampled standard deviation scatters by 1 / sqrt(2 n); the robust weights cost a few per cent.
     np.testing.assert_allclose(errors.std(axis=0) / sigma, 1.0, atol=4.0 / np.sqrt(2.0 * samples) + 0.05)
@@ -79,19 +79,19 @@ def test_simulated_sequences_scatter_as_expected(measurement: str):
 
 
 def test_an_opening_that_is_wrong_shifts_the_pose_of_a_rendered_image_as_told():
-    told = outlook().jaw.pose_per_m
+    told = forecast().jaw.pose_per_m
     image, wrong_m = picture(plain_scenario()), 1e-4
     sure = type(meter())(make_camera(PAPER_LENS), box_gripper(), MeasurementSettings(), 0.0)
     right, wrong = (measure(image, using=sure, jaw_opening_m=OPENING_M + e).cam_T_grip for e in (0.0, wrong_m))
     shift = difference(right, wrong)
-    # The image weighs the edges by their texture, which the outlook can not know.
+    # The image weighs the edges by their texture, which the forecast can not know.
     assert shift[2] == pytest.approx(told[2] * wrong_m, rel=0.3)
     assert np.abs(shift[:2] - told[:2] * wrong_m).max() < 3e-5
     assert told[2] > 2.0, "an opening looks like a distance: one part in 34 mm of 115 mm"
 
 
 def test_opening_and_distance_are_what_the_box_fingers_cannot_separate():
-    expected = outlook(jaw_sigma_m=0.0, corners=MeasurementSettings())
+    expected = forecast(jaw_sigma_m=0.0, corners=MeasurementSettings())
     assert expected.edges == 8 and expected.enough
     assert expected.jaw.correlation > 0.85
     assert expected.jaw.growth == pytest.approx(1.0 / np.sqrt(1.0 - expected.jaw.correlation**2))
@@ -109,7 +109,7 @@ def test_an_exact_opening_leaves_the_pose_of_six_unknowns():
     settings = MonitorSettings(floor_m=0.0, floor_rad=0.0, jaw_sigma_m=0.0)
     six = forecast_accuracy(make_camera(PAPER_LENS), rigid, settings, reference_of(nominal_cam_T_grip()), None)
     assert six.jaw is None
-    seven = outlook(jaw_sigma_m=0.0, corners=MeasurementSettings())
+    seven = forecast(jaw_sigma_m=0.0, corners=MeasurementSettings())
     np.testing.assert_allclose(seven.sigma, six.sigma, rtol=0.05)
 
 
