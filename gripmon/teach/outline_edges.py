@@ -347,7 +347,7 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
 def measure_outlines(
     camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
 ) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of fingertips that aren't known, from their rough outlines; ``printed``: see :func:`snap`.  Raises
+    """Corners of fingertips that aren't known, from their rough outlines; ``printed``: as in :func:`find_outline`.  Raises
     :class:`CalibrationError`.
     """
     snapped = find_outline(camera, image, outline, printed)
