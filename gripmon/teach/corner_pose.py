@@ -8,7 +8,7 @@ corners, the jaw opening, the camera's calibration, and how exactly the gripper 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ BY_HAND_PX = 1.0
 MADE_TO_M = 2e-5
 """How exactly a fingertip's corners lie where the gripper file has them (each coordinate, standard deviation)."""
 
+_LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
 _STEP = 0.3  # of a standard deviation, for central differences
 
 
@@ -330,3 +331,13 @@ def _linearised(
 def _same(one: Array, other: Array) -> bool:
     xi = perturbation_between(one, other)
     return bool(np.linalg.norm(xi[3:]) < _SAME_RAD and np.linalg.norm(xi[:3]) < _SAME_SHARE * one[2, 3])
+
+
+def corners_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
+    """Key, what is wrong, what would be right, of corners in a file or a request; None if nothing is."""
+    for name, uv_px in corners.items():
+        if name not in gripper.corner_ids:
+            return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"
+        if not all(np.isfinite(v) and abs(v) <= _LARGEST_PX for v in uv_px):
+            return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
+    return None

@@ -347,8 +347,8 @@ def _stretches(edge: SeenEdge) -> tuple[float, float]:
 def measure_outlines(
     camera: Camera, image: Image, outline: Outline, printed: PlatePrint | None = None
 ) -> tuple[FingerCorners, FoundOutline]:
-    """Corners of fingertips that aren't known, from their rough outlines; ``printed``: as in :func:`find_outline`.  Raises
-    :class:`CalibrationError`.
+    """Corners of fingertips that aren't known, from their rough outlines; ``printed`` and errors as in
+    :func:`find_outline`.
     """
     snapped = find_outline(camera, image, outline, printed)
     corners = list(outline.corners)

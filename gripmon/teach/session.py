@@ -38,6 +38,7 @@ from gripmon.teach.corner_pose import (
     Prior,
     Snapped,
     SnappedCorner,
+    corners_fault,
     place,
     pose_from_corners,
     prior_of,
@@ -64,7 +65,6 @@ from gripmon.teach.views import TeachingImage, TeachingRefused
 from gripmon.teach.visibility import Rig
 from gripmon.track.edges import TaughtEdges
 
-_LARGEST_PX = 100_000.0  # of a coordinate: corners are put in the image, or beside it
 _MOST_PICTURES = 50
 _LIVE_WAIT_S = 10.0
 _STEP_M = 1e-4  # of the TCP, for which the delay is given
@@ -169,16 +169,6 @@ def _reference_of(pose: CornerPose) -> ReferenceRecord:
     digest = hashlib.sha256(msgspec.json.encode(rounded)).hexdigest()[:8]
     flat = tuple(float(f"{v:.6e}") for v in pose.covariance.ravel().tolist())
     return ReferenceRecord(f"corners-{digest}", 0, 0, "configuration", rounded, flat)
-
-
-def corners_fault(corners: Mapping[str, Sequence[float]], gripper: Gripper) -> tuple[str, str, str] | None:
-    """Key, what is wrong, what would be right, of corners in a file or a request; None if nothing is."""
-    for name, uv_px in corners.items():
-        if name not in gripper.corner_ids:
-            return f"corners.{name}", "the gripper has no such corner", f"one of {', '.join(gripper.corner_ids)}"
-        if not all(np.isfinite(v) and abs(v) <= _LARGEST_PX for v in uv_px):
-            return f"corners.{name}", f"is {list(uv_px)}", "column and row in the image (px)"
-    return None
 
 
 class Saving(Protocol):

@@ -28,10 +28,10 @@ from gripmon.model.gripper import Gripper
 from gripmon.model.records import ReferenceRecord, to_json
 from gripmon.monitor import MonitorSettings
 from gripmon.teach.api import Picture, read_any, read_picture
-from gripmon.teach.corner_pose import CameraError
+from gripmon.teach.corner_pose import CameraError, corners_fault
 from gripmon.teach.outlines import RoughCorners
 from gripmon.teach.page_server import OutlineSession
-from gripmon.teach.session import Setup, corners_fault
+from gripmon.teach.session import Setup
 
 ROBOT, CAMERA_NAME, ROUGH = "robot1", "wrist", "rough.yaml"
 

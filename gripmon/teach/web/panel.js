@@ -53,14 +53,14 @@ export function pictures(list, live, chosen) {
 }
 
 export function corners(list, reply, selected, choose) {
-  const told = new Map((reply?.corners ?? []).map((corner) => [corner.name, corner]));
+  const replies = new Map((reply?.corners ?? []).map((corner) => [corner.name, corner]));
   $("#corners tbody").replaceChildren(...list.map(({ name, state, away }) => {
     const row = element("tr", "", { "data-corner": name });
     row.classList.toggle("selected", name === selected);
     const mark = element("td");
     mark.append(element("span", "", { class: "mark", "data-state": state }));
     row.append(mark, element("td", name));
-    const corner = told.get(name);
+    const corner = replies.get(name);
     if (state === "hand") {
       const off = away === null ? "" : `, ${away.toFixed(2)} px from the edges`;
       row.append(element("td", `set by hand${off}`, { colspan: 2, class: "quiet" }));
