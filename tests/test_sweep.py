@@ -129,7 +129,7 @@ def scatter(mount: Mount) -> np.ndarray:
     tracker = Tracker(camera, gripper, MonitorSettings(jaw_sigma_m=0.0))
     errors = []
     for k in range(FRAMES):
-        measured = tracker.measure(simulator.frame(k), cam_T_grip)
+        measured = tracker.measure(simulator.frame(k), cam_T_grip, k / scenario.fps)
         assert measured.trusted
         errors.append(difference(tracker.update(measured)[0], simulator.truth(k).cam_T_grip))
     return np.std(errors, axis=0)
