@@ -2,17 +2,8 @@
 configuration that runs.  It stands here because it knows configurations, which the room ``teach`` does not.
 """
 
-from gripmon.daemon.teaching.inputs import Inputs, Named, live_settings, outline_session, read_inputs, read_rough
-from gripmon.daemon.teaching.saving import FileSaving
+from gripmon.daemon.teaching.inputs import Inputs, outline_session, read_inputs
+from gripmon.daemon.teaching.saving import FileSaving, page_session, teach_from_file
 from gripmon.daemon.teaching.written import name_taught
 
-__all__ = [
-    "FileSaving",
-    "Inputs",
-    "Named",
-    "live_settings",
-    "name_taught",
-    "outline_session",
-    "read_inputs",
-    "read_rough",
-]
+__all__ = ["FileSaving", "Inputs", "name_taught", "outline_session", "page_session", "read_inputs", "teach_from_file"]
