@@ -151,7 +151,7 @@ def report(arguments: argparse.Namespace) -> None:
     elif data_path is not None:
         write(found.json() + b"\n", data_path, "--json")
     if arguments.out is not None:
-        with progress_bar(len(found.told), "recording") as step:
+        with progress_bar(len(found.analysed), "recording") as step:
             data = found.html(step)
         write(data, arguments.out)
     if not to_stdout:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from gripmon.analyse.replay_differences import Differences
+from gripmon.analyse.comparison import Differences
 from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.errors import InputError, NoResultError
