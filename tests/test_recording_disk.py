@@ -21,8 +21,8 @@ from support.recorded import Recorded, frame, record, recorder, trace, wait_unti
 from gripmon.daemon import DaemonSettings
 from gripmon.daemon.watch import Watch
 from gripmon.model.records import AlertEvent, AlertKind, Severity
+from gripmon.record.process import SILENT_AFTER_S, Health
 from gripmon.record.write import ProcessRecorder
-from gripmon.record.write.health import SILENT_AFTER_S, Health
 
 LONG_S = 60.0
 

@@ -140,10 +140,10 @@ def _provenance(found: CalibratedLaser, arguments: argparse.Namespace) -> Proven
 
 
 def _record(found: CalibratedLaser, path: Path) -> None:
-    from gripmon.record.write.laser_scene import write
+    from gripmon.record.spots import write_calibration
 
     try:
-        write(path, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
+        write_calibration(path, found.fit.refined, found.samples.base_T_ee, found.fit.uv_px)
     except OSError as error:
         raise common.not_writable(path, error, "--recording") from None
 

@@ -14,7 +14,7 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.model.records import FrameRecord
-    from gripmon.record.write.compared import ComparedRecorder
+    from gripmon.record.compared import ComparedRecorder
 
 
 def is_recording(paths: list[Path]) -> bool:

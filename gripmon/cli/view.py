@@ -50,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
     from gripmon.model.stopping import signals_exit
     from gripmon.record.read import is_rrd, recording_files
-    from gripmon.record.write.files_page import serve_files
-    from gripmon.record.write.viewer import NativeViewer, ViewerError, free_port, has_display, is_free
+    from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
 
     files = recording_files([Path(name) for name in arguments.recordings])
     for path in files:

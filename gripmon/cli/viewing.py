@@ -35,7 +35,7 @@ class LiveView:
 
     def __init__(self, settings: ViewSettings, kind: str, said_by: str) -> None:
         """Ends the command, before anything runs, where it can't be shown.  ``said_by`` names the configuration."""
-        from gripmon.record.write.viewer import has_display, is_free
+        from gripmon.record.viewer import has_display, is_free
 
         self.settings = settings
         self._native = kind == "native" or (kind == "auto" and has_display())
@@ -49,7 +49,7 @@ class LiveView:
 
     def open(self, opened: ExitStack) -> None:
         """Start the viewer, which shows the stream as soon as there is one; a page ends with ``opened``."""
-        from gripmon.record.write.viewer import ViewerError, WebPage
+        from gripmon.record.viewer import ViewerError, WebPage
 
         url = self.settings.stream_url
         if self._web:
@@ -67,7 +67,7 @@ class LiveView:
         """A viewer that finds no server gives up: it is started when there is one.  The window is the user's: it stays
         until it is closed.
         """
-        from gripmon.record.write.viewer import NativeViewer, ViewerError, is_free
+        from gripmon.record.viewer import NativeViewer, ViewerError, is_free
 
         end_s = time.monotonic() + _SERVER_STARTS_S
         while is_free(self.settings.port):

@@ -1,18 +1,24 @@
-"""A reader of everything that one monitor says, which can also tell it something."""
+"""A reader of everything that one monitor sends, which also sends it commands."""
 
 from __future__ import annotations
 
-import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from typing import Self, TypeVar
+from typing import TypeVar
 
 import msgspec
 import zenoh
 
-from gripmon.client.names import MonitorName, Start, monitor_name, start_of
-from gripmon.client.network import named_as_arguments, reader_settings
+from gripmon.client.network import (
+    Listener,
+    MonitorName,
+    Start,
+    monitor_name,
+    named_as_arguments,
+    reader_settings,
+    start_of,
+)
 from gripmon.io.wire import DEFAULT_ENDPOINT, Keys, open_session, zenoh_config
 from gripmon.model.records import (
     CommandError,
@@ -51,10 +57,10 @@ class Ambiguous(LookupError):
         self.argument = argument
 
 
-class Client:
+class Client(Listener):
     """Reads one monitor's messages.  Not for several threads at once, except for :meth:`close`.
 
-    A slow reader never holds anybody up: the newest ``depth`` records wait for it, older ones are dropped.
+    A slow reader never holds up the monitor: the newest ``depth`` records wait for it, older ones are dropped.
     """
 
     def __init__(
@@ -72,6 +78,7 @@ class Client:
         Raises ValueError for a name that can't be part of a key, and :class:`gripmon.io.wire.PublishError` for a bad
         configuration.
         """
+        super().__init__()
         self.keys = Keys(robot, camera if camera is not None else "*")
         settings = reader_settings(connect, zenoh_config_file)
         with named_as_arguments():
@@ -81,13 +88,6 @@ class Client:
         self._heard: MonitorName | None = None
         self._newest: FrameRecord | None = None
         self._samples = self._subscribe()
-        self._threads: list[threading.Thread] = []
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def latest(self) -> FrameRecord | None:
         """The newest record, at once; the same one again while no newer one came; None before the first.
@@ -111,14 +111,7 @@ class Client:
 
         An exception in the callback ends its thread and goes to ``threading.excepthook``.
         """
-        samples = self._subscribe()
-
-        def pump() -> None:
-            for record in self._records(samples):
-                callback(record)
-
-        self._threads.append(threading.Thread(target=pump, name="gripmon-client", daemon=True))
-        self._threads[-1].start()
+        self._call_back(callback, self._records(self._subscribe()))
 
     def state(self, timeout_s: float = 1.0) -> StateRecord | None:
         """The monitor's last state message; None if no monitor answers in time."""
@@ -163,9 +156,7 @@ class Client:
         It waits for a callback that is at work, unless it is called in one.
         """
         self._session.close()
-        if threading.current_thread() not in self._threads:  # two callbacks that close would wait for each other
-            for thread in self._threads:
-                thread.join()
+        super().close()
 
     def _subscribe(self) -> zenoh.Subscriber[zenoh.Handler[zenoh.Sample]]:
         return self._session.declare_subscriber(self.keys["transform"], zenoh.handlers.RingChannel(self._depth))

@@ -21,7 +21,7 @@ from gripmon.io.sources import SimulatedSettings, SourceError, make_simulator
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import Array, FrameRecord
 from gripmon.model.stopping import StopRequest
-from gripmon.record.write.viewer import free_port
+from gripmon.record.viewer import free_port
 from gripmon.simulate import Simulator
 
 _PREFERRED_PORT = 7447

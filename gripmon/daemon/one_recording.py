@@ -16,8 +16,8 @@ from gripmon.daemon.config import Config
 from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.starting import RECORDING_PATIENCE_S
 from gripmon.model.errors import InputError
+from gripmon.record.keeping import keep_whole
 from gripmon.record.write import NullRecorder, Recorder, open_recorder
-from gripmon.record.write.repair import keep_whole
 
 
 @contextmanager
@@ -71,7 +71,7 @@ def _missing(recorder: Recorder) -> str | None:
 @contextmanager
 def _told_at_the_end() -> Iterator[None]:
     """What a daemon logs of its recording while it goes on, a replay says in one line when it is over."""
-    logger = logging.getLogger("gripmon.record.write")
+    logger = logging.getLogger("gripmon.record")
     propagates, silent = logger.propagate, logging.NullHandler()
     logger.addHandler(silent)
     logger.propagate = False

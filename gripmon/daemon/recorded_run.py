@@ -14,11 +14,10 @@ from gripmon.daemon.config import Config, ConfigError
 from gripmon.daemon.config.recorded import from_recorded, to_recorded
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.records import FrameRecord, Limits, MonitorState
-from gripmon.record.read import recording_files
-from gripmon.record.read.replayed import RecordedFrames, SeveralRunsError, UnusableError
-from gripmon.record.write.compared import ComparedRecorder
-from gripmon.record.write.repair import keep_whole
-from gripmon.record.write.wire import make_scene
+from gripmon.record.compared import ComparedRecorder
+from gripmon.record.keeping import keep_whole
+from gripmon.record.read import RecordedFrames, SeveralRunsError, UnusableError, recording_files
+from gripmon.record.recorder import make_scene
 
 
 class RecordedRun:
