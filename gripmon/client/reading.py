@@ -126,17 +126,9 @@ class Reading(msgspec.Struct, frozen=True, kw_only=True):
         pose = self.smoothed if smoothed and self.smoothed is not None else self.transform
         if pose is None:
             raise NotUsable(self)
-        import numpy as np
+        from gripmon.model.geometry import from_record
 
-        x, y, z, w = pose.rotation_xyzw
-        matrix = np.eye(4)
-        matrix[:3, :3] = (
-            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
-            (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
-            (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
-        )
-        matrix[:3, 3] = pose.translation_m
-        return matrix
+        return from_record(Transform(pose.translation_m, pose.rotation_xyzw))
 
 
 def _largest_sigma_m(covariance: tuple[float, ...] | None) -> float:

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Protocol, Self
+from typing import Self
 
 import zenoh
 
@@ -67,7 +67,8 @@ class TransformClient(Listener):
         self.keys = Keys(robot, camera if camera is not None else "*")
         self._depth = depth
         self._inbox = Inbox()
-        self._asker = ClockAsker(self.keys["transform"], self._inbox.answered)
+        self._session: zenoh.Session | None = None
+        self._next_question_s = 0.0
         self._declared: tuple[object, ...] = ()  # Zenoh undeclares what is referred to no more
         with named_as_arguments():
             self._link = Link(reader_settings(connect, zenoh_config_file))
@@ -140,10 +141,10 @@ class TransformClient(Listener):
             if reply.ok is not None:
                 self._inbox.found(monitor_name(reply.ok.key_expr))
 
-        if self._asker.session is not None:
+        if self._session is not None:
             with contextlib.suppress(zenoh.ZError):  # another thread closes it just now
                 everyone, found = Keys("*", "*")["alive"], in_zenohs_thread(find)
-                self._asker.session.liveliness().get(everyone, found, timeout=_LOOK_WITHIN_S)
+                self._session.liveliness().get(everyone, found, timeout=_LOOK_WITHIN_S)
 
     def _fault(self) -> str:
         try:
@@ -152,7 +153,7 @@ class TransformClient(Listener):
             return "the client is being closed"
 
     def _declare(self, session: zenoh.Session) -> None:
-        self._asker.session = session
+        self._session = session
         keys, tokens = self.keys, session.liveliness()
         self._declared = (
             session.declare_subscriber(keys["transform"], in_zenohs_thread(self._receive)),
@@ -167,52 +168,35 @@ class TransformClient(Listener):
             sent = None if reading is None else Sent(reading, arrived_ns)
             self._inbox.take(monitor_name(sample.key_expr), sample.payload.to_bytes(), arrival_s, sent)
             if sent is not None:
-                self._asker.ask(known=self._inbox.age_known)
+                self._ask_for_clock(known=self._inbox.age_known)
 
     def _see(self, token: zenoh.Sample) -> None:
         seen = self._inbox.appeared if token.kind == zenoh.SampleKind.PUT else self._inbox.vanished
         seen(monitor_name(token.key_expr))
         if token.kind == zenoh.SampleKind.PUT:
-            self._asker.ask(known=False)  # so that its first transform is usable
+            self._ask_for_clock(known=False)  # so that its first transform is usable
 
     def _see_start(self, token: zenoh.Sample) -> None:
         seen = self._inbox.started if token.kind == zenoh.SampleKind.PUT else self._inbox.ended
         seen(start_of(token.key_expr))
 
-
-def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
-    try:
-        return from_json(payload.to_bytes(), ClockReading)
-    except MessageRefused:
-        return None
-
-
-class ClockAsker:
-    """Asks on a session, at most so often; called in Zenoh's threads, and answered there."""
-
-    def __init__(self, key: str, answered: Callable[[ClockReading, int, int], None]) -> None:
-        """``answered`` gets the answer, and when it was asked for and came by our steady clock, ns."""
-        self._selector, self._answered = f"{key}?{CLOCK_PARAMETER}", answered
-        self.session: zenoh.Session | None = None
-        self._next_s = 0.0
-
-    def ask(self, *, known: bool) -> None:
-        """Ask if it is time; sooner if nothing is ``known`` yet."""
-        session, now_s = self.session, time.monotonic()
-        if session is None or now_s < self._next_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
+    def _ask_for_clock(self, *, known: bool) -> None:
+        """Ask what the monitor's clock shows if it is time; sooner if nothing is ``known`` yet.  In Zenoh's threads."""
+        session, now_s = self._session, time.monotonic()
+        if session is None or now_s < self._next_question_s - (ASK_EVERY_S - _ASK_AGAIN_S) * (not known):
             return
-        self._next_s = now_s + ASK_EVERY_S
+        self._next_question_s = now_s + ASK_EVERY_S
         asked_ns = steady_ns()
 
         def take(reply: zenoh.Reply) -> None:
             answered_ns = steady_ns()
             reading = None if reply.ok is None else _clock_reading(reply.ok.payload)
             if reading is not None:  # a monitor of a version that doesn't tell answers with its last transform
-                self._answered(reading, asked_ns, answered_ns)
+                self._inbox.answered(reading, asked_ns, answered_ns)
 
         with contextlib.suppress(zenoh.ZError):  # the session is being closed
             session.get(
-                self._selector,
+                f"{self.keys['transform']}?{CLOCK_PARAMETER}",
                 in_zenohs_thread(take),
                 target=zenoh.QueryTarget.ALL,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -223,16 +207,11 @@ class ClockAsker:
             )
 
 
-class _Judge(Protocol):
-    """What the iterators need of the client."""
-
-    @property
-    def policy(self) -> Policy: ...
-    @property
-    def closed(self) -> bool: ...
-    def latest(self) -> Reading: ...
-    def look_around(self) -> None: ...
-    def judge(self, entry: Entry) -> Reading: ...
+def _clock_reading(payload: zenoh.ZBytes) -> ClockReading | None:
+    try:
+        return from_json(payload.to_bytes(), ClockReading)
+    except MessageRefused:
+        return None
 
 
 class _Queue:
@@ -243,21 +222,28 @@ class _Queue:
     waits for the next reading stops in time, too.
     """
 
-    def __init__(self, judge: _Judge, depth: int) -> None:
-        self._judge = judge
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        self._client = client
         self._entries: deque[Entry] = deque(maxlen=depth)
-        self._given = judge.latest()
+        self._given = client.latest()
         waits = self._given.verdict is Verdict.UNKNOWN
         self._look_s = time.monotonic() + FIRST_WITHIN_S - _LOOK_AROUND_S if waits else None
         self._say_s: float | None = None
+
+    def put(self, entry: Entry) -> None:
+        self._entries.append(entry)
+        self.wake()
+
+    def wake(self) -> None:
+        raise NotImplementedError
 
     def _take(self) -> Reading | None:
         """The next reading if there is one."""
         if self._entries:
             self._look_s = self._say_s = None
-            self._given = self._judge.judge(self._entries.popleft())
+            self._given = self._client.judge(self._entries.popleft())
             return self._given
-        if self._given.verdict is not Verdict.UNKNOWN and (now := self._judge.latest()).verdict is Verdict.UNKNOWN:
+        if self._given.verdict is not Verdict.UNKNOWN and (now := self._client.latest()).verdict is Verdict.UNKNOWN:
             self._given = now
             return now
         return self._silence(time.monotonic())
@@ -266,10 +252,10 @@ class _Queue:
         """What there is in place of a first message, when it is time to say so."""
         if self._look_s is not None and now_s >= self._look_s:
             self._look_s, self._say_s = None, now_s + _LOOK_AROUND_S
-            self._judge.look_around()
+            self._client.look_around()
         elif self._say_s is not None and now_s >= self._say_s:
             self._say_s = None
-            self._given = self._judge.latest()
+            self._given = self._client.latest()
             return self._given
         return None
 
@@ -280,19 +266,15 @@ class _Queue:
             return max(0.0, next_s - time.monotonic()) + _LATE_S
         if self._given.verdict is Verdict.UNKNOWN:
             return None
-        return max(0.0, self._judge.policy.max_age_s - self._judge.latest().age_s) + _LATE_S
+        return max(0.0, self._client.policy.max_age_s - self._client.latest().age_s) + _LATE_S
 
 
 class Readings(_Queue):
     """Iterator for one thread; ends when the client is closed."""
 
-    def __init__(self, judge: _Judge, depth: int) -> None:
-        super().__init__(judge, depth)
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        super().__init__(client, depth)
         self._news = threading.Event()
-
-    def put(self, entry: Entry) -> None:
-        self._entries.append(entry)
-        self._news.set()
 
     def wake(self) -> None:
         self._news.set()
@@ -301,11 +283,11 @@ class Readings(_Queue):
         return self
 
     def __next__(self) -> Reading:
-        while not self._judge.closed:
+        while not self._client.closed:
             self._news.clear()  # before looking: what comes after that is not missed
             if (reading := self._take()) is not None:
                 return reading
-            if not self._judge.closed:
+            if not self._client.closed:
                 self._news.wait(self._patience_s())
         raise StopIteration
 
@@ -316,14 +298,10 @@ class AsyncReadings(_Queue):
     A cancelled wait loses nothing: the next ``anext`` goes on.
     """
 
-    def __init__(self, judge: _Judge, depth: int) -> None:
-        super().__init__(judge, depth)
+    def __init__(self, client: TransformClient, depth: int) -> None:
+        super().__init__(client, depth)
         self._loop = asyncio.get_running_loop()
         self._news = asyncio.Event()
-
-    def put(self, entry: Entry) -> None:
-        self._entries.append(entry)
-        self.wake()
 
     def wake(self) -> None:
         with contextlib.suppress(RuntimeError):  # its loop has ended, and with it the wait
@@ -333,11 +311,11 @@ class AsyncReadings(_Queue):
         return self
 
     async def __anext__(self) -> Reading:
-        while not self._judge.closed:
+        while not self._client.closed:
             self._news.clear()
             if (reading := self._take()) is not None:
                 return reading
-            if not self._judge.closed:
+            if not self._client.closed:
                 with contextlib.suppress(TimeoutError):  # then it is time to look again
                     async with asyncio.timeout(self._patience_s()):
                         await self._news.wait()

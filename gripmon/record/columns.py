@@ -261,7 +261,7 @@ def log_origin(send: Sender, scene: Scene, file_number: int) -> None:
         recording_id=scene.recording_id,
         robot=scene.robot,
         camera=scene.camera,
-        gripper=scene.gripper,
+        gripper="" if scene.gripper is None else scene.gripper.name,
         version=scene.version,
         file_number=file_number,
         started_ns=time.time_ns(),

@@ -74,7 +74,7 @@ class ComparedRecorder:
         stream.send_blueprint(_layout(scene), make_active=True, make_default=True)
         self._writer = RowWriter(stream, scene, 1)
         beside = _Beside(stream)
-        self._curves, self._status = CurveWriter(beside, scene), EventWriter(beside, RECORDED)
+        self._curves, self._status = CurveWriter(beside, self._writer.corner_ids), EventWriter(beside, RECORDED)
         _name_both(Sender(stream))
         self._rows: list[Row] = []
         self._rows_then: list[Row] = []

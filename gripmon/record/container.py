@@ -57,10 +57,6 @@ class Span(NamedTuple):
     size: int
 
 
-Block = tuple[Span, ...]
-"""What is decoded at once."""
-
-
 class Chunk(NamedTuple):
     """Rows of one entity: ``batch`` is Arrow's, a column a timeline (unless it is static) or component."""
 
@@ -82,6 +78,9 @@ class Manifest:
     rows: IntArray
     first: IntArray
     last: IntArray
+
+    def span(self, message: int) -> Span:
+        return Span(int(self.offset[message]), int(self.size[message]))
 
 
 class StoreName(NamedTuple):
@@ -129,7 +128,7 @@ class RrdFile:
             self._distrust_footer(error)
         return None
 
-    def blocks(self) -> Iterator[Span]:
+    def spans(self) -> Iterator[Span]:
         """All whole messages in the order of the file, about a megabyte at a time.
 
         Ends at the file's end or at the first place that is no message, which goes to ``faults``.
@@ -148,34 +147,33 @@ class RrdFile:
                 else:
                     end += size
 
-    def record_texts(self, store: StoreName, block: Block) -> list[str]:
-        """The frames' records in a block."""
-        return [text for chunk in self.decode(store, block, (RECORD,)) for text in texts_of(chunk.batch, "json")]
+    def record_texts(self, store: StoreName, span: Span) -> list[str]:
+        """The frames' records in some messages."""
+        return [text for chunk in self.decode(store, span, (RECORD,)) for text in texts_of(chunk.batch, "json")]
 
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]:
+    def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]:
         """A store's chunks in some messages, only those of entities in ``content`` (all where it is None).
 
         Messages that are damaged are left out and counted.  Raises OSError where the file can't be read any more.
         """
         with self.path.open("rb") as file:
-            parts = [os.pread(file.fileno(), span.size, span.offset) for span in block]
+            part = os.pread(file.fileno(), span.size, span.offset)
         chunks = []
-        for part in parts:
-            offset = 0
-            while offset < len(part):
-                kind, size = _MESSAGE.unpack_from(part, offset) if offset + _MESSAGE.size <= len(part) else (_END, 0)
-                body = part[offset + _MESSAGE.size : offset + _MESSAGE.size + size]
-                offset += _MESSAGE.size + size
-                if offset > len(part) or kind not in (_CHUNK, _STORE_INFO, _BLUEPRINT):
-                    self.damaged += 1
-                    break
-                try:
-                    chunk = _chunk(body, store, content) if kind == _CHUNK else None
-                except Exception:  # noqa: BLE001 - whatever Arrow raises: this message is damaged, the others need not be
-                    self.damaged += 1
-                    continue
-                if chunk is not None:
-                    chunks.append(chunk)
+        offset = 0
+        while offset < len(part):
+            kind, size = _MESSAGE.unpack_from(part, offset) if offset + _MESSAGE.size <= len(part) else (_END, 0)
+            body = part[offset + _MESSAGE.size : offset + _MESSAGE.size + size]
+            offset += _MESSAGE.size + size
+            if offset > len(part) or kind not in (_CHUNK, _STORE_INFO, _BLUEPRINT):
+                self.damaged += 1
+                break
+            try:
+                chunk = _chunk(body, store, content) if kind == _CHUNK else None
+            except Exception:  # noqa: BLE001 - whatever Arrow raises: this message is damaged, the others need not be
+                self.damaged += 1
+                continue
+            if chunk is not None:
+                chunks.append(chunk)
         return chunks
 
     def _check_header(self, header: bytes) -> None:

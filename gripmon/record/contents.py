@@ -32,7 +32,6 @@ from gripmon.record.container import (
     FRAME,
     NO_FRAME,
     RECORD,
-    Block,
     Chunk,
     Manifest,
     RrdFile,
@@ -119,35 +118,35 @@ class Source(Protocol):
     faults: list[str]
     damaged: int
 
-    def record_texts(self, store: StoreName, block: Block) -> list[str] | list[bytes]: ...
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]: ...
+    def record_texts(self, store: StoreName, span: Span) -> list[str] | list[bytes]: ...
+    def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]: ...
 
 
 class Places:
-    """Where an entity's rows lie: blocks with the range of their frames' numbers."""
+    """Where an entity's rows lie: messages with the range of their frames' numbers."""
 
     def __init__(self) -> None:
-        self._blocks: list[Block] = []
+        self._spans: list[Span] = []
         self._first = array("q")
         self._last = array("q")
 
-    def add(self, block: Block, first: int, last: int) -> None:
-        self._blocks.append(block)
+    def add(self, span: Span, first: int, last: int) -> None:
+        self._spans.append(span)
         self._first.append(first)
         self._last.append(last)
 
-    def find(self, seq: int) -> list[Block]:
-        """Blocks that may hold a frame, in the order of the file, none twice."""
+    def find(self, seq: int) -> list[Span]:
+        """Those that may hold a frame, in the order of the file, none twice."""
         first, last = np.frombuffer(self._first, np.int64), np.frombuffer(self._last, np.int64)
-        return list(dict.fromkeys(self._blocks[i] for i in np.flatnonzero((first <= seq) & (seq <= last))))
+        return list(dict.fromkeys(self._spans[i] for i in np.flatnonzero((first <= seq) & (seq <= last))))
 
-    def blocks(self) -> list[Block]:
-        return list(dict.fromkeys(self._blocks))
+    def spans(self) -> list[Span]:
+        return list(dict.fromkeys(self._spans))
 
 
 class Contents:
-    """What one file holds of one recording.  ``record_block`` says of each row of ``frames`` in which of
-    ``record_blocks`` it lies; ``events`` are decoded records by entity, ``alerting`` the frames' records with alerts,
+    """What one file holds of one recording.  ``record_span`` says of each row of ``frames`` in which of
+    ``record_spans`` it lies; ``events`` are decoded records by entity, ``alerting`` the frames' records with alerts,
     ``places`` those of the images, ``image_seqs`` the frames that have one.
     """
 
@@ -155,15 +154,15 @@ class Contents:
         """Empty; :func:`read_contents` and :func:`read_lines` fill it."""
         self.source, self.store = source, store
         self.frames = TableBuilder()
-        self.record_blocks: list[Block] = []
-        self.record_block: IntArray = np.empty(0, np.int64)
+        self.record_spans: list[Span] = []
+        self.record_span: IntArray = np.empty(0, np.int64)
         self.image_seqs: IntArray = np.empty(0, np.int64)
         self.places = {entity: Places() for entity in ON_DEMAND}
         self.events: dict[str, list[Any]] = {}
         self.alerting: list[FrameRecord] = []
         self.about: tuple[str, str] | None = None
         self.faults: list[str] = []
-        self._rows_block = array("q")
+        self._rows_span = array("q")
         self._images: list[IntArray] = []
         self._texts: dict[str, dict[str, None]] = {entity: {} for entity in _EVENTS}
         self._not_understood: Counter[str] = Counter()
@@ -196,38 +195,36 @@ class Contents:
         return self.meta is not None and self.meta.kind == "spots"
 
     def take_by_manifest(self, file: RrdFile, manifest: Manifest, progress: Callable[[int], None]) -> None:
-        """Only the blocks of what is read at once; of the others their places."""
+        """Only the messages of what is read at once; of the others their places."""
         at: dict[str, list[int]] = {}
         for i, entity in enumerate(manifest.entity):
             at.setdefault(entity, []).append(i)
         for entity, places in self.places.items():
             for i in at.get(entity, ()):
-                place = (Span(int(manifest.offset[i]), int(manifest.size[i])),)
                 if manifest.last[i] >= manifest.first[i] > NO_FRAME:
-                    places.add(place, int(manifest.first[i]), int(manifest.last[i]))
+                    places.add(manifest.span(i), int(manifest.first[i]), int(manifest.last[i]))
         for entity in _AT_ONCE:
-            blocks = _gathered(manifest, at.get(entity, ()))
-            for number, block in enumerate(blocks):
-                self._take(block, file.decode(self.store, block))
+            messages = sorted(at.get(entity, ()), key=lambda i: int(manifest.offset[i]))
+            for number, span in enumerate(map(manifest.span, messages), 1):
+                self._take(span, file.decode(self.store, span))
                 if entity == RECORD:
-                    progress(file.size * (number + 1) // len(blocks))
+                    progress(file.size * number // len(messages))
         images = sum(int(manifest.rows[i]) for i in at.get(IMAGE, ()) if manifest.first[i] >= 0)
         if images != sum(map(len, self._images)):
             self._images.clear()  # written by another version: look at the images themselves
-            for block in self.places[IMAGE].blocks():
-                self._take(block, file.decode(self.store, block), look_at_images=True)
+            for span in self.places[IMAGE].spans():
+                self._take(span, file.decode(self.store, span), look_at_images=True)
 
     def take_everything(self, file: RrdFile, progress: Callable[[int], None]) -> None:
-        """Block by block, as the file stands."""
-        for span in file.blocks():
-            block = (span,)
-            self._take(block, file.decode(self.store, block), look_at_images=True, keep_places=True)
+        """About a megabyte at a time, as the file stands."""
+        for span in file.spans():
+            self._take(span, file.decode(self.store, span), look_at_images=True, keep_places=True)
             progress(span.offset + span.size)
 
     def finish(self) -> Contents:
         """Decode what was gathered, and put into ``faults`` what is wrong with it."""
         self.frames.close()
-        self.record_block = np.array(self._rows_block, np.int64)
+        self.record_span = np.array(self._rows_span, np.int64)
         if self._images:
             self.image_seqs = np.unique(np.concatenate(self._images))
         for name in sorted(self.frames.unknown_names):
@@ -239,16 +236,16 @@ class Contents:
         return self
 
     def _take(
-        self, block: Block, chunks: Sequence[Chunk], look_at_images: bool = False, keep_places: bool = False
+        self, span: Span, chunks: Sequence[Chunk], look_at_images: bool = False, keep_places: bool = False
     ) -> None:
         for chunk in chunks:
             entity = chunk.entity
             if keep_places and entity in self.places:
                 seqs = frame_numbers(chunk.batch)
                 if len(seqs):
-                    self.places[entity].add(block, int(seqs.min()), int(seqs.max()))
+                    self.places[entity].add(span, int(seqs.min()), int(seqs.max()))
             if entity == RECORD:
-                self.take_records(block, texts_of(chunk.batch, "json"))
+                self.take_records(span, texts_of(chunk.batch, "json"))
             elif entity in self._texts:
                 self._texts[entity].update(dict.fromkeys(texts_of(chunk.batch, "json")))
             elif entity == _ABOUT:
@@ -257,11 +254,11 @@ class Contents:
                 component = "EncodedImage:blob" if look_at_images else "Scalars:scalars"
                 self._images.append(_seqs_with(chunk.batch, component))
 
-    def take_records(self, block: Block, texts: Iterable[str | bytes]) -> None:
+    def take_records(self, span: Span, texts: Iterable[str | bytes]) -> None:
         """Frames' records, in order."""
-        if not self.record_blocks or self.record_blocks[-1] != block:
-            self.record_blocks.append(block)
-        number = len(self.record_blocks) - 1
+        if not self.record_spans or self.record_spans[-1] != span:
+            self.record_spans.append(span)
+        number = len(self.record_spans) - 1
         for text in texts:
             try:
                 line = self._decode(text)
@@ -269,7 +266,7 @@ class Contents:
                 self._note(RECORD, str(error))
                 continue
             self.frames.add(line)
-            self._rows_block.append(number)
+            self._rows_span.append(number)
             self._schemas.add(line.schema)
             if line.alerts or not self._checked:
                 self._take_whole_record(text)
@@ -331,21 +328,6 @@ def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], Non
     return contents.finish()
 
 
-def _gathered(manifest: Manifest, messages: Sequence[int]) -> list[Block]:
-    """Messages in the order of the file, about a megabyte at a time."""
-    blocks: list[Block] = []
-    spans: list[Span] = []
-    size = 0
-    for i in sorted(messages, key=lambda i: int(manifest.offset[i])):
-        span = Span(int(manifest.offset[i]), int(manifest.size[i]))
-        if spans and size + span.size > BLOCK_BYTES:
-            blocks.append(tuple(spans))
-            spans, size = [], 0
-        spans.append(span)
-        size += span.size
-    return [*blocks, tuple(spans)] if spans else blocks
-
-
 def frame_numbers(batch: Any) -> IntArray:
     """(rows,) of a batch; empty where it isn't on the timeline of frames, the least number where a row isn't."""
     if FRAME not in batch.schema.names:
@@ -378,16 +360,13 @@ class LineFile:
         if self.size == 0:
             raise UnreadableFileError("is empty")
 
-    def record_texts(self, store: StoreName, block: Block) -> list[bytes]:
-        """The lines of a block."""
-        texts: list[bytes] = []
+    def record_texts(self, store: StoreName, span: Span) -> list[bytes]:
+        """The lines there."""
         with self.path.open("rb") as file:
-            for span in block:
-                file.seek(span.offset)
-                texts += [line for line in file.read(span.size).split(b"\n") if line.strip()]
-        return texts
+            file.seek(span.offset)
+            return [line for line in file.read(span.size).split(b"\n") if line.strip()]
 
-    def decode(self, store: StoreName, block: Block, content: Sequence[str] | None = None) -> list[Chunk]:
+    def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]:
         """Nothing of rerun's."""
         return []
 
@@ -400,7 +379,7 @@ def read_lines(file: LineFile, progress: Callable[[int], None]) -> Contents:
         offset = 0
         while text := lines.readlines(BLOCK_BYTES):
             size = sum(map(len, text))
-            contents.take_records((Span(offset, size),), [line for line in text if line.strip()])
+            contents.take_records(Span(offset, size), [line for line in text if line.strip()])
             offset += size
             progress(offset)
     if not len(contents.frames):

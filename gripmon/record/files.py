@@ -9,7 +9,7 @@ import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -95,15 +95,13 @@ class FileSeries:
     """``name-0001.rrd`` and on.  Frames that arrive while nothing can be written are counted as lost.
 
     All files of a series carry one recording id: a viewer that is given several of them shows one recording.
-    ``extra_sinks`` is called for every file that begins; its rerun sinks get all that the file gets.
     """
 
-    def __init__(self, scene: Scene, extra_sinks: Callable[[], Sequence[Any]] = tuple):
+    def __init__(self, scene: Scene):
         rr.set_strict_mode(True)
         self._scene = scene
         self._layout = layout_file(scene)
         self._settings = settings = scene.settings
-        self._extra_sinks = extra_sinks
         self._directory = Path(scene.directory)
         self._budget = DiskBudget(self._directory, scene.robot, scene.camera, scene.name, settings.budget_bytes)
         self._pins = PinBoard()
@@ -305,7 +303,7 @@ class FileSeries:
         stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._scene.recording_id)
         begun_s = time.monotonic()
         try:
-            stream.set_sinks(rr.FileSink(path), *self._extra_sinks())
+            stream.set_sinks(rr.FileSink(path))
             stream.send_recording_name(self._scene.name)
             stream.log_file_from_contents("layout.rbl", self._layout)
             writer = make_writer(stream, self._scene, number)

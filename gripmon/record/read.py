@@ -253,17 +253,14 @@ class RecordedFrames:
         self._given.close()
 
     def _frames(self) -> Generator[Frame]:
-        shots, given = self._run.shots(), 0
-        shot = next(shots, None)
+        given = 0
         for record in self._run.records(self._seqs):
-            while shot is not None and shot.seq < record.seq:
-                shot = next(shots, None)
-            own = shot if shot is not None and shot.seq == record.seq else None
-            if own is None and not _stands_in(record):
+            shot = self._run.shot(record.seq)
+            if shot is None and not _stands_in(record):
                 continue
-            self.shot, self.record = own, record
+            self.shot, self.record = shot, record
             given += 1
-            yield self._frame(record, own)
+            yield self._frame(record, shot)
         self.passed_over = len(self._seqs) - given
 
     def _frame(self, record: FrameRecord, shot: Shot | None) -> Frame:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gripmon import __version__
 from gripmon.laser.pointer.document import LaserCalibration
 from gripmon.model.camera import Camera, LensSettings
-from gripmon.model.gripper import Gripper
+from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import (
     AlertRecord,
     Frame,
@@ -36,7 +36,6 @@ from gripmon.model.records import (
 )
 
 LOOPBACK = "127.0.0.1"
-_JAW_SAMPLES = 33  # openings at which the fingers are drawn exactly
 
 Trace = Callable[[], MeasurementTrace | None]
 Notes = Callable[[], MonitorNotes]
@@ -190,8 +189,7 @@ class NullRecorder:
 class Scene(msgspec.Struct, frozen=True, kw_only=True):
     """The first message: all that doesn't change while a recording runs.
 
-    ``points_m`` (k, p, 3) are the gripper's points in its own frame at the k openings ``jaw_openings_m``; ``edges`` and
-    ``faces`` index the points.  A second camera has a ``laser`` and neither gripper nor reference.
+    A wrist camera has a gripper and a reference, a second camera a ``laser``.
     """
 
     name: str
@@ -201,13 +199,7 @@ class Scene(msgspec.Struct, frozen=True, kw_only=True):
     robot: str
     camera: str
     lens: LensSettings
-    gripper: str = ""
-    corner_ids: tuple[str, ...] = ()
-    edges: tuple[tuple[int, int], ...] = ()
-    faces: tuple[tuple[int, ...], ...] = ()
-    jaw_nominal_m: float = 0.0
-    jaw_openings_m: tuple[float, ...] = ()
-    points_m: list[list[tuple[float, float, float]]] = []
+    gripper: GripperModel | None = None
     reference: ReferenceRecord | None = None
     laser: LaserCalibration | None = None
     has_truth: bool = False
@@ -236,7 +228,6 @@ def make_scene(
     view: ViewSettings | None = None,
 ) -> Scene:
     """That of a wrist camera."""
-    openings_m = np.linspace(gripper.jaw_min_m, gripper.jaw_max_m, _JAW_SAMPLES) if gripper.has_jaw else np.zeros(1)
     return Scene(
         name=name,
         recording_id=f"{name}-{uuid.uuid4()}",
@@ -245,13 +236,7 @@ def make_scene(
         robot=robot,
         camera=camera_name,
         lens=camera.settings,
-        gripper=gripper.name,
-        corner_ids=gripper.corner_ids,
-        edges=tuple((int(i), int(j)) for i, j in gripper.edge_points),
-        faces=tuple(tuple(int(i) for i in face.points) for face in gripper.faces),
-        jaw_nominal_m=gripper.jaw_nominal_m,
-        jaw_openings_m=tuple(openings_m.tolist()),
-        points_m=[gripper.points_grip_m(opening_m).tolist() for opening_m in openings_m.tolist()],
+        gripper=gripper.model,
         reference=reference,
         has_truth=has_truth,
         configuration=configuration,

@@ -28,12 +28,12 @@ from gripmon.model.records import (
     StateRecord,
 )
 from gripmon.record import contents as entities
-from gripmon.record.container import Block
+from gripmon.record.container import Span
 from gripmon.record.contents import Contents, decoded, frame_numbers
 from gripmon.record.table import FrameTable, IntArray, TableBuilder
 
 UNKNOWN = "unknown"
-_BLOCKS_KEPT = 16
+_SPANS_KEPT = 16
 _NUMBERED = re.compile(r"-(\d{4,9})$")
 Pixels = NDArray[np.float32]
 
@@ -62,8 +62,7 @@ class Picture:
 class Shot:
     """A recorded image as it stands in the file, and what came with the frame.
 
-    ``blob`` are a JPEG's or PNG's bytes; ``jaw_reported_m`` is None where no opening was reported, ``record`` where it
-    is lost.
+    ``blob`` are a JPEG's or PNG's bytes; ``jaw_reported_m`` is None where no opening was reported.
     """
 
     seq: int
@@ -71,7 +70,6 @@ class Shot:
     blob: bytes
     media_type: str
     jaw_reported_m: float | None
-    record: FrameRecord | None
 
 
 class _Row(NamedTuple):
@@ -104,7 +102,7 @@ class Recording:
         empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
         faults += [f"{part.path}: holds no frames" for part in empty]
         faults += _missing_files(parts)
-        self._kept: OrderedDict[tuple[int, Block], dict[str, list[Any]]] = OrderedDict()
+        self._kept: OrderedDict[tuple[int, Span], dict[str, list[Any]]] = OrderedDict()
         self.recording_id: str = parts[0].recording_id
         self.meta: Meta | None = next((part.meta for part in parts if part.meta is not None), None)
         self.files: tuple[Path, ...] = tuple(part.path for part in parts)
@@ -117,9 +115,9 @@ class Recording:
         self.robot, self.camera = _names(parts, self.meta, self.states)
         self.alerts: tuple[AlertRecord, ...] = _alerts(parts, self.robot, self.camera)
         self.image_seqs: IntArray = np.unique(np.concatenate([part.image_seqs for part in parts]))
-        # In which of the blocks (a part's number and a block of its file) each row of ``frames`` lies.
-        self._blocks = [(number, block) for number, part in enumerate(parts) for block in part.record_blocks]
-        self.frames, self._rows_block, repeated = _frames(parts)
+        # In which messages (a part's number and a span of its file) each row of ``frames`` lies.
+        self._spans = [(number, span) for number, part in enumerate(parts) for span in part.record_spans]
+        self.frames, self._rows_span, repeated = _frames(parts)
         faults += repeated
         self.gaps: tuple[str, ...] = self._gaps()
         self.faults: tuple[str, ...] = (*faults, *self.gaps, *self._backwards())
@@ -136,25 +134,25 @@ class Recording:
         rows = np.arange(len(self.frames))
         if seqs is not None:
             rows = np.flatnonzero(np.isin(self.frames.seq, seqs))
-        breaks = np.flatnonzero(np.diff(self._rows_block[rows])) + 1
+        breaks = np.flatnonzero(np.diff(self._rows_span[rows])) + 1
         for run in np.split(rows, breaks) if len(rows) else []:
             wanted = self.frames.seq[run].tolist()
-            part, block = self._blocks[int(self._rows_block[run[0]])]
-            found = self._records_of(part, block, set(wanted))
+            part, span = self._spans[int(self._rows_span[run[0]])]
+            found = self._records_of(part, span, set(wanted))
             yield from (found[seq] for seq in wanted if seq in found)
 
     def picture(self, seq: int) -> Picture | None:
         """The image of a frame with its overlay; None where there is none, it is damaged, or its file is gone."""
-        found = self._row(entities.IMAGE, seq)
-        image = None if found is None else decode_image(_blob(found))
-        if found is None or image is None:
+        shot = self.shot(seq)
+        image = None if shot is None else decode_image(shot.blob)
+        if shot is None or image is None:
             return None
         record = next(self.records(np.array([seq])), None)
         return Picture(
             seq=seq,
-            stamp_ns=_stamp_ns(found),
+            stamp_ns=shot.stamp_ns,
             image=image,
-            media_type=_media_type(found),
+            media_type=shot.media_type,
             edges_used=self._points(entities.EDGES_USED, seq),
             edges_refused=self._points(entities.EDGES_REFUSED, seq),
             predicted_edges=self._strips(entities.PREDICTED_EDGES, seq),
@@ -162,24 +160,12 @@ class Recording:
             corners=() if record is None else record.corners,
         )
 
-    def shots(self) -> Iterator[Shot]:
-        """All recorded images in the order of their frames' numbers, none of them kept in memory."""
-        records = self.records(self.image_seqs)
-        record = next(records, None)
-        for seq in self.image_seqs.tolist():
-            while record is not None and record.seq < seq:
-                record = next(records, None)
-            row = self._row(entities.IMAGE, seq)
-            if row is None:
-                continue
-            yield Shot(
-                seq=seq,
-                stamp_ns=_stamp_ns(row),
-                blob=_blob(row),
-                media_type=_media_type(row),
-                jaw_reported_m=self.jaw_reported_m(seq),
-                record=record if record is not None and record.seq == seq else None,
-            )
+    def shot(self, seq: int) -> Shot | None:
+        """The recorded image of a frame; None where there is none, or its file is gone."""
+        row = self._row(entities.IMAGE, seq)
+        if row is None:
+            return None
+        return Shot(seq, _stamp_ns(row), _blob(row), _media_type(row), self.jaw_reported_m(seq))
 
     def jaw_reported_m(self, seq: int) -> float | None:
         """The opening that was reported with a frame; None where there was none."""
@@ -210,12 +196,12 @@ class Recording:
         return (f"{self._file_of(row)}: {back}; frames were taken in the order of their numbers",)
 
     def _file_of(self, row: int) -> Path:
-        return self._parts[self._blocks[self._rows_block[row]][0]].path
+        return self._parts[self._spans[self._rows_span[row]][0]].path
 
-    def _records_of(self, part: int, block: Block, wanted: set[int]) -> dict[int, FrameRecord]:
+    def _records_of(self, part: int, span: Span, wanted: set[int]) -> dict[int, FrameRecord]:
         contents = self._parts[part]
         try:
-            texts = contents.source.record_texts(contents.store, block)
+            texts = contents.source.record_texts(contents.store, span)
         except OSError:
             return {}
         found: dict[int, FrameRecord] = {}
@@ -231,28 +217,28 @@ class Recording:
     def _row(self, entity: str, seq: int) -> _Row | None:
         """The row of a frame in an entity; in the first file that has it."""
         for number, contents in enumerate(self._parts):
-            for block in contents.places[entity].find(seq) if entity in contents.places else ():
-                for batch in self._batches(number, block).get(entity, ()):
+            for span in contents.places[entity].find(seq) if entity in contents.places else ():
+                for batch in self._batches(number, span).get(entity, ()):
                     rows = np.flatnonzero(frame_numbers(batch) == seq)
                     if len(rows):
                         return _Row(batch, int(rows[0]))
         return None
 
-    def _batches(self, part: int, block: Block) -> dict[str, list[Any]]:
-        """A block's rows by entity; those that were used last are kept."""
-        key = part, block
+    def _batches(self, part: int, span: Span) -> dict[str, list[Any]]:
+        """A message's rows by entity; those that were used last are kept."""
+        key = part, span
         if key not in self._kept:
             contents = self._parts[part]
             found: dict[str, list[Any]] = {}
             try:
-                chunks = contents.source.decode(contents.store, block, entities.ON_DEMAND)
+                chunks = contents.source.decode(contents.store, span, entities.ON_DEMAND)
             except OSError:
                 chunks = []
             for chunk in chunks:
                 if not chunk.is_static:
                     found.setdefault(chunk.entity, []).append(chunk.batch)
             self._kept[key] = found
-            if len(self._kept) > _BLOCKS_KEPT:
+            if len(self._kept) > _SPANS_KEPT:
                 self._kept.popitem(last=False)
         self._kept.move_to_end(key)
         return self._kept[key]
@@ -370,19 +356,19 @@ def _alerts(parts: Sequence[Contents], robot: str, camera: str) -> tuple[AlertRe
 
 def _frames(parts: Sequence[Contents]) -> tuple[FrameTable, IntArray, list[str]]:
     """All parts' frames in the order of their numbers, each once; the first file's where several have it.  With the
-    block of all parts' that each lies in, and what was left out.
+    span of all parts' that each lies in, and what was left out.
     """
-    counts = [len(part.record_blocks) for part in parts]
+    counts = [len(part.record_spans) for part in parts]
     begins = np.cumsum([0, *counts[:-1]])
-    rows_block = np.concatenate([part.record_block + begin for part, begin in zip(parts, begins, strict=True)])
+    rows_span = np.concatenate([part.record_span + begin for part, begin in zip(parts, begins, strict=True)])
     table = TableBuilder.join([part.frames for part in parts])
     if np.all(np.diff(table.seq) > 0):
-        return table, rows_block, []
+        return table, rows_span, []
     order = np.argsort(table.seq, kind="stable")
     again = np.concatenate([[False], np.diff(table.seq[order]) == 0])
-    repeated = _repeated(parts, table, order, again, np.repeat(np.arange(len(parts)), counts)[rows_block])
+    repeated = _repeated(parts, table, order, again, np.repeat(np.arange(len(parts)), counts)[rows_span])
     kept = order[~again]
-    return table.take(kept), rows_block[kept], repeated
+    return table.take(kept), rows_span[kept], repeated
 
 
 def _repeated(

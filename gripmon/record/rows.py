@@ -43,6 +43,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -67,11 +68,14 @@ class RowWriter:
     def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int):
         self._send = Sender(stream)
         self._events = EventWriter(self._send)
-        self._curves = CurveWriter(self._send, scene)
-        self._overlay = OverlayWriter(self._send, scene)
-        self._rig = RigWriter(self._send, scene)
+        assert scene.gripper is not None, "a wrist camera's"
+        gripper = Gripper(scene.gripper)
+        self.corner_ids = gripper.corner_ids
+        self._curves = CurveWriter(self._send, gripper.corner_ids)
+        self._overlay = OverlayWriter(self._send, gripper.corner_ids, scene.lens.height_px)
+        self._rig = RigWriter(self._send, scene, gripper)
         self._references: list[ReferenceRecord] = []
-        self._send.static("about", rr.TextDocument(_about(scene), media_type="text/markdown"))
+        self._send.static("about", rr.TextDocument(_about(scene, gripper.name), media_type="text/markdown"))
         log_origin(self._send, scene, file_number)
 
     def write(self, rows: Sequence[Row], events: Events) -> None:
@@ -122,10 +126,10 @@ def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
     return next((r for r in records if (r.reference_id, r.revision) == key), records[0])
 
 
-def _about(scene: Scene) -> str:
+def _about(scene: Scene, gripper: str) -> str:
     lens = scene.lens
     return (
-        f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, gripper `{scene.gripper}`, "
+        f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, gripper `{gripper}`, "
         f"{lens.width_px} x {lens.height_px} px\n\nLens: `{to_json(lens).decode()}`\n\n"
         "Image: predicted edges blue, edge points green where the fit believed them and red where not, measured "
         "corners yellow.  Plot: motion of the TCP in the camera frame against the reference; thin lines are one "
@@ -136,14 +140,13 @@ def _about(scene: Scene) -> str:
 class CurveWriter:
     """Writes everything that is a number over time, with the limits that it is judged by, in people's units."""
 
-    def __init__(self, send: Sender, scene: Scene):
+    def __init__(self, send: Sender, corner_ids: tuple[str, ...]):
         self._send = send
-        self._corner_ids = scene.corner_ids
         self._reference_tcp_m: dict[tuple[str, int], tuple[float, float, float]] = {}
         self._open: dict[str, tuple[AlertKind, Severity]] = {}  # of the alerts that are open
         self._newest: Row | None = None
         self._drawn_ns: int | None = None
-        _log_styles(send, scene)
+        _log_styles(send, corner_ids)
 
     def add_reference(self, reference: ReferenceRecord) -> None:
         """What drifts are measured from."""
@@ -293,7 +296,7 @@ class CurveWriter:
             send.scalars("quality/edge_points", traced, counts)
 
 
-def _log_styles(send: Sender, scene: Scene) -> None:
+def _log_styles(send: Sender, corner_ids: tuple[str, ...]) -> None:
     """Names, colours and widths of the curves."""
     axes, lines = list(Palette.AXES), send.lines
     pale, paler = ([faded(colour, alpha) for colour in axes] for alpha in (130, 90))
@@ -324,7 +327,7 @@ def _log_styles(send: Sender, scene: Scene) -> None:
         lines(f"noise/{name}", _XYZ, axes, 1.5)
     send.static("noise/average_share", rr.SeriesLines(names=[*_XYZ, *(f"about {axis}" for axis in _XYZ)]))
     lines("residual/rms_px", ["corners, rms", "edge points, rms"], [Palette.CORNER_USED, Palette.EDGE_USED], 1.5)
-    send.static("residual/corners_px", rr.SeriesLines(names=list(scene.corner_ids)))
+    send.static("residual/corners_px", rr.SeriesLines(names=list(corner_ids)))
     lines("quality/edge_points", ["edge points used", "refused"], [Palette.EDGE_USED, Palette.EDGE_REFUSED], 1.5)
     lines("quality/corners_used", "corners used", Palette.CORNER_USED, 1.5)
 

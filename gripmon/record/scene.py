@@ -11,6 +11,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
+from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, FrameRecord, ReferenceRecord, Transform, Verdict
 from gripmon.record.columns import APPLICATION_ID, AXIS, Palette, Row, Sender, image_view, log_view, plot, two_columns
 from gripmon.record.recorder import Scene, TraceNote, pairs
@@ -41,10 +42,9 @@ class _Corner(NamedTuple):
 class OverlayWriter:
     """Image, predicted edges, edge points and corners, all of the same frame: the overlay fits the image it lies on."""
 
-    def __init__(self, send: Sender, scene: Scene):
-        self._send = send
-        self._corner_ids = scene.corner_ids
-        self._label_px = _LABEL_HEIGHT_FRACTION * scene.lens.height_px
+    def __init__(self, send: Sender, corner_ids: tuple[str, ...], height_px: int):
+        self._send, self._corner_ids = send, corner_ids
+        self._label_px = _LABEL_HEIGHT_FRACTION * height_px
         static = send.static
         static(f"{IMAGE}/edges/predicted", rr.LineStrips2D.from_fields(colors=Palette.PREDICTED, radii=_LINE_PX))
         for name, colour, radius_px in (
@@ -156,13 +156,9 @@ def _predicted_corners(trace: TraceNote | None) -> _Pixels:
 class RigWriter:
     """The fingers as solids at the newest estimate, the reference as a wire frame, the TCP's shift as an arrow."""
 
-    def __init__(self, send: Sender, scene: Scene):
-        self._send = send
-        self._openings_m = np.array(scene.jaw_openings_m)
-        self._points_m = np.array(scene.points_m, dtype=float)
-        self._nominal_m = scene.jaw_nominal_m
-        self._edges = np.array(scene.edges, dtype=np.intp).reshape(-1, 2)
-        self._triangles, self._face_points = _triangulate(scene.faces)
+    def __init__(self, send: Sender, scene: Scene, gripper: Gripper):
+        self._send, self._gripper = send, gripper
+        self._triangles, self._face_points = _triangulate(gripper)
         self._drawn: tuple[float, Verdict] | None = None
         lens, distance_m = scene.lens, float(np.linalg.norm(scene.tcp_m))
         send.static("rig", rr.ViewCoordinates.RDF)
@@ -216,26 +212,27 @@ class RigWriter:
         return True
 
     def _look(self, record: FrameRecord) -> tuple[float, Verdict]:
-        opening_m = self._nominal_m if record.jaw_opening_m is None else record.jaw_opening_m
+        opening_m = self._gripper.jaw_nominal_m if record.jaw_opening_m is None else record.jaw_opening_m
         return opening_m, record.verdict if record.cam_T_grip is not None else Verdict.UNKNOWN
 
     def _write_fingers(self, rows: Sequence[Row]) -> None:
         """The fingers as they are and, white, at the reference; without estimate there is only that."""
+        edges_of = self._gripper.edge_points
         looks = [self._look(row.record) for row in rows]
         points_m = [self._points_at(opening_m) for opening_m, _ in looks]
         posed = [row.record.cam_T_grip is not None for row in rows]
-        counts = [len(self._edges) * shown for shown in posed]
+        counts = [len(edges_of) * shown for shown in posed]
         edges = rr.LineStrips3D.columns(
-            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[self._edges]],
+            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[edges_of]],
             colors=[Palette.VERDICTS[v] for (_, v), n in zip(looks, counts, strict=True) for _ in range(n)],
             radii=[_LINE_M] * sum(counts),
         )
         self._send.frames("rig/gripper/edges", rows, edges.partition(counts))
-        ghosts = [strip for some in points_m for strip in some[self._edges]]
+        ghosts = [strip for some in points_m for strip in some[edges_of]]
         wires = rr.LineStrips3D.columns(
             strips=ghosts, colors=[Palette.REFERENCE] * len(ghosts), radii=[0.7 * _LINE_M] * len(ghosts)
         )
-        self._send.frames("rig/reference/edges", rows, wires.partition([len(self._edges)] * len(rows)))
+        self._send.frames("rig/reference/edges", rows, wires.partition([len(edges_of)] * len(rows)))
         if len(self._triangles):
             solids = [
                 some[self._face_points] if shown else _NO_POINTS for some, shown in zip(points_m, posed, strict=True)
@@ -258,12 +255,8 @@ class RigWriter:
 
     def _points_at(self, opening_m: float) -> Array:
         """(p, 3) in the gripper frame; a picture, so an opening outside the jaw's range shows the end of it."""
-        if len(self._openings_m) == 1:
-            return self._points_m[0]
-        position = float(np.interp(opening_m, self._openings_m, np.arange(len(self._openings_m))))
-        low = min(int(position), len(self._openings_m) - 2)
-        share = position - low
-        return (1.0 - share) * self._points_m[low] + share * self._points_m[low + 1]
+        gripper = self._gripper
+        return gripper.points_grip_m(min(max(opening_m, gripper.jaw_min_m), gripper.jaw_max_m))
 
 
 def _poses(poses: Sequence[Transform]) -> rr.ComponentColumnList:
@@ -279,14 +272,14 @@ def _arrow(record: FrameRecord) -> tuple[Array, Array] | None:
     return np.array(record.cam_T_grip.translation_m) - shift_m, shift_m
 
 
-def _triangulate(faces: Sequence[tuple[int, ...]]) -> tuple[np.ndarray, np.ndarray]:
+def _triangulate(gripper: Gripper) -> tuple[np.ndarray, np.ndarray]:
     """Triangles (t, 3) into a vertex list that repeats the points for each face, and that list's points (v,)."""
     triangles: list[tuple[int, int, int]] = []
     points: list[int] = []
-    for face in faces:
+    for face in gripper.faces:
         first = len(points)
-        points += face
-        triangles += [(first, first + i, first + i + 1) for i in range(1, len(face) - 1)]
+        points += face.points.tolist()
+        triangles += [(first, first + i, first + i + 1) for i in range(1, len(face.points) - 1)]
     return np.array(triangles, np.uint32).reshape(-1, 3), np.array(points, np.intp)
 
 

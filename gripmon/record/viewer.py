@@ -7,7 +7,6 @@ from __future__ import annotations
 import functools
 import http.server
 import importlib.util
-import logging
 import os
 import socket
 import subprocess
@@ -16,16 +15,14 @@ import threading
 import time
 import urllib.parse
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from gripmon.record.recorder import LOOPBACK
 
-_log = logging.getLogger(__name__)
 _START_S = 20.0
 _STOP_S = 5.0
-_PIECE_BYTES = 1 << 20
 # The kernel ends the viewer with its parent, however that ends; parent gone before: not even started.
 _TIED = (
     "import ctypes, os, signal, sys; ctypes.CDLL(None).prctl(1, signal.SIGKILL); "
@@ -157,41 +154,26 @@ def serve_files(files: Sequence[Path], web_port: int) -> Iterator[WebPage]:
         yield page
 
 
-class _Files(http.server.BaseHTTPRequestHandler):
+class _Files(http.server.SimpleHTTPRequestHandler):
     """These files and nothing else, to the page that was opened for them."""
 
     def __init__(self, named: dict[str, Path], origin: str, *details: Any) -> None:
         self._named, self._origin = named, origin
         super().__init__(*details)
 
-    def do_GET(self) -> None:
-        """A file as it is on the disk now."""
-        self._send(with_content=True)
+    def translate_path(self, path: str) -> str:
+        """The file; empty, which is not found, for any other path."""
+        return str(self._named.get(path, ""))
 
-    def do_HEAD(self) -> None:
-        """How long a file is."""
-        self._send(with_content=False)
+    def end_headers(self) -> None:
+        """With the leave to be read by the page."""
+        self.send_header("Access-Control-Allow-Origin", self._origin)
+        super().end_headers()
 
-    def _send(self, *, with_content: bool) -> None:
-        path = self._named.get(self.path)
-        if path is None or not path.exists():
-            self.send_error(404)
-            return
-        try:
-            with path.open("rb") as file:
-                left = os.fstat(file.fileno()).st_size
-                self.send_response(200)
-                self.send_header("Content-Type", "application/octet-stream")
-                self.send_header("Content-Length", str(left))
-                self.send_header("Access-Control-Allow-Origin", self._origin)
-                self.end_headers()
-                while with_content and left > 0 and (piece := file.read(min(_PIECE_BYTES, left))):
-                    self.wfile.write(piece)
-                    left -= len(piece)
-        except (BrokenPipeError, ConnectionResetError):
-            pass  # the page was closed
-        except OSError as error:
-            _log.warning("view: %s: can't be read (%s)", path, error.strerror)
+    def copyfile(self, source: Any, outputfile: Any) -> None:
+        """Until the page is closed, perhaps."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            super().copyfile(source, outputfile)
 
     def log_message(self, format: str, *values: Any) -> None:
         """Log nothing."""
