@@ -34,7 +34,7 @@ _log = logging.getLogger(__name__)
 SILENT_AFTER_S = 5.0
 """A monitor sends its state once a second; one that hasn't for so long, though its session stands, hangs."""
 MONITORS_KEPT = 50_000
-"""More names than this are not kept, so that whoever writes to the network can't fill the memory."""
+"""More names than this are not kept, so that no writer on the network can fill the memory."""
 _STARTS_KEPT = 16  # of one name: two are too many already
 _RATE_TRANSFORMS = 64  # over which the rate is measured
 _ALERTS_KEPT = 64  # of each monitor: twice what its publisher repeats to subscribers that come late
@@ -130,8 +130,8 @@ class _Known:
 class Fleet(Listener):
     """Listens to every monitor's state and liveliness token, and to more if asked to.  Any thread may ask.
 
-    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  What a
-    monitor that vanished said last is kept.
+    State messages come once a second whatever the cameras do, so that this works for thousands of robots.  The
+    last message of a monitor that vanished is kept.
     """
 
     def __init__(
@@ -212,7 +212,7 @@ class Fleet(Listener):
                 return
             if token.kind == zenoh.SampleKind.DELETE:
                 known.starts.pop(start.monitor_id, None)
-                if known.starts:  # what is left of several is not what the other one said
+                if known.starts:  # of several, the ones left sent something else
                     known.state, known.heard_s = next(reversed(known.starts.values()))
             elif len(known.starts) < _STARTS_KEPT:
                 state = known.state if known.state and known.state.monitor_id == start.monitor_id else None
@@ -227,7 +227,7 @@ class Fleet(Listener):
             known.present = not known.present
             known.gone_since_ns = None if known.present else time.time_ns()
             if known.present:
-                known.state, known.heard_s = None, now_s  # what it said before its end says nothing of now
+                known.state, known.heard_s = None, now_s  # a message from before its end says nothing of now
                 known.transforms_s.clear()
             status = _status(name, known, now_s)
         if self._on_presence is not None:

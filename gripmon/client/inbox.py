@@ -100,7 +100,7 @@ def _waited_ns(leads: Leads, sent: Sent) -> int | None:
 
 
 def transform_message(payload: bytes) -> FrameRecord:
-    """Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose, whoever sent it."""
+    """Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose."""
     record = from_json(payload, FrameRecord)
     for pose in (record.cam_T_grip, record.smoothed):
         if pose is not None and not _is_pose(pose):
@@ -198,7 +198,7 @@ class Inbox:
             self._hand_over(entry)
 
     def answered(self, answer: ClockReading, asked_ns: int, answered_ns: int) -> None:
-        """A monitor said what its clock shows; both times by our steady clock."""
+        """A monitor answered what its clock shows; both times by our steady clock."""
         with self._lock:
             self._set(leads=with_answer(self.heard.leads, answer, asked_ns, answered_ns))
             held, self._held = self._held, None

@@ -184,7 +184,7 @@ def _age_s(heard: Heard, entry: Entry, policy: Policy, now_s: float, wall_ns: in
 
 
 def _cut_off(heard: Heard, entry: Entry | None, now_s: float) -> _Refusal | None:
-    """Is it unclear whether the monitor, and which one, still stands by what it said?"""
+    """Is it unclear whether the monitor, and which one, still stands by its last message?"""
     if heard.closed:
         return Unusable.CLOSED, "the client is closed"
     if text := several(heard, now_s):
@@ -215,13 +215,13 @@ def _silence(heard: Heard, fault: Callable[[], str]) -> _Refusal:
 
 
 def _holds_no_longer(heard: Heard, entry: Entry, age_s: float, policy: Policy, wall_ns: int) -> _Refusal | None:
-    """Is the transform unknown, too old, or of an age that can't be told?"""
+    """Is the transform unknown, too old, or of unknown age?"""
     record = entry.record
     if record.verdict is Verdict.UNKNOWN:
         return Unusable.UNKNOWN, f"the monitor has no transform: {record.reason or record.state}"
     ahead_s = 1e-9 * (record.stamp_ns - wall_ns)
     if policy.clocks_agree and ahead_s > CLOCK_AHEAD_LIMIT_S:
-        # With clocks that agree there is no such thing: one of them is wrong, and no age can be told by them.
+        # With clocks that agree there is no such thing: one of them is wrong, and they give no age.
         text = f"the transform's stamp is {ahead_s:.3g} s ahead of this machine's clock: clocks_agree does not hold"
         return Unusable.CLOCKS, text
     if age_s == math.inf:

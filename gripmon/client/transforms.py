@@ -58,7 +58,7 @@ class TransformClient(Listener):
         ``connect`` are the monitor's or a router's endpoints; ``zenoh_config_file`` is a file of Zenoh's instead.
         ``depth`` is how many readings wait for each iterator or callback that is slower than the camera: 1 gives it
         always the newest.  Raises ValueError for a name that can't be part of a key or a ``depth`` below 1, and
-        :class:`gripmon.io.wire.PublishError` for a bad configuration; that nobody answers is no error.
+        :class:`gripmon.io.wire.PublishError` for a bad configuration; to get no answer is not an error.
         """
         if depth < 1:
             raise ValueError(f"depth is {depth}; give 1 or more")

@@ -205,8 +205,8 @@ class RrdFile:
 
     def _distrust_footer(self, error: Exception) -> None:
         self.has_footer = False
-        said = " ".join(str(error).split()) or type(error).__name__
-        self.faults.append(f"has a footer that can't be used ({said}); its messages were read one by one")
+        reason = " ".join(str(error).split()) or type(error).__name__
+        self.faults.append(f"has a footer that can't be used ({reason}); its messages were read one by one")
 
     def _note_where_it_ends(self, offset: int, damaged: bool) -> None:
         if damaged:

@@ -49,7 +49,7 @@ class Trigger:
     """Which alerts are worth the images around them, and files that nothing deletes: warnings and errors, when they
     are raised or become worse.
 
-    Not those about the recording itself: they tell nothing about the camera, and a full budget must not pin more.
+    Not those about the recording itself: they are not about the camera, and a full budget must not pin more.
     """
 
     def __init__(self) -> None:

@@ -89,7 +89,7 @@ class Recording:
     ``frames`` has no number twice.  ``meta`` is None for files that are older than it; ``robot`` and ``camera`` are
     ``unknown`` where the files don't say.  ``alerts`` are those of the frames' records and the daemon's own.
     ``faults`` are one line each: what is wrong, in which file, and what was used; ``file_faults`` those of them that a
-    file has by itself, whether the others of its run are there or not, ``gaps`` those that tell of frames whose numbers
+    file has by itself, whether the others of its run are there or not, ``gaps`` those about frames whose numbers
     are missing.
     """
 

@@ -5,9 +5,9 @@ Timelines: ``capture_time`` (the pulse's ``stamp_ns``) and ``frame`` (``seq`` of
 
 ==============================  ====================================================================================
 ``base``                        the robot's base, metres;  ``plane``, ``camera`` and its ``image`` as calibrated
-``base/camera/image/spot``      where the spot was seen;  ``foreseen`` by the calibration, ``off`` from that to this
+``base/camera/image/spot``      where the spot was seen;  ``foreseen`` where predicted, ``off`` from that to this
 ``base/ee``, ``base/beam``      the end-effector, and the beam from its laser to where the calibration has the spot
-``off/px``, ``off/sigma_px``    the spot less where it was foreseen (u, v), and the band of one standard deviation
+``off/px``, ``off/sigma_px``    the spot less the prediction (u, v), and the band of one standard deviation
 ``gaps/mm``, ``sigma_mm``       how far the three ways to the spot disagree, one curve a pair
 ``test/square``                 normalised square of ``off``;  ``moved``: probability that anything has moved
 ``shift/mm``, ``mrad``          of the camera, base axes
@@ -52,7 +52,7 @@ IMAGE = "base/camera/image"
 _USED, _LEFT_OUT, _BEAM, _PLANE = (40, 120, 230, 255), (230, 60, 60, 255), (235, 90, 90, 255), (90, 180, 120, 90)
 _AXIS_M = 0.1
 _PLANE_SIDE_FRACTION = 0.4  # half a side of the plane that is drawn, of its distance
-_PLANE_MARGIN, _PLANE_LEAST_M = 1.3, 0.01  # half a side: so much more than the spots need, and at least that
+_PLANE_MARGIN, _PLANE_LEAST_M = 1.3, 0.01  # half a side: this much more than the spots need, and at least
 _SPOT_PX = 2.5
 _UV, _XYZ = ["u", "v"], ["x", "y", "z"]
 _GAPS: tuple[Colour, ...] = (Palette.BUSY, Palette.DOUBTFUL, Palette.REPAIR, Palette.GOOD)
