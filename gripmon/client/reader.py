@@ -123,8 +123,7 @@ class Client(Listener):
 
     def alive(self, timeout_s: float = 1.0) -> tuple[MonitorName, ...]:
         """The monitors of this name that run now, in order; all on the network for ``Client("*")``."""
-        replies = self._session.liveliness().get(self.keys["alive"], timeout=timeout_s)
-        return tuple(sorted({monitor_name(reply.ok.key_expr) for reply in replies if reply.ok is not None}))
+        return tuple(sorted(map(monitor_name, self._tokens(self.keys["alive"], timeout_s))))
 
     def send(
         self,
@@ -142,13 +141,14 @@ class Client(Listener):
         :class:`Ambiguous` if the name is that of more than one monitor; ValueError for a request that can't be one.
         ``monitor_id`` names the start of the monitor that is meant; without it there must be one.
         """
-        return self._ask(CommandRequest(argument, _or_new(request_id), monitor_id), name, timeout_s)[0]
+        new_id = uuid.uuid4().hex if request_id is None else request_id
+        return self._ask(CommandRequest(argument, new_id, monitor_id), name, timeout_s)[0]
 
     def snapshot(self, timeout_s: float = 5.0, *, monitor_id: str = "") -> tuple[CommandReply, bytes | None]:
         """The monitor's state and newest frame, and a file of its image, as ``reply.snapshot.image`` says; None if it
         has none.  Raises as :meth:`send`.
         """
-        return self._ask(CommandRequest("", _or_new(None), monitor_id), CommandName.SNAPSHOT, timeout_s)
+        return self._ask(CommandRequest("", uuid.uuid4().hex, monitor_id), CommandName.SNAPSHOT, timeout_s)
 
     def close(self) -> None:
         """Leave the network; iterations and callbacks end.
@@ -217,8 +217,7 @@ class Client(Listener):
 
     def _only_start(self, monitor: MonitorName, monitor_id: str) -> Start:
         """The one start of it that is meant; one without an id where none shows any."""
-        replies = self._session.liveliness().get(Keys(*monitor)["alive/*"], timeout=1.0)
-        starts = sorted({start_of(reply.ok.key_expr) for reply in replies if reply.ok is not None})
+        starts = sorted(map(start_of, self._tokens(Keys(*monitor)["alive/*"])))
         names = ", ".join(start.monitor_id for start in starts)
         if monitor_id:
             if starts and Start(monitor, monitor_id) not in starts:
@@ -234,9 +233,13 @@ class Client(Listener):
         """Who is there instead of the monitor that is meant."""
         if not any(True for _ in self._session.info.links()):
             return f"there is no connection to {self._where}"
-        replies = self._session.liveliness().get(Keys("*", "*")["alive"], timeout=1.0)
-        names = sorted({str(monitor_name(reply.ok.key_expr)) for reply in replies if reply.ok is not None})
+        names = sorted(str(monitor_name(key)) for key in self._tokens(Keys("*", "*")["alive"]))
         return f"there are {', '.join(names)}" if names else f"none at all at {self._where}"
+
+    def _tokens(self, key: str, timeout_s: float = 1.0) -> set[str]:
+        """The liveliness tokens that are there."""
+        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
     def _check_name(self, key: zenoh.KeyExpr) -> None:
         name = monitor_name(key)
@@ -246,10 +249,6 @@ class Client(Listener):
             raise LookupError(
                 f"{self.keys.robot}/{self.keys.camera} is more than one monitor: {self._heard}, {name}; name the one"
             )
-
-
-def _or_new(request_id: str | None) -> str:
-    return uuid.uuid4().hex if request_id is None else request_id
 
 
 def _is_of_another(reply: zenoh.Reply) -> bool:

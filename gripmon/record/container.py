@@ -63,10 +63,6 @@ class Chunk(NamedTuple):
     entity: str
     batch: Any
 
-    @property
-    def is_static(self) -> bool:
-        return FRAME not in self.batch.schema.names
-
 
 @dataclass(frozen=True, slots=True)
 class Manifest:

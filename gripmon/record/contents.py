@@ -9,7 +9,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -111,17 +111,6 @@ def decoded(text: str | bytes, kind: type[_T]) -> tuple[_T, str]:
     return record, f"is {written}, this version reads {schema}" if written != schema else reason
 
 
-class Source(Protocol):
-    """A file that records can be read from once more."""
-
-    path: Path
-    faults: list[str]
-    damaged: int
-
-    def record_texts(self, store: StoreName, span: Span) -> list[str] | list[bytes]: ...
-    def decode(self, store: StoreName, span: Span, content: Sequence[str] | None = None) -> list[Chunk]: ...
-
-
 class Places:
     """Where an entity's rows lie: messages with the range of their frames' numbers."""
 
@@ -150,7 +139,7 @@ class Contents:
     ``places`` those of the images, ``image_seqs`` the frames that have one.
     """
 
-    def __init__(self, source: Source, store: StoreName) -> None:
+    def __init__(self, source: RrdFile | LineFile, store: StoreName) -> None:
         """Empty; :func:`read_contents` and :func:`read_lines` fill it."""
         self.source, self.store = source, store
         self.frames = TableBuilder()

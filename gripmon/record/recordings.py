@@ -4,8 +4,9 @@ contradictory.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import re
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
@@ -76,11 +77,14 @@ class _Row(NamedTuple):
     batch: Any
     number: int
 
+    def scalar(self, component: str) -> Any:
+        """Arrow's value; None where the component is missing."""
+        return self.batch.column(component)[self.number] if component in self.batch.schema.names else None
+
     def value(self, component: str) -> Any:
-        """None where the component is missing or empty in this row."""
-        if component not in self.batch.schema.names:
-            return None
-        return self.batch.column(component)[self.number]
+        """The same as Python's; None where the component is missing or empty in this row."""
+        found = self.scalar(component)
+        return None if found is None else found.as_py()
 
 
 class Recording:
@@ -102,7 +106,7 @@ class Recording:
         empty = [part for part in parts if not len(part.frames) and (part is not parts[-1] or len(parts) == 1)]
         faults += [f"{part.path}: holds no frames" for part in empty]
         faults += _missing_files(parts)
-        self._kept: OrderedDict[tuple[int, Span], dict[str, list[Any]]] = OrderedDict()
+        self._batches = functools.lru_cache(_SPANS_KEPT)(functools.partial(_batches, parts))
         self.recording_id: str = parts[0].recording_id
         self.meta: Meta | None = next((part.meta for part in parts if part.meta is not None), None)
         self.files: tuple[Path, ...] = tuple(part.path for part in parts)
@@ -165,13 +169,14 @@ class Recording:
         row = self._row(entities.IMAGE, seq)
         if row is None:
             return None
-        return Shot(seq, _stamp_ns(row), _blob(row), _media_type(row), self.jaw_reported_m(seq))
+        stamp, kinds = row.scalar("capture_time"), row.value("EncodedImage:media_type")
+        stamp_ns = 0 if stamp is None else stamp.value or 0
+        return Shot(seq, stamp_ns, _blob(row), kinds[0] if kinds else "", self.jaw_reported_m(seq))
 
     def jaw_reported_m(self, seq: int) -> float | None:
         """The opening that was reported with a frame; None where there was none."""
         row = self._row(entities.JAW_REPORTED, seq)
-        value = None if row is None else row.value("Scalars:scalars")
-        openings_m = None if value is None else value.as_py()
+        openings_m = None if row is None else row.value("Scalars:scalars")
         return openings_m[0] if openings_m else None
 
     def _gaps(self) -> tuple[str, ...]:
@@ -224,34 +229,24 @@ class Recording:
                         return _Row(batch, int(rows[0]))
         return None
 
-    def _batches(self, part: int, span: Span) -> dict[str, list[Any]]:
-        """A message's rows by entity; those that were used last are kept."""
-        key = part, span
-        if key not in self._kept:
-            contents = self._parts[part]
-            found: dict[str, list[Any]] = {}
-            try:
-                chunks = contents.source.decode(contents.store, span, entities.ON_DEMAND)
-            except OSError:
-                chunks = []
-            for chunk in chunks:
-                if not chunk.is_static:
-                    found.setdefault(chunk.entity, []).append(chunk.batch)
-            self._kept[key] = found
-            if len(self._kept) > _SPANS_KEPT:
-                self._kept.popitem(last=False)
-        self._kept.move_to_end(key)
-        return self._kept[key]
-
     def _points(self, entity: str, seq: int) -> Pixels:
         row = self._row(entity, seq)
         points = None if row is None else row.value("Points2D:positions")
-        return np.array([] if points is None else points.as_py() or [], np.float32).reshape(-1, 2)
+        return np.array(points or [], np.float32).reshape(-1, 2)
 
     def _strips(self, entity: str, seq: int) -> tuple[Pixels, ...]:
         row = self._row(entity, seq)
         strips = None if row is None else row.value("LineStrips2D:strips")
-        return tuple(np.array(s, np.float32).reshape(-1, 2) for s in (strips.as_py() or ()) if s) if strips else ()
+        return tuple(np.array(strip, np.float32).reshape(-1, 2) for strip in strips or () if strip)
+
+
+def _batches(parts: Sequence[Contents], part: int, span: Span) -> dict[str, list[Any]]:
+    """A message's rows by entity."""
+    found: dict[str, list[Any]] = {}
+    with contextlib.suppress(OSError):
+        for chunk in parts[part].source.decode(parts[part].store, span, entities.ON_DEMAND):
+            found.setdefault(chunk.entity, []).append(chunk.batch)
+    return found
 
 
 def decode_image(blob: bytes) -> Image | None:
@@ -268,22 +263,11 @@ def decode_image(blob: bytes) -> Image | None:
 
 
 def _blob(row: _Row) -> bytes:
-    value = row.value("EncodedImage:blob")
+    value = row.scalar("EncodedImage:blob")
     if value is None or not value.is_valid or not len(value.values):
         return b""
     first = value.values[0]
     return bytes(first.values.to_numpy().tobytes()) if hasattr(first, "values") else bytes(first.as_py() or b"")
-
-
-def _media_type(row: _Row) -> str:
-    value = row.value("EncodedImage:media_type")
-    texts = None if value is None else value.as_py()
-    return texts[0] if texts else ""
-
-
-def _stamp_ns(row: _Row) -> int:
-    value = row.value("capture_time")
-    return 0 if value is None or not value.is_valid else int(value.value)
 
 
 def file_number(meta: Meta | None, path: Path) -> int | None:

@@ -217,22 +217,22 @@ class RigWriter:
 
     def _write_fingers(self, rows: Sequence[Row]) -> None:
         """The fingers as they are and, white, at the reference; without estimate there is only that."""
-        edges_of = self._gripper.edge_points
+        ends = self._gripper.edge_points
         looks = [self._look(row.record) for row in rows]
         points_m = [self._points_at(opening_m) for opening_m, _ in looks]
         posed = [row.record.cam_T_grip is not None for row in rows]
-        counts = [len(edges_of) * shown for shown in posed]
+        counts = [len(ends) * shown for shown in posed]
         edges = rr.LineStrips3D.columns(
-            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[edges_of]],
+            strips=[s for some, shown in zip(points_m, posed, strict=True) if shown for s in some[ends]],
             colors=[Palette.VERDICTS[v] for (_, v), n in zip(looks, counts, strict=True) for _ in range(n)],
             radii=[_LINE_M] * sum(counts),
         )
         self._send.frames("rig/gripper/edges", rows, edges.partition(counts))
-        ghosts = [strip for some in points_m for strip in some[edges_of]]
+        ghosts = [strip for some in points_m for strip in some[ends]]
         wires = rr.LineStrips3D.columns(
             strips=ghosts, colors=[Palette.REFERENCE] * len(ghosts), radii=[0.7 * _LINE_M] * len(ghosts)
         )
-        self._send.frames("rig/reference/edges", rows, wires.partition([len(edges_of)] * len(rows)))
+        self._send.frames("rig/reference/edges", rows, wires.partition([len(ends)] * len(rows)))
         if len(self._triangles):
             solids = [
                 some[self._face_points] if shown else _NO_POINTS for some, shown in zip(points_m, posed, strict=True)
