@@ -24,9 +24,6 @@ from gripmon.model.records import (
     ClockReading,
     FrameRecord,
     MessageRefused,
-    Protection,
-    Smoothed,
-    Transform,
     Verdict,
     from_json,
 )
@@ -100,37 +97,26 @@ def _waited_ns(leads: Leads, sent: Sent) -> int | None:
 
 
 def transform_message(payload: bytes) -> FrameRecord:
-    """Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose."""
+    """Checked before anything moves by it; that all numbers are finite JSON ensures.
+
+    Raises :class:`~gripmon.model.records.MessageRefused` for what is not a message or a pose.
+    """
     record = from_json(payload, FrameRecord)
-    for pose in (record.cam_T_grip, record.smoothed):
-        if pose is not None and not _is_pose(pose):
+    smoothed, bounds = record.smoothed, record.protection
+    for pose in (record.cam_T_grip, smoothed):
+        if pose is not None and not abs(math.hypot(*pose.rotation_xyzw) - 1.0) < _UNIT_TOLERANCE:
             raise MessageRefused("a transform that is no pose")
-    for covariance in (record.covariance, record.smoothed.covariance if record.smoothed else None):
-        if covariance is not None and not _is_covariance(covariance):
-            raise MessageRefused("a covariance with numbers that are not finite, or a variance below 0")
-    if record.protection is not None and not _is_protection(record.protection):
-        raise MessageRefused("a protection level that is not finite or below 0, or a risk that is not within 0 and 1")
+    for covariance in (record.covariance, None if smoothed is None else smoothed.covariance):
+        if covariance is not None and min(covariance[::7]) < 0.0:
+            raise MessageRefused("a covariance with a variance below 0")
+    if bounds is not None and not (min(bounds.position_m, bounds.rotation_rad) >= 0.0 and 0.0 < bounds.risk <= 1.0):
+        raise MessageRefused("a protection level below 0, or a risk that is not within 0 and 1")
     if record.verdict is not Verdict.UNKNOWN and (record.cam_T_grip is None or record.covariance is None):
         raise MessageRefused(f"verdict {record.verdict} without a transform and its covariance")
     for name in ("seq", "stamp_ns", "revision", "latency_ns"):
         if not 0 <= getattr(record, name) <= 2**63 - 1:
             raise MessageRefused(f"{name} is not within 0 and 2⁶³ - 1")
     return record
-
-
-def _is_pose(pose: Transform | Smoothed) -> bool:
-    return all(map(math.isfinite, pose.translation_m)) and (
-        abs(math.hypot(*pose.rotation_xyzw) - 1.0) < _UNIT_TOLERANCE  # false for NaN, too
-    )
-
-
-def _is_covariance(covariance: tuple[float, ...]) -> bool:
-    return all(map(math.isfinite, covariance)) and min(covariance[::7]) >= 0.0
-
-
-def _is_protection(protection: Protection) -> bool:
-    bounds = (protection.position_m, protection.rotation_rad)
-    return all(math.isfinite(bound) and bound >= 0.0 for bound in bounds) and 0.0 < protection.risk <= 1.0
 
 
 class Entry(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import rerun as rr
@@ -254,24 +254,49 @@ def _configuration(colours: dict[State, Colour] | dict[Verdict, Colour]) -> rr.S
     return rr.StateConfiguration(values=[str(value) for value in colours], colors=list(colours.values()))
 
 
-def log_origin(send: Sender, scene: Scene, file_number: int) -> None:
-    """What this file is, and what the monitor ran with: each file stands alone."""
-    meta = Meta(
-        name=scene.name,
-        recording_id=scene.recording_id,
-        robot=scene.robot,
-        camera=scene.camera,
-        gripper="" if scene.gripper is None else scene.gripper.name,
-        version=scene.version,
-        file_number=file_number,
-        started_ns=time.time_ns(),
-        image_policy=_image_policy(scene.settings),
-        has_truth=scene.has_truth,
-        kind="frames" if scene.laser is None else "spots",
-    )
-    send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
-    if scene.configuration is not None:
-        send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
+class Writer:
+    """Writes the rows of its kind, a wrist camera's frames or a second camera's pulses, into one file."""
+
+    def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int, about: str):
+        """Writes what this file is, and what the monitor ran with: each file stands alone.  ``about`` is for people."""
+        self._send = Sender(stream)
+        self._events = EventWriter(self._send)
+        meta = Meta(
+            name=scene.name,
+            recording_id=scene.recording_id,
+            robot=scene.robot,
+            camera=scene.camera,
+            gripper="" if scene.gripper is None else scene.gripper.name,
+            version=scene.version,
+            file_number=file_number,
+            started_ns=time.time_ns(),
+            image_policy=_image_policy(scene.settings),
+            has_truth=scene.has_truth,
+            kind="frames" if scene.laser is None else "spots",
+        )
+        self._send.static("meta", rr.AnyValues(json=to_json(meta).decode()))
+        if scene.configuration is not None:
+            self._send.static("configuration", rr.AnyValues(json=to_json(scene.configuration).decode()))
+        about = f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, {about}\n"
+        self._send.static("about", rr.TextDocument(about, media_type="text/markdown"))
+
+    def write(self, rows: Sequence[Any], events: Events) -> None:
+        """Send everything that was gathered since the last call."""
+        raise NotImplementedError
+
+    def write_pictures(self, rows: Sequence[Any]) -> None:
+        """Send the pictures of rows that were written before without them."""
+        raise NotImplementedError
+
+    def repeat(self) -> None:
+        """Write again, with the next row, what else is only written when it changes."""
+        self._events.repeat()
+
+    def finish(self) -> None:
+        """Nothing more comes into this file."""
+
+    def _write_records(self, rows: Sequence[AnyRow]) -> None:
+        self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
 
 
 def _image_policy(settings: RecordingSettings) -> str:

@@ -12,11 +12,10 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
 
 import rerun as rr
 
-from gripmon.record.columns import APPLICATION_ID, AnyRow
+from gripmon.record.columns import APPLICATION_ID, AnyRow, Writer
 from gripmon.record.container import free_closed_streams, is_complete
 from gripmon.record.keeping import (
     PIN_SUFFIX,
@@ -46,15 +45,6 @@ _PICTURES_A_CHUNK = 16
 _ALERTS_KEPT = 64  # while nothing can be written: the next file says why
 # Space must have become a little more than it has to be, or recording would start and stop at every flush.
 _FREE_AGAIN = 1.02
-
-
-class Writer(Protocol):
-    """Writes the rows of its kind, a wrist camera's frames or a second camera's pulses, into one file."""
-
-    def write(self, rows: Sequence[Any], events: Events) -> None: ...
-    def write_pictures(self, rows: Sequence[Any]) -> None: ...
-    def repeat(self) -> None: ...
-    def finish(self) -> None: ...
 
 
 def make_writer(stream: rr.RecordingStream, scene: Scene, file_number: int) -> Writer:

@@ -43,6 +43,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from gripmon.model.camera import LensSettings
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (
     AlertEvent,
@@ -53,7 +54,7 @@ from gripmon.model.records import (
     Severity,
     to_json,
 )
-from gripmon.record.columns import EventWriter, Line, Palette, Row, Sender, faded, log_origin
+from gripmon.record.columns import Line, Palette, Row, Sender, Writer, faded
 from gripmon.record.recorder import Events, Scene, TraceNote, pairs
 from gripmon.record.scene import OverlayWriter, RigWriter
 
@@ -62,21 +63,18 @@ _POSE = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"]
 _LIMITS_PERIOD_NS = 2_000_000_000
 
 
-class RowWriter:
-    """Writes rows into one file.  The constructor writes what is static."""
+class RowWriter(Writer):
+    """Writes the frames of a wrist camera."""
 
     def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int):
-        self._send = Sender(stream)
-        self._events = EventWriter(self._send)
         assert scene.gripper is not None, "a wrist camera's"
         gripper = Gripper(scene.gripper)
+        super().__init__(stream, scene, file_number, _about(scene.lens, gripper.name))
         self.corner_ids = gripper.corner_ids
         self._curves = CurveWriter(self._send, gripper.corner_ids)
         self._overlay = OverlayWriter(self._send, gripper.corner_ids, scene.lens.height_px)
         self._rig = RigWriter(self._send, scene, gripper)
         self._references: list[ReferenceRecord] = []
-        self._send.static("about", rr.TextDocument(_about(scene, gripper.name), media_type="text/markdown"))
-        log_origin(self._send, scene, file_number)
 
     def write(self, rows: Sequence[Row], events: Events) -> None:
         """Send everything that was gathered since the last call.
@@ -91,25 +89,21 @@ class RowWriter:
             lines = [self._write_reference(r, _first_with(r, rows)) for r in self._references]
             self._references.clear()
             self._curves.write(rows)
-            whole = rr.AnyValues.columns(json=[to_json(row.record).decode() for row in rows])
-            self._send.frames("record", rows, whole)
+            self._write_records(rows)
             self._overlay.write(rows)
             self._rig.write(rows)
         self._events.write(rows, events, lines)
 
     def repeat(self) -> None:
-        """Write again, with the next frame, what else is only written when it changes."""
-        self._events.repeat()
+        super().repeat()
         self._rig.repeat()
 
     def write_pictures(self, rows: Sequence[Row]) -> None:
-        """Send the pictures of frames that were written before without them."""
         if rows:
             self._curves.write_pictures(rows)
             self._overlay.write_late(rows)
 
     def finish(self) -> None:
-        """Nothing more comes into this file."""
         self._curves.finish()
 
     def _write_reference(self, reference: ReferenceRecord, first: FrameRecord) -> Line:
@@ -126,14 +120,12 @@ def _first_with(reference: ReferenceRecord, rows: Sequence[Row]) -> FrameRecord:
     return next((r for r in records if (r.reference_id, r.revision) == key), records[0])
 
 
-def _about(scene: Scene, gripper: str) -> str:
-    lens = scene.lens
+def _about(lens: LensSettings, gripper: str) -> str:
     return (
-        f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, gripper `{gripper}`, "
-        f"{lens.width_px} x {lens.height_px} px\n\nLens: `{to_json(lens).decode()}`\n\n"
+        f"gripper `{gripper}`, {lens.width_px} x {lens.height_px} px\n\nLens: `{to_json(lens).decode()}`\n\n"
         "Image: predicted edges blue, edge points green where the fit believed them and red where not, measured "
         "corners yellow.  Plot: motion of the TCP in the camera frame against the reference; thin lines are one "
-        "standard deviation, wide pale ones the truth where there is one.\n"
+        "standard deviation, wide pale ones the truth where there is one."
     )
 
 

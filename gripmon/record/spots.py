@@ -35,13 +35,12 @@ from gripmon.model.records import Array, SpotRecord, to_json
 from gripmon.record.columns import (
     AXIS,
     Colour,
-    EventWriter,
     Palette,
     Sender,
     SpotRow,
+    Writer,
     faded,
     image_view,
-    log_origin,
     log_view,
     plot,
     two_columns,
@@ -58,39 +57,27 @@ _UV, _XYZ = ["u", "v"], ["x", "y", "z"]
 _GAPS: tuple[Colour, ...] = (Palette.BUSY, Palette.DOUBTFUL, Palette.REPAIR, Palette.GOOD)
 
 
-class SpotWriter:
-    """Writes rows into one file.  The constructor writes what is static."""
+class SpotWriter(Writer):
+    """Writes the pulses of a second camera's laser."""
 
     def __init__(self, stream: rr.RecordingStream, scene: Scene, file_number: int):
         assert scene.laser is not None, "a second camera's"
-        self._send = Sender(stream)
-        self._events = EventWriter(self._send)
+        super().__init__(stream, scene, file_number, _about(scene.lens))
         self._setup = setup_of(scene.laser)
         self._gap_names: tuple[str, ...] = ()
         _log_cell(self._send, scene, scene.laser)
         _log_styles(self._send)
-        self._send.static("about", rr.TextDocument(_about(scene), media_type="text/markdown"))
-        log_origin(self._send, scene, file_number)
 
     def write(self, rows: Sequence[SpotRow], events: Events) -> None:
-        """Send everything that was gathered since the last call."""
         if rows:
-            self._send.frames("record", rows, rr.AnyValues.columns(json=[to_json(r.record).decode() for r in rows]))
+            self._write_records(rows)
             self._curves(rows)
             self._places(rows)
             self.write_pictures([row for row in rows if row.picture is not None])
         self._events.write(rows, events)
 
     def write_pictures(self, rows: Sequence[SpotRow]) -> None:
-        """Send the pictures of pulses."""
         self._send.images(IMAGE, rows)
-
-    def repeat(self) -> None:
-        """Write again, with the next pulse, what else is only written when it changes."""
-        self._events.repeat()
-
-    def finish(self) -> None:
-        """Nothing is kept back."""
 
     def _curves(self, rows: Sequence[SpotRow]) -> None:
         send, records = self._send, [row.record for row in rows]
@@ -192,12 +179,11 @@ def _log_styles(send: Sender) -> None:
     send.static("test/moved", rr.SeriesLines(names=["probability moved"], colors=[Palette.BAD]))
 
 
-def _about(scene: Scene) -> str:
+def _about(lens: LensSettings) -> str:
     return (
-        f"# {scene.robot} / {scene.camera}\n\ngripmon {scene.version}, a second camera, watched with a pulsed laser, "
-        f"{scene.lens.width_px} x {scene.lens.height_px} px\n\nLens: `{to_json(scene.lens).decode()}`\n\nImage: the "
-        "last pulse, with the spot green where it was accepted and red where not, and where the calibration predicts "
-        "it blue.\n"
+        f"a second camera, watched with a pulsed laser, {lens.width_px} x {lens.height_px} px\n\n"
+        f"Lens: `{to_json(lens).decode()}`\n\nImage: the last pulse, with the spot green where it was accepted and red "
+        "where not, and where the calibration predicts it blue."
     )
 
 

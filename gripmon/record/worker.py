@@ -22,8 +22,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from gripmon.model.records import Alert, AlertRecord, FrameRecord, Limits
-from gripmon.record.columns import APPLICATION_ID, AnyRow, Picture, Row, SpotRow
-from gripmon.record.files import FileSeries, Writer, make_writer
+from gripmon.record.columns import APPLICATION_ID, AnyRow, Picture, Row, SpotRow, Writer
+from gripmon.record.files import FileSeries, make_writer
 from gripmon.record.keeping import Moments, PictureRing, Trigger, pinned_by
 from gripmon.record.process import ImageRing, Unframer
 from gripmon.record.recorder import (

@@ -76,7 +76,7 @@ _FRAMES_A_TURN = 4  # before the interpreter lock is let go
 _ROOM_POLL_S = 0.002
 _STOPPED_TIMEOUT_S = 2.0
 _LOSSES_PERIOD_S = 60.0  # between two lines about them
-_EVENTS_KEPT = 1024  # while the process is away
+_EVENTS_KEPT = 4096  # while the process is away
 
 Truth = Callable[[int], tuple[float, float, float] | None]
 
