@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gripmon.model.records import AlertRecord, Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord, StateRecord
+from gripmon.model.records import Frame, FrameRecord, Limits, RecordedCommand, ReferenceRecord
 from gripmon.record.columns import (
     APPLICATION_ID,
     AXIS,
@@ -26,7 +26,7 @@ from gripmon.record.columns import (
     two_columns,
 )
 from gripmon.record.read import RecordedFrames
-from gripmon.record.recorder import Events, Notes, Scene, Trace, pack_trace
+from gripmon.record.recorder import Events, Notes, NullRecorder, Scene, Trace, pack_trace
 from gripmon.record.rows import CurveWriter, RowWriter
 from gripmon.record.scene import rig_view, wrist_image_view
 from gripmon.record.worker import measured_picture
@@ -52,22 +52,19 @@ class _Beside(Sender):
         super().columns(f"{RECORDED}/{path}", stamps_ns, seqs, columns)
 
 
-class ComparedRecorder:
+class ComparedRecorder(NullRecorder):
     """A recorder for a replay: takes each frame with what ``source``, which gave it last, has recorded of it.
 
     The replay is the recording, with all its entities; what was recorded lies beside it below ``recorded``, with the
-    same names.  It writes in the caller's thread: a replay can wait.
+    same names.  It writes in the caller's thread: a replay can wait.  The daemon's own alerts and state messages aren't
+    in it.
     """
-
-    dropped = images_dropped = 0
-    has_room = True
 
     def __init__(self, path: Path, scene: Scene, source: RecordedFrames, recorded_limits: Limits | None) -> None:
         """``recorded_limits`` are drawn beside the replay's; None where they are unknown.  OSError as for a file."""
         path.open("wb").close()
         self._path, self._source, self._recorded_limits = path, source, recorded_limits
         self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=scene.recording_id)
-        self.failure: str | None = None
         if self._has_space():
             stream.set_sinks(rr.FileSink(path))
         stream.send_recording_name(f"{scene.name}: {RECORDED} and {REPLAYED}")
@@ -96,12 +93,6 @@ class ComparedRecorder:
         self._rows_then.append(Row(then, None, None, None, opening_m, None, self._recorded_limits))
         if len(self._rows) >= _BATCH_ROWS:
             self._write()
-
-    def alert(self, alert: AlertRecord) -> None:
-        """The daemon's own alerts are none of a replay's."""
-
-    def state(self, state: StateRecord) -> None:
-        """Nor are its state messages."""
 
     def reference(self, reference: ReferenceRecord) -> None:
         """A new reference of the replay."""

@@ -18,13 +18,10 @@ import re
 import struct
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-
-from gripmon.record.table import IntArray
 
 MAGIC = b"RRF2"
 _FILE_HEADER_BYTES = 12
@@ -64,19 +61,14 @@ class Chunk(NamedTuple):
     batch: Any
 
 
-@dataclass(frozen=True, slots=True)
-class Manifest:
-    """What a footer says of the messages of one store: an element each.  ``first`` and ``last`` are frame numbers."""
+class Message(NamedTuple):
+    """What a footer says of a message; ``first`` and ``last`` are its frames' numbers."""
 
-    entity: list[str]
-    offset: IntArray
-    size: IntArray
-    rows: IntArray
-    first: IntArray
-    last: IntArray
-
-    def span(self, message: int) -> Span:
-        return Span(int(self.offset[message]), int(self.size[message]))
+    entity: str
+    span: Span
+    rows: int
+    first: int
+    last: int
 
 
 class StoreName(NamedTuple):
@@ -107,8 +99,8 @@ class RrdFile:
         if not self.stores:
             raise UnreadableFileError("is cut short before its recording begins")
 
-    def manifest(self, store: StoreName) -> Manifest | None:
-        """The footer's, None where it is missing or doesn't fit the file."""
+    def manifest(self, store: StoreName) -> list[Message] | None:
+        """A store's messages by the footer, None where it is missing or doesn't fit the file."""
         if not self.has_footer:
             return None
         from rerun.chunk import RrdReader
@@ -116,7 +108,7 @@ class RrdFile:
         try:
             reader = RrdReader(self.path)
             entry = next(e for e in reader.recordings() if e.recording_id == store.recording_id)
-            return _manifest(_chunk_index(reader.store(store=entry)), self.size)
+            return _messages(_chunk_index(reader.store(store=entry)), self.size)
         except RerunChangedError as error:
             self.has_footer = False
             self.faults.append(f"its messages were read one by one: {error}")
@@ -232,26 +224,23 @@ def whole_bytes(path: Path) -> int:
         return size
 
 
-def _manifest(batch: Any, file_size: int) -> Manifest:
-    """Raises ValueError where it can't be that of this file."""
+def _messages(batch: Any, file_size: int) -> list[Message]:
+    """Raises ValueError where they can't be those of this file."""
     column = {name: batch.column(name) for name in batch.schema.names}
 
-    def integers(name: str) -> IntArray:
-        return column[name].cast("int64").fill_null(NO_FRAME).to_numpy(zero_copy_only=False)
+    def integers(name: str) -> list[int]:
+        if name not in column:
+            return [NO_FRAME] * batch.num_rows
+        values: list[int] = column[name].cast("int64").fill_null(NO_FRAME).to_pylist()
+        return values
 
-    offset = integers("chunk_byte_offset") - _MESSAGE.size
-    size = integers("chunk_byte_size") + _MESSAGE.size
-    if np.any(offset < _FILE_HEADER_BYTES) or np.any(size <= 0) or np.any(offset + size > file_size):
+    places = zip(integers("chunk_byte_offset"), integers("chunk_byte_size"), strict=True)
+    spans = [Span(offset - _MESSAGE.size, size + _MESSAGE.size) for offset, size in places]
+    if any(s.offset < _FILE_HEADER_BYTES or s.size <= 0 or s.offset + s.size > file_size for s in spans):
         raise ValueError("it names bytes beyond the file")
-    nothing = np.full(len(offset), NO_FRAME)
-    return Manifest(
-        entity=[path.removeprefix("/") for path in column["chunk_entity_path"].to_pylist()],
-        offset=offset,
-        size=size,
-        rows=integers("chunk_num_rows"),
-        first=integers("frame:start") if "frame:start" in column else nothing,
-        last=integers("frame:end") if "frame:end" in column else nothing,
-    )
+    entities = [path.removeprefix("/") for path in column["chunk_entity_path"].to_pylist()]
+    frames = integers("frame:start"), integers("frame:end")
+    return list(map(Message, entities, spans, integers("chunk_num_rows"), *frames))
 
 
 def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, int]]:

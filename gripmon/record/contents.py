@@ -8,6 +8,7 @@ import re
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +34,7 @@ from gripmon.record.container import (
     NO_FRAME,
     RECORD,
     Chunk,
-    Manifest,
+    Message,
     RrdFile,
     Span,
     StoreName,
@@ -183,22 +184,22 @@ class Contents:
         """Is it a second camera's?  Its records are of another kind."""
         return self.meta is not None and self.meta.kind == "spots"
 
-    def take_by_manifest(self, file: RrdFile, manifest: Manifest, progress: Callable[[int], None]) -> None:
+    def take_by_manifest(self, file: RrdFile, messages: Sequence[Message], progress: Callable[[int], None]) -> None:
         """Only the messages of what is read at once; of the others their places."""
-        at: dict[str, list[int]] = {}
-        for i, entity in enumerate(manifest.entity):
-            at.setdefault(entity, []).append(i)
+        by_entity: dict[str, list[Message]] = {}
+        for message in messages:
+            by_entity.setdefault(message.entity, []).append(message)
         for entity, places in self.places.items():
-            for i in at.get(entity, ()):
-                if manifest.last[i] >= manifest.first[i] > NO_FRAME:
-                    places.add(manifest.span(i), int(manifest.first[i]), int(manifest.last[i]))
+            for message in by_entity.get(entity, ()):
+                if message.last >= message.first > NO_FRAME:
+                    places.add(message.span, message.first, message.last)
         for entity in _AT_ONCE:
-            messages = sorted(at.get(entity, ()), key=lambda i: int(manifest.offset[i]))
-            for number, span in enumerate(map(manifest.span, messages), 1):
-                self._take(span, file.decode(self.store, span))
+            found = sorted(by_entity.get(entity, ()), key=attrgetter("span"))
+            for number, message in enumerate(found, 1):
+                self._take(message.span, file.decode(self.store, message.span))
                 if entity == RECORD:
-                    progress(file.size * number // len(messages))
-        images = sum(int(manifest.rows[i]) for i in at.get(IMAGE, ()) if manifest.first[i] >= 0)
+                    progress(file.size * number // len(found))
+        images = sum(message.rows for message in by_entity.get(IMAGE, ()) if message.first >= 0)
         if images != sum(map(len, self._images)):
             self._images.clear()  # written by another version: look at the images themselves
             for span in self.places[IMAGE].spans():
