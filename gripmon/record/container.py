@@ -17,7 +17,7 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -99,8 +99,8 @@ class RrdFile:
         if not self.stores:
             raise UnreadableFileError("is cut short before its recording begins")
 
-    def manifest(self, store: StoreName) -> list[Message] | None:
-        """A store's messages by the footer, None where it is missing or doesn't fit the file."""
+    def manifest(self, store: StoreName, content: Collection[str]) -> list[Message] | None:
+        """A store's messages of some entities by the footer, None where it is missing or doesn't fit the file."""
         if not self.has_footer:
             return None
         from rerun.chunk import RrdReader
@@ -108,7 +108,7 @@ class RrdFile:
         try:
             reader = RrdReader(self.path)
             entry = next(e for e in reader.recordings() if e.recording_id == store.recording_id)
-            return _messages(_chunk_index(reader.store(store=entry)), self.size)
+            return _messages(_chunk_index(reader.store(store=entry)), content, self.size)
         except RerunChangedError as error:
             self.has_footer = False
             self.faults.append(f"its messages were read one by one: {error}")
@@ -224,7 +224,7 @@ def whole_bytes(path: Path) -> int:
         return size
 
 
-def _messages(batch: Any, file_size: int) -> list[Message]:
+def _messages(batch: Any, content: Collection[str], file_size: int) -> list[Message]:
     """Raises ValueError where they can't be those of this file."""
     column = {name: batch.column(name) for name in batch.schema.names}
 
@@ -234,13 +234,18 @@ def _messages(batch: Any, file_size: int) -> list[Message]:
         values: list[int] = column[name].cast("int64").fill_null(NO_FRAME).to_pylist()
         return values
 
-    places = zip(integers("chunk_byte_offset"), integers("chunk_byte_size"), strict=True)
-    spans = [Span(offset - _MESSAGE.size, size + _MESSAGE.size) for offset, size in places]
+    names = "chunk_byte_offset", "chunk_byte_size", "chunk_num_rows", "frame:start", "frame:end"
+    found = [
+        Message(path.removeprefix("/"), Span(offset - _MESSAGE.size, size + _MESSAGE.size), rows, first, last)
+        for path, offset, size, rows, first, last in zip(
+            column["chunk_entity_path"].to_pylist(), *map(integers, names), strict=True
+        )
+        if path.removeprefix("/") in content
+    ]
+    spans = [message.span for message in found]
     if any(s.offset < _FILE_HEADER_BYTES or s.size <= 0 or s.offset + s.size > file_size for s in spans):
         raise ValueError("it names bytes beyond the file")
-    entities = [path.removeprefix("/") for path in column["chunk_entity_path"].to_pylist()]
-    frames = integers("frame:start"), integers("frame:end")
-    return list(map(Message, entities, spans, integers("chunk_num_rows"), *frames))
+    return found
 
 
 def _walk(descriptor: int, file_size: int) -> Iterator[tuple[int | None, int, int]]:

@@ -310,7 +310,7 @@ def read_contents(file: RrdFile, store: StoreName, progress: Callable[[int], Non
     Raises OSError where the file can't be read any more.
     """
     contents = Contents(file, store)
-    manifest = file.manifest(store)
+    manifest = file.manifest(store, {*_AT_ONCE, *ON_DEMAND})
     if manifest is None:
         contents.take_everything(file, progress)
     else:
