@@ -16,6 +16,7 @@ to start, and nothing needs help when a monitor or a router ends and comes again
 
 from __future__ import annotations
 
+from gripmon.client.alert_log import AlertLog, Event
 from gripmon.client.fleet import Condition, Fleet, MonitorStatus, trouble
 from gripmon.client.network import MonitorName
 from gripmon.client.reader import Ambiguous, Client, NotCarriedOut
@@ -23,9 +24,11 @@ from gripmon.client.reading import NotUsable, Policy, Reading, Unusable
 from gripmon.client.transforms import TransformClient
 
 __all__ = [
+    "AlertLog",
     "Ambiguous",
     "Client",
     "Condition",
+    "Event",
     "Fleet",
     "MonitorName",
     "MonitorStatus",
