@@ -187,7 +187,7 @@ def write(path: Path, runs: Sequence[CorrectedRun], inputs: Sequence[tuple[str, 
         elif path.suffix.lower() == ".parquet":
             _write_parquet(part, runs, about)
         else:
-            from gripmon.record.write.track import write_track
+            from gripmon.record.compared import write_track
 
             recording = runs[number].recording
             write_track(part, recording.recording_id, recording.frames, runs[number].correction, about)

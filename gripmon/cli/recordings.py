@@ -200,8 +200,7 @@ def correct(arguments: argparse.Namespace) -> None:
 def view(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon view``."""
     from gripmon.record.read import recording_files
-    from gripmon.record.write.files_page import serve_files
-    from gripmon.record.write.viewer import NativeViewer, ViewerError, free_port, has_display, is_free
+    from gripmon.record.viewer import NativeViewer, ViewerError, free_port, has_display, is_free, serve_files
 
     files = recording_files(arguments.recording)
     for path in files:
