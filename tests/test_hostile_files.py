@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.gripmon_process import gripmon
 
-from gripmon.calibrate.interchange.opencv_storage import DEEPEST, SYNTAXES, nesting
+from gripmon.calibrate.opencv_files import DEEPEST, SYNTAXES, nesting
 from gripmon.cli import main
 from gripmon.io.sources import FolderSettings, FolderSource, SourceError
 from gripmon.io.sources.pulses import read_pulses

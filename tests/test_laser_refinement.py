@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import f as fisher_f
 from support.laser_scenes import PAPER_LENS, assert_same, numeric, scene
 
-from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.bundle import LensModel
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer import common_plane, refinement
 from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions

@@ -13,10 +13,9 @@ import yaml
 from support.plates import pose, render
 from test_robot_world import columns, transform
 
-from gripmon.calibrate.detection import detect
-from gripmon.calibrate.detection.boards import upright
+from gripmon.calibrate.bundle import plate_pose
+from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml

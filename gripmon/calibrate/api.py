@@ -18,10 +18,10 @@ from typing import Literal
 import numpy as np
 
 from gripmon.calibrate import intrinsics, robot_world
+from gripmon.calibrate.bundle import MODELS, ModelName, parameter_names
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-from gripmon.calibrate.intrinsics_result import IntrinsicsResult
-from gripmon.calibrate.lens_models import MODELS, ModelName, parameter_names
+from gripmon.calibrate.intrinsics import IntrinsicsResult
 from gripmon.calibrate.robot_world import RobotWorld
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.calibrate.verify import verify
@@ -195,16 +195,24 @@ def _about_target(sightings: list[Sighting], target: Target) -> list[str]:
 
 
 def calibrate_robot_world(
-    base_T_ee: Array, cam_T_target: Array, covariance: Array | None = None, *, eye_in_hand: bool = False
+    base_T_ee: Array,
+    cam_T_target: Array,
+    covariance: Array | None = None,
+    *,
+    common: Array | None = None,
+    eye_in_hand: bool = False,
 ) -> RobotWorld:
     """Both unknown transforms of ``cam_T_target = cam_T_base base_T_ee ee_T_target`` from poses (n, 4, 4) each, with
-    the ``covariance`` (n, 6, 6) of the targets' poses if it is known.
+    the ``covariance`` (n, 6, 6) of the targets' poses if it is known, and ``common`` (n, 6, k): what independent errors
+    of the camera, in their standard deviations, do to all of them.
 
     ``eye_in_hand``: the camera is on the hand and the target stands; the result's ``cam_T_base`` is ``cam_T_ee`` then,
     and its ``ee_T_target`` is ``base_T_target``.
     """
     arm = np.stack([invert(T) for T in base_T_ee]) if eye_in_hand else base_T_ee
     start = robot_world.solve(cam_T_target, arm)
-    found = robot_world.refine(cam_T_target, arm, start, covariance, inexact_arm=True)
+    found = robot_world.refine(
+        cam_T_target, arm, start, covariance, inexact_arm=True, eye_in_hand=eye_in_hand, common=common
+    )
     robot_world.check_reading(found, cam_T_target, arm)
     return found

@@ -14,9 +14,15 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from gripmon.calibrate.bundle import Bundle
-from gripmon.calibrate.intrinsics import lens_vector, model_of, plate_pose
-from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.bundle import (
+    Bundle,
+    GivenCamera,
+    LensModel,
+    independent_errors,
+    lens_vector,
+    model_of,
+    plate_pose,
+)
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -57,15 +63,6 @@ class FingerCorners:
         count = len(self.names)
         blocks = self.covariance_px.reshape(count, 2, count, 2)
         return np.ascontiguousarray(np.einsum("ipiq->ipq", blocks))
-
-
-@dataclass(frozen=True, slots=True)
-class GivenCamera:
-    """A camera with the covariance of those of its ``parameters`` that aren't exact, named as in its file."""
-
-    lens: LensSettings
-    parameters: tuple[str, ...] = ()
-    covariance: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,43 +279,28 @@ def _plate_directions(given: _Given, covariance: Array) -> list[_Direction]:
     def changed(change: Array) -> _Given:
         return replace(given, cam_T_plate=perturb(given.cam_T_plate, change))
 
-    return [_along(changed, root) for root in _roots(covariance)]
+    return [_along(changed, root) for root in independent_errors(covariance)]
 
 
 def _corner_directions(given: _Given, corners: FingerCorners) -> list[_Direction]:
     def changed(change: Array) -> _Given:
         return replace(given, uv_px=given.uv_px + change.reshape(-1, 2))
 
-    return [_along(changed, root) for root in _roots(corners.covariance_px)]
+    return [_along(changed, root) for root in independent_errors(corners.covariance_px)]
 
 
 def _camera_directions(given: _Given, camera: GivenCamera, sighting: Sighting) -> list[_Direction]:
     """The plate's pose follows: with another camera the same image shows the plate elsewhere."""
     if camera.covariance is None or not camera.parameters:
         return []
-    lens, names = camera.lens, camera.parameters
-    model = LensModel(model_of(lens), lens.width_px, lens.height_px)
-    vector, places = lens_vector(lens), [parameter_names(model.name).index(name) for name in names]
-    tied = "fx_px" in names and "fy_px" not in names
+    model = LensModel(model_of(camera.lens), camera.lens.width_px, camera.lens.height_px)
+    vector, free = lens_vector(camera.lens), camera.free
 
     def changed(change: Array) -> _Given:
-        moved = vector.copy()
-        moved[places] += change
-        if tied:
-            moved[1] *= moved[0] / vector[0]
+        moved = vector + free @ change
         return replace(given, camera=model.camera(moved), cam_T_plate=plate_pose(model.settings(moved), sighting)[0])
 
-    return [_along(changed, root) for root in _roots(camera.covariance)]
-
-
-def _roots(covariance: Array) -> Array:
-    """(n, n) rows of independent errors, one standard deviation each; by eigenvectors, as corners that share an edge,
-    or parameters that were hardly free, make a covariance nearly singular.
-    """
-    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    variances, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    roots: Array = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
-    return roots.T
+    return [_along(changed, root) for root in independent_errors(camera.covariance)]
 
 
 def _along(changed: Callable[[Array], _Given], root: Array) -> _Direction:

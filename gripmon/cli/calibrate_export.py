@@ -117,7 +117,7 @@ def _notes(source: Calibrated, arguments: argparse.Namespace) -> tuple[str, ...]
 
 
 def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.calibrate.interchange.cameras import write_camera
+    from gripmon.calibrate.interchange import write_camera
 
     if source.lens is None:
         raise InputError(
@@ -139,7 +139,7 @@ def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Name
 
 
 def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.calibrate.interchange.hand_eye import HandEye, write_hand_eye
+    from gripmon.calibrate.interchange import HandEye, write_hand_eye
 
     if source.cam_T_grip is None:
         raise InputError(

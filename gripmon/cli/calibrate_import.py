@@ -55,7 +55,7 @@ def _size(text: str) -> tuple[int, int]:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate import``."""
     from gripmon.calibrate.documents import CameraCalibration
-    from gripmon.calibrate.interchange.cameras import ReadOptions, format_of, read_camera
+    from gripmon.calibrate.interchange import format_of, read_camera
     from gripmon.daemon.calibrations import read_bytes
     from gripmon.model.provenance import provenance_of
 
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     files.check_output(out, force=arguments.force)
     data = read_bytes(path)
     kind = arguments.format or format_of(data, str(path))
-    camera = read_camera(data, str(path), kind, ReadOptions(arguments.camera, arguments.size, arguments.fisheye))
+    camera = read_camera(data, str(path), kind, arguments.camera, arguments.size, arguments.fisheye)
     said = {
         "--format": arguments.format,
         "--camera": arguments.camera,

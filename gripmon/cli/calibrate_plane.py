@@ -14,7 +14,8 @@ from gripmon.cli import common
 from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
-    from gripmon.calibrate.plane import Coincidence, GivenCamera
+    from gripmon.calibrate.bundle import GivenCamera
+    from gripmon.calibrate.plane import Coincidence
     from gripmon.calibrate.plane_average import PlaneCalibration
     from gripmon.daemon.config import Config
     from gripmon.model.gripper import Gripper
@@ -152,7 +153,7 @@ def _check_options(arguments: argparse.Namespace) -> None:
 
 def _camera(arguments: argparse.Namespace, config: Config | None) -> tuple[GivenCamera, list[Path]]:
     """The camera, and all files beside the images that the provenance names."""
-    from gripmon.calibrate.plane import GivenCamera
+    from gripmon.calibrate.bundle import GivenCamera
     from gripmon.daemon.calibrations import read_given_camera
 
     named = [arguments.camera, arguments.config, arguments.gripper, *(arguments.corners or [])]

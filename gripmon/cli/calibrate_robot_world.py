@@ -46,21 +46,25 @@ def add_parser(methods: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate robot-world``."""
     from gripmon.calibrate.api import calibrate_robot_world
-    from gripmon.calibrate.arm_poses import read_arm_poses
     from gripmon.calibrate.documents import robot_world_document
+    from gripmon.calibrate.tables import read_arm_poses
     from gripmon.daemon.calibrations import read_given_camera
     from gripmon.model.provenance import provenance_of
 
     out, inputs = Path(arguments.out), [Path(name) for name in arguments.data]
     files.check_output(out, force=arguments.force)
     target = None if arguments.target is None else files.target_of(arguments.target)
-    camera = None if arguments.camera is None else read_given_camera(Path(arguments.camera)).lens
+    camera = None if arguments.camera is None else read_given_camera(Path(arguments.camera))
     with files.errors_of("robot-world"):
         poses = read_arm_poses(inputs, camera, target, common.progress_bar)
         for line in poses.unseen:
             print(line, file=sys.stderr)
         found = calibrate_robot_world(
-            poses.base_T_ee, poses.cam_T_target, poses.covariance, eye_in_hand=arguments.eye_in_hand
+            poses.base_T_ee,
+            poses.cam_T_target,
+            poses.covariance,
+            common=poses.common,
+            eye_in_hand=arguments.eye_in_hand,
         )
     if poses.images:
         inputs += [Path(arguments.camera), *poses.images]

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
+from gripmon.calibrate.bundle import LensModel, lens_vector, model_of, parameter_names
 from gripmon.calibrate.documents import CameraCalibration
-from gripmon.calibrate.intrinsics import lens_vector, model_of
-from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError, NotFound
 from gripmon.laser.pointer.calibrating import LaserResult, Spots, calibrate, groups_of
 from gripmon.laser.pointer.document import LaserCalibration, document

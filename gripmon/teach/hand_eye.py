@@ -15,9 +15,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.plane_average import PlaneCalibration, average
 from gripmon.calibrate.sighting import CalibrationError, NotFound
 from gripmon.calibrate.verify import Calibrated, agreeing, mean_of_one_scene

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.bundle import LensModel
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.pointer.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
 from gripmon.model.camera import Camera

@@ -12,8 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gripmon.calibrate.intrinsics import lens_vector, model_of
-from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.bundle import LensModel, lens_vector, model_of, parameter_names
 from gripmon.judge.recalibrate import RecalibrationRefused, recalibrate, refusal, rivals, solutions
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gripmon.calibrate.intrinsics import plate_pose
-from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
+from gripmon.calibrate.bundle import GivenCamera, plate_pose
+from gripmon.calibrate.plane import Coincidence, KnownCorners, calibrate_plane
 from gripmon.calibrate.plane_average import PlaneCalibration, against
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import make_camera

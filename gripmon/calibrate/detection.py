@@ -1,19 +1,28 @@
-"""A calibration target found in an image, all of it or a part: fingers may stand on it."""
+"""Calibration targets in images, whole or in part: fingers may stand on them.  Points to hundredths of a pixel."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gripmon.calibrate.detection import blobs, chequers, symmetry
-from gripmon.calibrate.detection.bending import bends
-from gripmon.calibrate.detection.boards import ends_all_round
-from gripmon.calibrate.detection.lattice import Index
-from gripmon.calibrate.detection.pictures import Grey, edge_blur_px, noise_of, sharpest_blur_px, to_bytes, to_grey
+from gripmon.calibrate import chequers
+from gripmon.calibrate.chequers import bends
+from gripmon.calibrate.lattice import (
+    Grey,
+    Index,
+    edge_blur_px,
+    find_discs,
+    noise_of,
+    refined,
+    sharpest_blur_px,
+    to_bytes,
+    to_grey,
+)
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.records import Array, Image
 from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target, TargetError
@@ -126,7 +135,7 @@ def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | Not
 
 def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
     columns, rows = target.columns, target.rows
-    found = blobs.find_discs(grey, columns, rows, target.spacing_m / target.diameter_m)
+    found = find_discs(grey, columns, rows, target.spacing_m / target.diameter_m)
     if not found:
         return NotFound(_blurred(grey) or "no lattice of discs in the image; one that is evenly lit and not too small")
     cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
@@ -144,7 +153,7 @@ def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
         return NotFound(_too_coarse(blur_px, steps))
     noise = noise_of(grey)
     first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
-    centres = [blobs.refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
+    centres = [refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
     good = np.array([centre is not None for centre in centres])
     uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
     covariance = np.array([np.eye(2) if centre is None else centre[1] for centre in centres])
@@ -228,23 +237,23 @@ def _sharp(
     are their places on the lattice.
     """
     noise = noise_of(grey)
-    found = symmetry.centres_of_symmetry(grey, rough, radius_px, noise)
+    found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
     good = _corners(grey, *found, radius_px)
     # How the lattice bends is known once its corners are.
     bend = np.zeros((len(rough), 3, 2))
     size = (grey.shape[1], grey.shape[0])
     bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
-    found = symmetry.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
+    found = chequers.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
     return found[0], found[1], _corners(grey, *found, radius_px)
 
 
 def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
     """(n,) which are free, and a corner."""
-    radius = np.clip(radius_px, symmetry.SMALLEST_RADIUS_PX, symmetry.LARGEST_RADIUS_PX)
+    radius = np.clip(radius_px, chequers.SMALLEST_RADIUS_PX, chequers.LARGEST_RADIUS_PX)
     size = np.array(grey.shape[::-1])
     edge = np.minimum(uv_px, size - 1 - uv_px).min(axis=1)
     crosses, _ = chequers.crossing(grey, np.nan_to_num(uv_px, nan=-1e3), 0.8 * radius)
-    good: NDArray[np.bool_] = (asymmetry < symmetry.ASYMMETRIC) & (edge > radius) & crosses
+    good: NDArray[np.bool_] = (asymmetry < chequers.ASYMMETRIC) & (edge > radius) & crosses
     return good
 
 
@@ -275,3 +284,77 @@ def _too_blurred(blur_px: float) -> str:
     return (
         f"blurred: its sharpest edges have a standard deviation of {blur_px:.1f} px; an image in focus, without motion"
     )
+
+
+LEAST_CONTRAST = 0.2
+"""Between dark and light squares, over the range of the squares' grey levels: what is less may be light and shadow."""
+BARE = 0.3
+"""Of the contrast: so much what lies beyond may differ from the plate's own ground."""
+_ALL = 0.9
+
+
+def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool) -> bool:
+    """True where a lattice (cells (n, 2) from 0 on, at (n, 2) px) has no gaps and the plate beyond all its four sides
+    is in view and bare.  False says nothing: a finger, the image's border, or something else may hide the rest.
+
+    ``squares``: the points are corners of squares, else centres of discs.
+    """
+    columns, rows = (cells.max(axis=0) + 1).tolist()
+    if len(cells) < columns * rows or min(columns, rows) < 3:
+        return False
+    grid = np.empty((rows, columns, 2))
+    grid[cells[:, 1], cells[:, 0]] = at
+    middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
+    if squares:
+        ink, ground = np.percentile(_levels(grey, middles), [15.0, 85.0]).tolist()
+    else:
+        ink, ground = float(np.median(_levels(grey, grid))), float(np.median(_levels(grey, middles)))
+    for turn in range(4):
+        turned = np.rot90(grid, turn)
+        edge, step = turned[0], turned[0] - turned[1]
+        if squares:  # the middles of the squares that would follow those which end the pattern
+            edge, step = 0.5 * (edge[1:] + edge[:-1]), 0.75 * (step[1:] + step[:-1])
+        beyond = edge + step
+        if ((beyond < 1.0) | (beyond > np.array(grey.shape[::-1]) - 2.0)).any():
+            return False
+        # Beyond squares of two colours may be either, but the same all along.
+        shown, near = _levels(grey, beyond), BARE * abs(ground - ink)
+        if max(np.mean(np.abs(shown - level) < near) for level in ((ground, ink) if squares else (ground,))) < _ALL:
+            return False
+    return True
+
+
+def _levels(grey: Grey, where: Array) -> Array:
+    at = where.reshape(1, -1, 2).astype(np.float32)
+    out = cv2.remap(cv2.GaussianBlur(grey, (0, 0), 1.0), at[:, :, 0], at[:, :, 1], cv2.INTER_LINEAR)
+    return np.asarray(out[0], np.float64)
+
+
+def upright(image: Image, sighting: Sighting, board: Chequerboard) -> Sighting | NotFound:
+    """``sighting`` of a whole board whose numbers of corners are one even, one odd, turned such that the square between
+    its first corners along both axes is dark.  :class:`NotFound` where a part of the board is hidden (the lattice's
+    origin is unknown then), or the colours don't tell.
+    """
+    count = board.columns * board.rows
+    if len(sighting) != count:
+        return NotFound(f"{len(sighting)} of the board's {count} corners; all of them, to tell which way up it is")
+    cells = np.rint(sighting.plate_m[:, :2] / board.square_m).astype(int)
+    cells -= cells.min(axis=0)
+    if tuple(cells.max(axis=0) + 1) == (board.rows, board.columns):  # x along the columns
+        cells = np.stack([cells[:, 1], board.rows - 1 - cells[:, 0]], axis=1)
+    if tuple(cells.max(axis=0) + 1) != (board.columns, board.rows):
+        return NotFound("the corners aren't the whole board; all of them, to tell which way up it is")
+    places = np.empty((board.columns, board.rows, 2))
+    places[cells[:, 0], cells[:, 1]] = sighting.uv_px
+    # A square's middle by its four corners: perspective and lens hardly bend one square.
+    middles = 0.25 * (places[:-1, :-1] + places[1:, :-1] + places[:-1, 1:] + places[1:, 1:])
+    grey = to_grey(image)
+    levels = grey[tuple(np.rint(middles[..., k]).astype(int) for k in (1, 0))].astype(np.float64)
+    even = np.indices(levels.shape).sum(axis=0) % 2 == 0
+    difference = float(np.median(levels[even]) - np.median(levels[~even]))
+    if abs(difference) <= LEAST_CONTRAST * float(np.ptp(levels)):
+        return NotFound("dark and light squares don't tell which way up the board is; a board in even light")
+    if difference > 0.0:
+        cells = [board.columns - 1, board.rows - 1] - cells
+    plate_m = np.concatenate([cells * board.square_m, np.zeros((count, 1))], axis=1)
+    return replace(sighting, plate_m=plate_m)
