@@ -15,7 +15,7 @@ from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.laser.world import calibrated, foresee
 from gripmon.simulate.laser import spot_image
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")

@@ -10,10 +10,9 @@ from support.laser_scenes import paper_setup, sampled
 from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # noqa: F401 - camera is a fixture
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.planning import Arm, candidates, plan
-from gripmon.laser.pointer.refinement import refine
-from gripmon.laser.pointer.setup import spots_on_plane
-from gripmon.laser.pointer.spot_problem import SpotProblem
+from gripmon.laser.planning import Arm, candidates, plan
+from gripmon.laser.refinement import SpotProblem, refine
+from gripmon.laser.setup import spots_on_plane
 from gripmon.model.geometry import perturbation_between
 
 
@@ -45,7 +44,7 @@ def test_what_is_foretold_is_what_a_calibration_with_these_poses_says():
     exact = data.camera.project(spots_on_plane(data.truth, poses)[0])
     rng = np.random.default_rng(3)
     again = refine(SpotProblem(data.camera, poses, exact + rng.normal(0.0, refined.scale, exact.shape)), data.truth)
-    from gripmon.laser.pointer.document import base_covariance
+    from gripmon.laser.setup import base_covariance
 
     sigma = np.sqrt(np.trace(base_covariance(again)[:3, :3]))
     assert sigma == pytest.approx(planned.sigmas[-1, 0], rel=0.35)

@@ -9,14 +9,13 @@ from support.laser_scenes import PAPER_LENS, assert_same, numeric, scene
 
 from gripmon.calibrate.bundle import LensModel
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer import common_plane, refinement
-from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions
-from gripmon.laser.pointer.refinement import FALSE_OUTLIERS, refine, with_held_lens
-from gripmon.laser.pointer.setup import (
+from gripmon.laser import closed_form, refinement
+from gripmon.laser.calibrating import Spots, calibrate, contradictions
+from gripmon.laser.refinement import FALSE_OUTLIERS, LensPrior, PoseNoise, SpotProblem, refine, with_held_lens
+from gripmon.laser.setup import (
     PARAMETERS,
     LaserSetup,
 )
-from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.model.geometry import perturb, perturbation_between
 
 
@@ -114,7 +113,7 @@ def test_a_slightly_wrong_lens_needs_its_part_in_the_covariance():
         believed = right.copy()
         believed[:4] += np.sqrt(prior.diagonal()) * np.random.default_rng(seed + 50).normal(size=4)
         lens = LensPrior(model, believed, (0, 1, 2, 3), prior)
-        start = common_plane.solve(model.camera(believed).undistort(uv), data.base_T_ee)
+        start = closed_form.solve(model.camera(believed).undistort(uv), data.base_T_ee)
         problem = SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens)
         exact = refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)
         for out, found in (

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import Told
+from gripmon.laser.matching import Matcher, PulseSettings, Shown, Told, mean_image
 from gripmon.model.records import Frame, PulseFault
 
 POSE = np.eye(4)

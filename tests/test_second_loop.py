@@ -17,10 +17,9 @@ from support.stand_ins import Listener, ScriptedSource
 from gripmon.daemon import DaemonSettings, run_second
 from gripmon.daemon.config.second import read_laser
 from gripmon.io.sources import Waiting
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import LONGEST_S, Told, of_message
-from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.laser.watch import SpotWatchSettings
+from gripmon.laser.judgement import SpotWatchSettings
+from gripmon.laser.matching import LONGEST_S, PulseSettings, Told, of_message
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,

@@ -9,10 +9,11 @@ import pytest
 from support.pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
 from gripmon.calibrate.sighting import NotFound
-from gripmon.laser.pointer.spots import Spot
-from gripmon.laser.watch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
-from gripmon.laser.watch.foresight import foresight
-from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.laser.judgement import SpotFault, SpotSeen, SpotWatchSettings
+from gripmon.laser.planning import foresight
+from gripmon.laser.spots import Spot, plain_spot
+from gripmon.laser.watch import SpotWatch
+from gripmon.laser.world import calibrated, foresee
 from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 
 

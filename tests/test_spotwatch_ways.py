@@ -5,14 +5,12 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from support.laser_scenes import laser_printed
 from support.pulsed_laser import calibration, drawn_world, poses, true_world
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.document import setup_of
-from gripmon.laser.pointer.setup import origin_axes, spots_between, spots_on_plane, spots_on_rays
-from gripmon.laser.watch.single import visible
-from gripmon.laser.watch.ways import INPUTS, disagreements, ways
-from gripmon.laser.watch.world import calibrated, foresee, foresee_moved, larger
+from gripmon.laser.setup import origin_axes, setup_of, spots_on_plane
+from gripmon.laser.world import INPUTS, calibrated, disagreements, foresee, foresee_moved, larger, visible, ways
 from gripmon.model.geometry import invert, perturb
 
 STEP = 1e-6
@@ -85,13 +83,15 @@ def test_the_three_ways_are_those_of_the_calibration_with_derivatives(known):
     xy = known.camera.undistort(uv[None])
     points = [
         spots_on_plane(setup, pose[None])[0],
-        spots_on_rays(setup, xy)[0],
-        spots_between(setup, pose[None], xy)[0],
+        laser_printed.spots_on_rays(setup, xy)[0],
+        laser_printed.spots_between(setup, pose[None], xy)[0],
     ]
     base = known.world.base_T_cam
     expected = np.concatenate(points) @ base[:3, :3].T + base[:3, 3]
     assert np.allclose(found.spots_base_m, expected, atol=1e-12)
-    assert np.linalg.norm(found.gap_m) == pytest.approx(float(spots_between(setup, pose[None], xy)[1][0]), abs=1e-12)
+    assert np.linalg.norm(found.gap_m) == pytest.approx(
+        float(laser_printed.spots_between(setup, pose[None], xy)[1][0]), abs=1e-12
+    )
 
     def again(step):
         return ways(known.world.moved(step[:13]), known.camera, perturb(pose, step[15:]), uv + step[13:15])

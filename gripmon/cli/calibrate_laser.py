@@ -13,8 +13,8 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.laser.api import CalibratedLaser
-    from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.laser.pointer.planning import Plan
+    from gripmon.laser.planning import Plan
+    from gripmon.laser.setup import LaserCalibration
     from gripmon.model.provenance import Provenance
 
 LONGEST_ARM_M = 20.0
@@ -83,7 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate laser``."""
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.laser.api import PoseNoise, calibrate_laser
-    from gripmon.laser.pointer.samples import plan_table
+    from gripmon.laser.samples import plan_table
 
     out = Path(arguments.out)
     _check_outputs(arguments)

@@ -12,9 +12,9 @@ from gripmon.cli import common
 from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
-    from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatchSettings
-    from gripmon.laser.watch.foresight import Foresight
+    from gripmon.laser.judgement import CameraMotion, SpotJudgement, SpotWatchSettings
+    from gripmon.laser.planning import Foresight
+    from gripmon.laser.setup import LaserCalibration
     from gripmon.model.records import Array
 
 _OPTIONS = ("arm_noise", "false_alarms", "wrong_spots")
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _settings(arguments: argparse.Namespace) -> SpotWatchSettings:
-    from gripmon.laser.watch import SpotWatchSettings
+    from gripmon.laser.judgement import SpotWatchSettings
 
     given: dict[str, Any] = {}
     if arguments.arm_noise is not None:
@@ -101,8 +101,8 @@ def _calibration(path: Path) -> LaserCalibration:
 
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
     """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
-    from gripmon.laser.watch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
-    from gripmon.laser.watch.world import calibrated
+    from gripmon.laser.planning import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
+    from gripmon.laser.world import calibrated
 
     known = calibrated(calibration)
     try:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gripmon.laser.pulses.told import Told
+from gripmon.laser.matching import Told
 from gripmon.model.records import (
     Command,
     CommandError,

@@ -25,8 +25,8 @@ from gripmon.daemon.settings import DaemonSettings
 from gripmon.daemon.snapshots import Snapshots
 from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import PulsedWatch
+from gripmon.laser.matching import Told
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import Alert
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.record.write import EventRecorder, Recorder, SpotRecorder

@@ -18,9 +18,8 @@ from gripmon.daemon.watch import Judged
 from gripmon.io.publish import SpotPublisher
 from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
-from gripmon.laser.pulses.matching import Shown
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import Outcome, PulsedWatch
+from gripmon.laser.matching import Shown, Told
+from gripmon.laser.watching import Outcome, PulsedWatch
 from gripmon.model.records import (
     Alert,
     AlertKind,

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gripmon.laser.pointer.calibrating import Spots, calibrate
-from gripmon.laser.pointer.document import LaserCalibration, document
-from gripmon.laser.pointer.setup import LaserSetup
-from gripmon.laser.watch import SpotSeen, plain_spot
-from gripmon.laser.watch.world import Calibrated, World, calibrated, foresee
+from gripmon.laser.calibrating import Spots, calibrate
+from gripmon.laser.judgement import SpotSeen
+from gripmon.laser.setup import LaserCalibration, LaserSetup, document
+from gripmon.laser.spots import plain_spot
+from gripmon.laser.world import Calibrated, World, calibrated, foresee
 from gripmon.model.geometry import invert, perturb
 from gripmon.model.provenance import provenance_of
 from support.laser_scenes import paper_setup, sampled

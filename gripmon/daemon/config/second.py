@@ -22,11 +22,10 @@ from gripmon.io.metrics import MetricsSettings
 from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
 from gripmon.io.sources.pulses import read_pulses
 from gripmon.io.wire import Joining, PublishSettings
-from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.laser.watch import SpotWatchSettings
+from gripmon.laser.judgement import SpotWatchSettings
+from gripmon.laser.matching import PulseSettings, Told
+from gripmon.laser.setup import LaserCalibration
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.camera import Camera, make_camera
 from gripmon.record.write import RecordingSettings, ViewSettings
 

@@ -9,7 +9,7 @@ import zenoh
 
 from gripmon.io.wire import Link
 from gripmon.io.wire.malformed import Malformed
-from gripmon.laser.pulses.told import Told, of_message
+from gripmon.laser.matching import Told, of_message
 from gripmon.model.records import LaserPulse, MessageRefused, from_json, largest_bytes
 
 _log = logging.getLogger(__name__)

@@ -6,7 +6,7 @@ import csv
 from pathlib import Path
 
 from gripmon.io.sources.base import SourceError
-from gripmon.laser.pulses.told import Told, of_rows
+from gripmon.laser.matching import Told, of_rows
 
 COLUMNS = "stamp_ns,until_ns,tx_m,ty_m,tz_m,qx,qy,qz,qw"
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from gripmon.laser.pointer.refinement import Refined
-from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
+from gripmon.laser.refinement import Refined
+from gripmon.laser.setup import laser_lines, spots_on_plane
 from gripmon.model.geometry import invert
 from gripmon.model.records import Array
 

@@ -23,8 +23,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
-from gripmon.laser.pointer.document import LaserCalibration, setup_of
-from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
+from gripmon.laser.setup import LaserCalibration, laser_lines, setup_of, spots_on_plane
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array, SpotRecord, to_json
 from gripmon.record.write import palette

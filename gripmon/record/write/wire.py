@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (

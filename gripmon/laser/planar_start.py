@@ -1,11 +1,4 @@
-"""Steps 2 and 3 of the closed form, better: all orientations share one plane, and wrong spots are left out.
-
-On a plane with the normal n the spots are ``s = ray / (nᵀ ray)`` up to the plane's distance, and shifts without turning
-move them linearly: ``s = T + B w``.  For each n that is a linear fit of eight unknowns an orientation, where the direct
-linear transformation of the print (equations (15) to (18)) has eleven and finds n only afterwards; n itself is sought
-over the half sphere of what a camera can see, coarsely, then around what is best.  Wrong spots are found by least
-trimmed squares over small subsets (Rousseeuw, 1984).
-"""
+""""""
 
 from __future__ import annotations
 
@@ -18,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.setup import basis
+from gripmon.laser.setup import basis
 from gripmon.model.least_squares import Equations, minimise, normal_equations
 from gripmon.model.records import Array
 

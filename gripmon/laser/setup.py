@@ -1,17 +1,19 @@
-"""A laser pointer on the end-effector, a plane that its spot falls on, and a fixed camera that sees the spot.
-
-Three ways lead to the same spot (laser-pointer method, equations (7) to (14)): laser line and plane, camera ray and
-plane, laser line and camera ray.  Where they disagree, something has moved.
-"""
+""""""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
-from gripmon.model.geometry import perturb, skew
-from gripmon.model.records import Array
+from gripmon.laser.refinement import Refined
+from gripmon.model.camera import LensSettings
+from gripmon.model.geometry import from_record, invert, perturb, skew, to_record
+from gripmon.model.provenance import Provenance
+from gripmon.model.records import Array, Transform
 
 PARAMETERS = (
     "cam_T_base.x_m", "cam_T_base.y_m", "cam_T_base.z_m", "cam_T_base.rx_rad", "cam_T_base.ry_rad", "cam_T_base.rz_rad",
@@ -123,35 +125,128 @@ def pose_slopes(setup: LaserSetup, base_T_ee: Array) -> Array:
     return slopes
 
 
-def spots_on_rays(setup: LaserSetup, xy: Array) -> tuple[Array, Array]:
-    """Camera ray and plane, equations (10) to (12): spots (n, 3) in the camera frame of ideal image points (n, 2), and
-    their derivatives (n, 3, 2) by these; NaN where a ray doesn't meet the plane before the camera.
-    """
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    n = setup.normal_cam
-    steep = rays @ n
-    depth = setup.distance_m / np.where(np.abs(steep) > 1e-9, steep, np.nan)
-    depth = np.where(depth > 0.0, depth, np.nan)
-    spots = depth[:, None] * rays
-    slopes = depth[:, None, None] * (np.eye(3)[None, :, :2] - rays[:, :, None] * n[:2] / steep[:, None, None])
-    return spots, slopes
+Vector = tuple[float, float, float]
+_Length = Annotated[float, Meta(ge=0.0)]
+
+NAMES = (
+    "base_T_cam.x_m", "base_T_cam.y_m", "base_T_cam.z_m",
+    "base_T_cam.rx_rad", "base_T_cam.ry_rad", "base_T_cam.rz_rad",
+    *PARAMETERS[6:],
+)  # fmt: skip
+"""Rows of a file's covariance: the camera's pose (position, then rotation, base axes), plane, laser line."""
 
 
-def spots_between(setup: LaserSetup, base_T_ee: Array, xy: Array) -> tuple[Array, Array, Array]:
-    """Laser line and camera ray, equations (13) and (14): the points of the rays (n, 3) that the lines come nearest to,
-    the distances (n,) that are left between them (m), and the depths' derivatives (n, 2) by the image points; NaN where
-    both are parallel.  No plane is needed: it may have moved.
+class Plane(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``normal . p = distance`` in the camera frame and in the base's; normals point away from the camera."""
+
+    normal_cam: Vector
+    distance_cam_m: float
+    normal_base: Vector
+    distance_base_m: float
+
+
+class LaserLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A point of the beam and its unit direction, end-effector frame."""
+
+    point_ee_m: Vector
+    direction_ee: Vector
+
+
+class LaserResiduals(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How well the spots fit."""
+
+    rms_px: Annotated[_Length, Meta(description="root mean square of the used residuals, u and v each (px)")]
+    sigma_px: Annotated[_Length, Meta(description="the spots' noise that they show, each axis (px)")]
+    spots: Annotated[int, Meta(ge=1)]
+    used: Annotated[int, Meta(ge=1)]
+    orientations: Annotated[int, Meta(ge=1)]
+    degrees_of_freedom: Annotated[int, Meta(ge=1)]
+    outliers: Annotated[tuple[str, ...], Meta(description="samples that were left out")] = ()
+
+
+class LaserCalibration(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="schema",
+    tag="gripmon.laser_calibration/1",
+):  # fmt: skip
+    """``base_T_cam``, plane and laser line; ``covariance`` (n·n, row by row) of the n ``parameters``, ``sigmas`` the
+    roots of its diagonal.  ``camera`` is the refined one where the lens was refined.
     """
-    origin, u = laser_lines(setup, base_T_ee)
-    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    # The depth z at which z ray is nearest to the line: (I - u uᵀ)(z ray - origin) has its least length.
-    across = rays - u * np.einsum("ni,ni->n", rays, u)[:, None]
-    size = np.einsum("ni,ni->n", across, across)
-    size = np.where(size > 1e-12, size, np.nan)
-    depth = np.einsum("ni,ni->n", across, origin) / size
-    left = depth[:, None] * rays - origin
-    left = left - u * np.einsum("ni,ni->n", left, u)[:, None]
-    # d(depth) of d(xy): the quotient's derivative, the projection being its own square.
-    flat = origin - u * np.einsum("ni,ni->n", origin, u)[:, None]
-    slopes = (flat[:, :2] - 2.0 * depth[:, None] * across[:, :2]) / size[:, None]
-    return depth[:, None] * rays, np.linalg.norm(left, axis=1), slopes
+
+    camera: LensSettings
+    base_T_cam: Transform
+    plane: Plane
+    laser: LaserLine
+    parameters: tuple[str, ...]
+    sigmas: dict[str, float]
+    covariance: tuple[float, ...]
+    residuals: LaserResiduals
+    warnings: tuple[str, ...] = ()
+    provenance: Provenance
+
+
+def pose_jacobian(cam_T_base: Array) -> Array:
+    """How a perturbation of ``cam_T_base`` (camera axes) perturbs ``base_T_cam`` (base axes), (6, 6)."""
+    turn = cam_T_base[:3, :3].T
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = -turn
+    out[:3, 3:] = -turn @ skew(cam_T_base[:3, 3])
+    return out
+
+
+def base_covariance(refined: Refined) -> Array:
+    """(13, 13) of :data:`NAMES`."""
+    change = np.eye(len(NAMES))
+    change[:6, :6] = pose_jacobian(refined.setup.cam_T_base)
+    out: Array = change @ refined.covariance @ change.T
+    return out
+
+
+def document(
+    refined: Refined, names: tuple[str, ...], orientations: int, warnings: tuple[str, ...], provenance: Provenance
+) -> LaserCalibration:
+    """What is written of a result."""
+    setup, covariance = refined.setup, base_covariance(refined)
+    base_T_cam = invert(setup.cam_T_base)
+    normal_base = base_T_cam[:3, :3] @ setup.normal_cam
+    sigmas = np.sqrt(covariance.diagonal())
+    return LaserCalibration(
+        camera=refined.camera,
+        base_T_cam=to_record(base_T_cam),
+        plane=Plane(
+            normal_cam=_vector(setup.normal_cam),
+            distance_cam_m=setup.distance_m,
+            normal_base=_vector(normal_base),
+            distance_base_m=setup.distance_m + float(normal_base @ base_T_cam[:3, 3]),
+        ),
+        laser=LaserLine(point_ee_m=_vector(setup.point_ee_m), direction_ee=_vector(setup.direction_ee)),
+        parameters=NAMES,
+        sigmas=dict(zip(NAMES, sigmas.tolist(), strict=True)),
+        covariance=tuple(covariance.ravel().tolist()),
+        residuals=LaserResiduals(
+            rms_px=refined.rms_px,
+            sigma_px=refined.scale_px,
+            spots=len(names),
+            used=int(refined.used.sum()),
+            orientations=orientations,
+            degrees_of_freedom=refined.degrees_of_freedom,
+            outliers=tuple(name for name, used in zip(names, refined.used, strict=True) if not used),
+        ),
+        warnings=warnings,
+        provenance=provenance,
+    )
+
+
+def setup_of(calibration: LaserCalibration) -> LaserSetup:
+    """The set-up that a file describes."""
+    return LaserSetup(
+        invert(from_record(calibration.base_T_cam)),
+        np.array(calibration.plane.normal_cam),
+        calibration.plane.distance_cam_m,
+        np.array(calibration.laser.point_ee_m),
+        np.array(calibration.laser.direction_ee),
+    )
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

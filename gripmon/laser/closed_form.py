@@ -1,12 +1,19 @@
-"""Eye, hand and workspace from laser spots in closed form: the eight steps of the laser-pointer method.
+"""Eye, hand and workspace from laser spots in closed form: one plane for all orientations, so one scale, and no sign to
+guess.
 
 At each of M orientations the end-effector is shifted without turning; the spot then moves on the plane by
 
     p = T_m + G_m C_R_B w,    G_m = I - u_m nᵀ / (u_mᵀ n)
 
-(w the shift in the base's axes, u_m the beam, n the plane's normal, camera axes).  Every step is a function of its own;
-noise-free data give exact results.
-"""
+(w the shift in the base's axes, u_m the beam, n the plane's normal, camera axes).
+:mod:`~gripmon.laser.planar_start` gives n and, with spots ``s = ray / (nᵀ ray)`` that have the same scale 1 / distance
+everywhere, one matrix an orientation whose part in the plane is
+
+    A_m = P G_m R / distance = (P R - (P v_m) (nᵀ R)) / distance,    R = C_R_B,  u_m ~ n + v_m,
+
+P the two axes of the plane.  So differences between orientations have rank one with nᵀ R, the plane's normal in base
+axes, as their row; what is left of all A_m across it is P R / distance.  Steps 4 and 5 of the print become linear, over
+all orientations at once; there they have an unknown scale and an unknown sign each."""
 
 from __future__ import annotations
 
@@ -18,7 +25,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.setup import LaserSetup, basis, origin_axes
+from gripmon.laser.planar_start import SUBSET, planar_start
+from gripmon.laser.setup import LaserSetup, basis, origin_axes
 from gripmon.model.geometry import make_transform
 from gripmon.model.records import Array
 
@@ -61,29 +69,6 @@ def orientation_groups(base_T_ee: Array, tolerance_rad: float = SAME_ORIENTATION
             groups.append([index])
             firsts.append(rotation)
     return [np.array(group, dtype=np.intp) for group in groups]
-
-
-def solve(xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None) -> LaserSetup:
-    """All steps as printed: ideal image points (n, 2) (step 1 has undistorted them) and poses (n, 4, 4) -> the set-up.
-
-    :func:`gripmon.laser.pointer.common_plane.solve` is the better one with noise.  Raises
-    :class:`CalibrationError` that names the degenerate case: too few orientations, shifts in a plane, turned about one
-    axis, a plane through the camera, a beam along the plane.
-    """
-    check_spots(xy)
-    usable = [
-        replace(o, matrix=spot_matrix(xy[o.members], base_T_ee[o.members, :3, 3] - o.centre_m))
-        for o in usable_orientations(base_T_ee, groups, FEWEST_SHIFTS)
-    ]
-    normal = plane_normal([o.matrix for o in usable])
-    chosen = consistent_beams([beam_candidates(o.matrix, normal) for o in usable])
-    cam_R_base = mean_rotation([c.cam_R_base for c in chosen])
-    direction = beam_in_hand([c.beam_cam for c in chosen], [o.base_R_ee for o in usable], cam_R_base)
-    point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction)
-    distance = plane_distance(usable, scales, normal, base_T_ee)
-    if distance < 0.0:
-        normal, distance = -normal, -distance
-    return LaserSetup(make_transform(cam_R_base, shift), normal, distance, point, direction)
 
 
 def check_spots(xy: Array) -> None:
@@ -139,92 +124,6 @@ def _check_turns(base_R_ee: Array) -> None:
             f"{len(base_R_ee)} orientations, turned about one axis only: where the laser sits along it stays unknown; "
             "at least three orientations, turned about at least two axes"
         )
-
-
-def spot_matrix(xy: Array, shifts_m: Array) -> Array:
-    """Step 2, equations (15) to (17): the matrix (3, 4) with ``z [x y 1]ᵀ = H [w 1]ᵀ`` by direct linear transformation,
-    of any scale, its sign such that depths are positive; shifts (k, 3) are scaled first, for the sake of rounding.
-    """
-    scale = float(np.linalg.norm(shifts_m, axis=1).mean())
-    w = np.concatenate([shifts_m / scale, np.ones((len(xy), 1))], axis=1)
-    middle, size = xy.mean(axis=0), float(np.linalg.norm(xy - xy.mean(axis=0), axis=1).mean())
-    if size < 1e-9:
-        raise CalibrationError("the spots of an orientation coincide; shifts that move the spot in the image")
-    x, y = ((xy - middle) / size).T
-    zero = np.zeros_like(w)
-    rows = np.concatenate(
-        [np.concatenate([w, zero, -x[:, None] * w], axis=1), np.concatenate([zero, w, -y[:, None] * w], axis=1)]
-    )
-    found = np.linalg.svd(rows)[2][-1].reshape(3, 4)
-    matrix = np.array([[size, 0.0, middle[0]], [0.0, size, middle[1]], [0.0, 0.0, 1.0]]) @ found
-    matrix[:, :3] /= scale
-    depth = matrix[2] @ np.concatenate([shifts_m, np.ones((len(xy), 1))], axis=1).T
-    return matrix * (np.sign(np.median(depth)) / np.linalg.norm(matrix[:, 3]))
-
-
-def plane_normal(matrices: Sequence[Array]) -> Array:
-    """Step 3, equation (18): what stands on all motions of the spot, the smallest singular vector (3,); away from the
-    camera.
-    """
-    motions = np.concatenate([m[:, :3].T / np.linalg.norm(m[:, :3]) for m in matrices])
-    _, sizes, axes = np.linalg.svd(motions)
-    if sizes[1] < FLAT * sizes[0]:
-        raise CalibrationError("the spots move along one line only; orientations and shifts that move it across, too")
-    normal = axes[2]
-    towards = float(np.median([normal @ m[:, 3] for m in matrices]))
-    if abs(towards) < 1e-4:
-        raise CalibrationError("the plane goes through the camera; a plane that it sees from above")
-    out: Array = normal * np.sign(towards)
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class BeamCandidate:
-    """A beam (3,) in camera axes, and the rotation between camera and base that it asks for."""
-
-    beam_cam: Array
-    cam_R_base: Array
-
-
-def beam_candidates(matrix: Array, normal: Array) -> tuple[BeamCandidate, BeamCandidate]:
-    """Step 4, equations (19) to (25), for one orientation: both beams that its matrix allows.
-
-    With the beam written as ũ = u / (uᵀ n) = n + v, v in the plane, the left part A = lambda G C_R_B of the matrix has
-
-        A Aᵀ = lambda² (I - ũ nᵀ - n ũᵀ + ũ ũᵀ) = lambda² (I - n nᵀ + v vᵀ):
-
-    in the plane its eigenvalues are lambda² and lambda² (1 + |v|²), with v along the larger one's axis, of unknown
-    sign.  (The print's equation (25) has lost its scale; this is the same with ũᵀ n = 1.)
-    """
-    a, b = basis(normal)
-    plane = np.stack([a, b])
-    motion = plane @ matrix[:, :3]
-    values, axes = np.linalg.eigh(motion @ motion.T)
-    if values[0] <= 1e-12 * values[1]:
-        raise CalibrationError("the spot moves along one line only; a beam that doesn't run along the plane")
-    slope = float(np.sqrt(max(values[1] / values[0] - 1.0, 0.0)))
-    out = []
-    for sign in (1.0, -1.0):
-        v = plane.T @ (sign * slope * axes[:, 1])
-        beam = normal + v
-        # plane G = plane - (plane v) nᵀ; its rows, turned by C_R_B, are the measured motion's.
-        rows = plane - np.outer(plane @ v, normal)
-        out.append(BeamCandidate(beam / np.linalg.norm(beam), _rotation_of(rows, motion / np.sqrt(values[0]))))
-    return out[0], out[1]
-
-
-def consistent_beams(candidates: Sequence[tuple[BeamCandidate, BeamCandidate]]) -> list[BeamCandidate]:
-    """One of each pair, such that all ask for the same rotation between camera and base."""
-    best: list[BeamCandidate] = []
-    least = np.inf
-    for pair in candidates:
-        for start in pair:
-            chosen = [min(p, key=lambda c: -float(np.trace(c.cam_R_base.T @ start.cam_R_base))) for p in candidates]
-            mean = mean_rotation([c.cam_R_base for c in chosen])
-            apart = sum(3.0 - float(np.trace(c.cam_R_base.T @ mean)) for c in chosen)
-            if apart < least:
-                best, least = chosen, apart
-    return best
 
 
 def mean_rotation(rotations: Sequence[Array]) -> Array:
@@ -289,24 +188,65 @@ def positions(
     return point, solution[2:5], scales
 
 
-def plane_distance(orientations: Sequence[Orientation], scales: Array, normal: Array, base_T_ee: Array) -> float:
-    """Step 8, equation (34): the mean of nᵀ p over all spots (m)."""
-    distances = []
-    for orientation, scale, shifts in zip(orientations, scales, _shifts_of(orientations, base_T_ee), strict=True):
-        spots = scale * np.concatenate([shifts, np.ones((len(shifts), 1))], axis=1) @ orientation.matrix.T
-        distances.append(spots @ normal)
-    return float(np.mean(np.concatenate(distances)))
-
-
 def _shifts_of(orientations: Sequence[Orientation], base_T_ee: Array) -> list[Array]:
     return [base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
 
 
-def _rotation_of(rows: Array, turned: Array) -> Array:
-    """The rotation R with ``rows R = turned``, both (2, 3), nearest to it (Kabsch, 1976)."""
-    before = np.concatenate([rows, np.cross(rows[0], rows[1])[None]])
-    after = np.concatenate([turned, np.cross(turned[0], turned[1])[None]])
-    left, _, right = np.linalg.svd(before.T @ after)
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
-    out: Array = left @ flip @ right
-    return out
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, towards the plane's far side or back: no sign), and
+    the plane's ``distance_m``.
+    """
+
+    cam_R_base: Array
+    beams_cam: Array
+    distance_m: float
+
+
+def solve(
+    xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, robust: bool = True
+) -> LaserSetup:
+    """As :func:`gripmon.laser.closed_form.solve`; ``robust``: wrong spots are sought and left out."""
+    check_spots(xy)
+    usable = usable_orientations(base_T_ee, groups, SUBSET + 1)
+    shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
+    start = planar_start(xy, shifts, [o.members for o in usable], robust=robust)
+    usable = [replace(o, matrix=m) for o, m in zip(usable, start.matrices, strict=True)]
+    turn = turn_from_motions([o.matrix[:, :3] for o in usable], start.normal)
+    direction = beam_in_hand(list(turn.beams_cam), [o.base_R_ee for o in usable], turn.cam_R_base)
+    point, shift, scales = positions(usable, base_T_ee, turn.cam_R_base, direction, one_plane=True)
+    distance = float(scales[0])
+    if distance <= 0.0:
+        raise CalibrationError(
+            "the spots put the plane behind the camera: poses and spots don't belong together (out of step, or "
+            "ee_T_base for base_T_ee); each spot with the pose that it was seen at"
+        )
+    return LaserSetup(make_transform(turn.cam_R_base, shift), start.normal, distance, point, direction)
+
+
+def turn_from_motions(motions: Sequence[Array], normal: Array) -> Turn:
+    """Steps 4 and 5 together, from the matrices (3, 3) by which shifts in base axes move the spots of the plane
+    ``normalᵀ s = 1`` (camera axes).
+    """
+    plane = np.stack(basis(normal))
+    flat = np.stack([plane @ m for m in motions])
+    apart = flat - flat.mean(axis=0)
+    left, sizes, rows = np.linalg.svd(apart.reshape(-1, 3), full_matrices=False)
+    if sizes[0] < FLAT * np.linalg.norm(flat):
+        raise CalibrationError(
+            "the beam meets the plane at the same angle at every orientation; orientations that tilt the beam"
+        )
+    across = rows[0]
+    mean = flat.mean(axis=0) @ (np.eye(3) - np.outer(across, across))
+    # P R / distance has two rows of equal length that stand on each other: the nearest such matrix.
+    left, sizes, right = np.linalg.svd(mean, full_matrices=False)
+    if sizes[1] < FLAT * sizes[0]:
+        raise CalibrationError("the spots move along one line only; a beam that doesn't run along the plane")
+    turned = left @ right
+    scale = float(sizes.mean())
+    third = np.cross(turned[0], turned[1])
+    cam_R_base: Array = np.concatenate([plane, normal[None]]).T @ np.concatenate([turned, third[None]])
+    # A_m third = -(P v_m) / distance
+    leaning = -(flat @ third) / scale
+    beams = normal + leaning @ plane
+    return Turn(cam_R_base, beams / np.linalg.norm(beams, axis=1)[:, None], 1.0 / scale)

@@ -1,4 +1,4 @@
-"""Laser spots in images: sub-pixel, from saturated, speckled blobs, with a covariance and the candidates beside it."""
+""""""
 
 from __future__ import annotations
 

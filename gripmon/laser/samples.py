@@ -1,4 +1,4 @@
-"""Samples of the laser-pointer method: spots, or images that show them, and the poses that they were seen at."""
+""""""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.calibrate.tables import POSITION, QUATERNION, Row, check_scale, numbers_of, pose_of, rows_of
-from gripmon.laser.pointer.planning import Plan
-from gripmon.laser.pointer.spots import Spot, find_spots, plain_spot
+from gripmon.laser.planning import Plan
+from gripmon.laser.spots import Spot, find_spots, plain_spot
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import quaternion_xyzw
 from gripmon.model.images import check_size, image_in

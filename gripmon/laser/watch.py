@@ -1,4 +1,4 @@
-"""Pulse after pulse: is the set-up still the one that was calibrated?"""
+""""""
 
 from __future__ import annotations
 
@@ -9,16 +9,22 @@ import numpy as np
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.judge.policy import AlertBook
-from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.laser.pointer.spots import Spot
-from gripmon.laser.watch import words
-from gripmon.laser.watch.beliefs import Places, Pulse
-from gripmon.laser.watch.judgement import SpotFault, SpotJudgement, SpotSeen
-from gripmon.laser.watch.moving import UNIT, Moved, alert_of, how
-from gripmon.laser.watch.sequential import MotionTest
-from gripmon.laser.watch.settings import SpotWatchSettings
-from gripmon.laser.watch.single import Single, alone, visible
-from gripmon.laser.watch.world import Foreseen, calibrated, foresee, larger
+from gripmon.laser.beliefs import MotionTest, Places, Pulse
+from gripmon.laser.judgement import (
+    UNIT,
+    Moved,
+    SpotFault,
+    SpotJudgement,
+    SpotSeen,
+    SpotWatchSettings,
+    alert_of,
+    how,
+    lost_alert,
+    outlier_text,
+)
+from gripmon.laser.setup import LaserCalibration
+from gripmon.laser.spots import Spot
+from gripmon.laser.world import Foreseen, Single, alone, calibrated, foresee, larger, visible
 from gripmon.model.records import Alert, State, Verdict
 
 MOTION, VIEW = "motion", "view"
@@ -105,7 +111,7 @@ class SpotWatch:
         self._moved = how(self._test, self._calibrated, self._places.poses) if self._test.moved else None
         if found.believed:
             return self._told(seen, None, "", foreseen, single, chosen)
-        reason = words.outlier(single.off_px, single.square)
+        reason = outlier_text(single.off_px, single.square)
         return self._told(seen, SpotFault.OUTLIER, reason, foreseen, single, chosen)
 
     def _missing(self, seen: SpotSeen, foreseen: Foreseen, reason: str) -> SpotJudgement:
@@ -185,7 +191,7 @@ class SpotWatch:
     def _alerts(self) -> tuple[Alert, ...]:
         book, now_s, stamp_ns = self.book, self._now_s, self._stamp_ns
         if self.state is State.LOST:
-            alerts = book.present(VIEW, words.lost_alert(self._bad), now_s, stamp_ns)
+            alerts = book.present(VIEW, lost_alert(self._bad), now_s, stamp_ns)
         else:
             alerts = book.absent(VIEW, "spots are seen again", now_s, at_once=True) if not self._bad else ()
         motion_alert = self.motion_alert

@@ -1,21 +1,20 @@
-"""From spots and poses to a refined set-up: start, refinement, other candidates, and why it can't be."""
+""""""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer import common_plane
-from gripmon.laser.pointer.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups
-from gripmon.laser.pointer.misreading import SUSPECT_PX, check_reading
-from gripmon.laser.pointer.refinement import Refined, refine, with_held_lens
-from gripmon.laser.pointer.setup import LaserSetup
-from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
+from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
+from gripmon.laser.refinement import LensPrior, PoseNoise, Refined, SpotProblem, refine, with_held_lens
+from gripmon.laser.setup import LaserSetup
 from gripmon.model.camera import Camera
+from gripmon.model.geometry import invert
 from gripmon.model.records import Array
 
 FARTHEST_PLANE_M = 50.0
@@ -100,7 +99,7 @@ def calibrate(
     groups = groups_of(labels, base_T_ee)
     fault: CalibrationError | None = None
     try:
-        start = common_plane.solve(xy, base_T_ee, groups)
+        start = solve(xy, base_T_ee, groups)
         found = _refined(camera, base_T_ee, spots, start, lens if refine_lens else None, pose_noise)
     except CalibrationError as error:
         fault = error
@@ -222,4 +221,61 @@ def _check_sizes(found: Refined) -> None:
         raise CalibrationError(
             f"the laser's line would pass the end-effector's origin at {offset:.3g} m: are the poses in centimetres or "
             "inches, or of another frame than the hand's? metres, base_T_ee"
+        )
+
+
+SUSPECT_PX = 3.0
+"""Noise of spots from which it is asked whether the poses are what they are taken for."""
+LEAST_FITTING = 0.7
+"""Part of the spots that has to fit another reading before it is named."""
+_OFFSETS = (1, -1, 2, -2)
+
+
+def check_reading(camera: Camera, base_T_ee: Array, uv_px: Array, fault: CalibrationError | None) -> None:
+    """Raise :class:`CalibrationError` with the reading of poses (n, 4, 4) that spots (n, 2) fit, if there is one;
+    ``fault`` is what was wrong with the reading that was taken.
+    """
+    xy = camera.undistort(uv_px)
+    for poses, part, said in _readings(base_T_ee):
+        try:
+            found = refine(SpotProblem(camera, poses, uv_px[part]), solve(xy[part], poses))
+        except CalibrationError:
+            continue
+        if found.used.mean() > LEAST_FITTING and found.scale < SUSPECT_PX:
+            agree = f"{int(found.used.sum())} of {len(poses)} agree, {found.scale:.2g} px"
+            raise CalibrationError(said.format(agree=agree)) from fault
+
+
+def _readings(base_T_ee: Array) -> Iterator[tuple[Array, slice, str]]:
+    """Poses, the spots that belong to them, and what there is to say with how well they fit."""
+    everything = slice(None)
+    inverted = np.stack([invert(pose) for pose in base_T_ee])
+    yield inverted, everything, "the poses are ee_T_base: inverted, the spots fit ({agree}); base_T_ee"
+    quaternions = Rotation.from_matrix(base_T_ee[:, :3, :3]).as_quat()
+    reordered = base_T_ee.copy()
+    reordered[:, :3, :3] = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
+    yield (
+        reordered,
+        everything,
+        ("the quaternions have w first: read so, the spots fit ({agree}); qx, qy, qz, qw, in this order"),
+    )
+    transposed = base_T_ee.copy()
+    transposed[:, :3, :3] = base_T_ee[:, :3, :3].transpose(0, 2, 1)
+    yield (
+        transposed,
+        everything,
+        ("the rotations are the other way round: inverted, the spots fit ({agree}); base_R_ee"),
+    )
+    for offset in _OFFSETS:
+        count = len(base_T_ee) - abs(offset)
+        own = slice(max(offset, 0), max(offset, 0) + count)
+        other = slice(max(-offset, 0), max(-offset, 0) + count)
+        which = "later" if offset > 0 else "earlier"
+        yield (
+            base_T_ee[own],
+            other,
+            (
+                f"poses and images are out of step: spots fit the poses {abs(offset)} row(s) {which} ({{agree}}); each "
+                "spot with its own pose"
+            ),
         )
