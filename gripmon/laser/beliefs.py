@@ -1,4 +1,19 @@
-""""""
+"""Has anything moved?  Shiryaev and Roberts's procedure over normal beliefs, with a stated rate of false alarms.
+
+A belief is about a set-up: how it was calibrated, by how much it has moved since, and by how much the arm and the lens
+are off at the poses where pulses come from.  What the calibration is off by is the same for all pulses; what the arm
+and the lens are off by is the same for pulses from one pose.  Both are unknowns with a known covariance here, so that
+no number of pulses is mistaken for as many independent witnesses.
+
+With every pulse a new alternative begins: "something moved just now", for each thing that may have and for small and
+large motions.  Each belief predicts where the next spot will be, and how surely; the product of how much better an
+alternative's prediction was than the reigning belief's is its likelihood ratio.  Under the reigning belief the sum R of
+the ratios less the number of pulses is a martingale, so that R exceeds K once in K pulses at most, on average, whatever
+alternatives there are and however few of them are kept (Pollak, Ann. Statist. 13, 1985).
+
+A spot may be wrong: a reflection, or speckle beside it.  Half of the wrong ones lie anywhere in the image, the others
+near the right one as readily as far off: uniformly in the logarithm of the distance.
+"""
 
 from __future__ import annotations
 

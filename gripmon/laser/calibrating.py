@@ -1,4 +1,4 @@
-""""""
+"""From spots and poses to a refined set-up: start, refinement, other candidates, and why it can't be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-""""""
+"""Pulses of the laser as they are reported, and which frames show which of them: by their stamps alone, no clock."""
 
 from __future__ import annotations
 

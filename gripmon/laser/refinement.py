@@ -1,4 +1,10 @@
-""""""
+"""All parameters of a laser set-up at once: the least distance between measured and predicted spots in the image.
+
+Equation (35) of the laser-pointer method, with an analytic Jacobian.  Wrong spots (speckle, reflections) get no weight
+where they contradict the rest: Tukey's biweight on a robust scale that shrinks with the residuals; at the end those
+beyond what noise explains are left out, and the rest counts in full.  (The print keeps the 50 nearest of 90, however
+many are wrong.)
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-""""""
+"""A laser pointer on the end-effector, a plane that its spot falls on, a fixed camera that sees the spot; and the file
+of such a set-up's calibration.
+
+The spot is where the laser's line meets the plane, laser-pointer method, equations (7) to (9).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,12 @@
-""""""
+"""Camera, plane and laser line, each in the frame in which it stands still by itself; and three ways to a spot.
+
+What moves alone changes its own parameters only.  A file's covariance has the plane in the camera's frame; here it is
+in the base's, so that a camera that moves leaves it where it is.
+
+The three ways are equations (7) to (14) of the laser-pointer method: beam and plane (7)-(9), camera ray and plane
+(10)-(12), beam and ray (13)-(14).  Each leaves one of the three out: if the plane moved, beam and ray still meet.  All
+in the base frame, to first order in the calibration's 13 parameters, the spot's two coordinates and the arm's six.
+"""
 
 from __future__ import annotations
 
