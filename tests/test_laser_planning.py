@@ -44,7 +44,7 @@ def test_what_is_foretold_is_what_a_calibration_with_these_poses_says():
     exact = data.camera.project(spots_on_plane(data.truth, poses)[0])
     rng = np.random.default_rng(3)
     again = refine(SpotProblem(data.camera, poses, exact + rng.normal(0.0, refined.scale, exact.shape)), data.truth)
-    from gripmon.laser.setup import base_covariance
+    from gripmon.laser.calibrating import base_covariance
 
     sigma = np.sqrt(np.trace(base_covariance(again)[:3, :3]))
     assert sigma == pytest.approx(planned.sigmas[-1, 0], rel=0.35)

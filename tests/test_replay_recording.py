@@ -26,7 +26,7 @@ from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.one_recording import one_recording
 from gripmon.daemon.recorded_run import as_recorded_before_bounds
 from gripmon.daemon.replaying import replay
-from gripmon.io.sources.folder import FolderSettings, FolderSource
+from gripmon.io.sources.files import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
     AlertEvent,

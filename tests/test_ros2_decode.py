@@ -23,7 +23,7 @@ from gripmon.io.ros2 import (
     decode_joint_state,
     subscription_key,
 )
-from gripmon.io.ros2.decode import MOST_JOINT_STATE_BYTES
+from gripmon.io.ros2.node import MOST_JOINT_STATE_BYTES
 
 HEADER = idl.Header(idl.Time(1_700_000_000, 123_456_789), "wrist_optical_frame")
 STAMP_NS = 1_700_000_000_123_456_789

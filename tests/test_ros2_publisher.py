@@ -26,10 +26,9 @@ from gripmon.io.ros2 import (
     Ros2Publisher,
     Ros2Settings,
 )
-from gripmon.io.ros2.messages import inverse
 from gripmon.io.ros2.names import dds_type
-from gripmon.io.ros2.node import gid_of
-from gripmon.io.ros2.types import type_hash
+from gripmon.io.ros2.node import gid_of, type_hash
+from gripmon.io.ros2.publisher import inverse
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 

@@ -108,7 +108,7 @@ def make(arguments: argparse.Namespace) -> int:
 
 def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
     """The names for which there shall be certificates, each with its hosts."""
-    from gripmon.io.wire.rules import names_of
+    from gripmon.io.wire.certificates import names_of
 
     try:
         robots = [name for robot in arguments.robot for name in names_of(robot)]
@@ -122,7 +122,7 @@ def _wanted(arguments: argparse.Namespace) -> dict[str, list[str]]:
 
 def _add_rules(path: Path, robots: list[str]) -> None:
     """Put rules for the robots into a router's file."""
-    from gripmon.io.wire.rules import with_robot
+    from gripmon.io.wire.certificates import with_robot
     from gripmon.model.atomic import write_atomically
 
     try:

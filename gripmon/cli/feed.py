@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon feed``."""
     from gripmon.io.publish.feeding import Feeder
     from gripmon.io.wire import Keys, Link, PublishError, PublishSettings
-    from gripmon.io.wire.settings import check_key
+    from gripmon.io.wire.session import check_key
 
     if wrong := joining.misuse(arguments):
         raise InputError(f"feed: {wrong}")

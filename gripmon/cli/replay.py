@@ -157,7 +157,7 @@ def _run_second(arguments: argparse.Namespace, config: SecondConfig) -> int:
 
 def _refuse_empty_folder(paths: list[Path]) -> None:
     """Before anything else is asked for, which would not help."""
-    from gripmon.io.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+    from gripmon.io.sources.files import IMAGE_SUFFIXES, TIMESTAMPS_NAME
     from gripmon.record.read import recordings_below
 
     for path in paths:

@@ -10,7 +10,7 @@ from gripmon.daemon.config import Config, ConfigError, SecondConfig, check_netwo
 from gripmon.daemon.neighbours import JawFeed, Reports
 from gripmon.io.metrics import MetricsError, MetricsServer
 from gripmon.io.publish import NullPublisher, Presence, Publisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
-from gripmon.io.publish.jaw import opening_of_joints
+from gripmon.io.publish.inputs import opening_of_joints
 from gripmon.io.publish.presence import in_words
 from gripmon.io.ros2 import (
     COMPRESSED_IMAGE,

@@ -17,12 +17,13 @@ from gripmon.calibrate.bundle import LensModel, lens_vector, model_of, parameter
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.picture import disc, line, write
 from gripmon.calibrate.sighting import CalibrationError, NotFound
-from gripmon.laser.calibrating import LaserResult, Spots, calibrate, groups_of
+from gripmon.laser.calibrating import LaserResult, Spots, calibrate, document, groups_of
 from gripmon.laser.judgement import SpotJudgement, SpotSeen, SpotWatchSettings
+from gripmon.laser.planar_start import SEED
 from gripmon.laser.planning import Arm, Plan, plan
 from gripmon.laser.refinement import LensPrior, PoseNoise
 from gripmon.laser.samples import Samples, read_samples, spots_of
-from gripmon.laser.setup import LaserCalibration, document, laser_lines, spots_on_plane
+from gripmon.laser.setup import LaserCalibration, laser_lines, spots_on_plane
 from gripmon.laser.spots import Spot
 from gripmon.laser.watch import SpotWatch
 from gripmon.model.camera import LensSettings, make_camera
@@ -31,6 +32,18 @@ from gripmon.model.geometry import invert
 from gripmon.model.progress import Progress, quiet
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Alert, Array, Image
+
+__all__ = [
+    "SEED",
+    "CalibratedLaser",
+    "LaserCheck",
+    "PoseNoise",
+    "Samples",
+    "SpotWatchSettings",
+    "calibrate_laser",
+    "check_laser",
+    "read_samples",
+]
 
 
 @dataclass(frozen=True, slots=True)

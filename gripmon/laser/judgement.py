@@ -1,4 +1,4 @@
-"""What a person may set about the watch, what it makes of a pulse, and what has moved: how far, and the alert about it."""
+"""The watch's settings, what it makes of a pulse, and what has moved: how far, and the alert about it."""
 
 from __future__ import annotations
 

@@ -8,13 +8,15 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
 from msgspec import Meta
 
-from gripmon.calibrate.tables import Row, check_scale, pose_of
+from gripmon.calibrate.tables import Row, check_scale, pose_of, rows_of
+from gripmon.model.errors import InputError
 from gripmon.model.records import Array, Frame, Image, LaserPulse, PulseFault
 
 _NS = 1_000_000_000
@@ -324,6 +326,18 @@ def of_message(pulse: LaserPulse) -> Told:
         "base_T_ee": {"translation_m": list(pose.translation_m), "rotation_xyzw": list(pose.rotation_xyzw)},
     }
     return _checked(pulse.stamp_ns, pulse.until_ns, row, "the pulse")
+
+
+def read_pulses(path: Path) -> list[Told]:
+    """The pulses of a table, by their stamps; poses as in the tables of ``calibrate laser``.
+
+    Raises :class:`~gripmon.model.errors.InputError`: "file: line: what is wrong; what would be right".
+    """
+    rows, places = rows_of(path)
+    try:
+        return of_rows(rows, places)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[Told]:

@@ -1,4 +1,4 @@
-"""Ahead of the pulses: which poses to take next for a calibration, and which motions of the camera the watch detects."""
+"""Ahead of the pulses: which poses a calibration needs next, and which motions of the camera the watch detects."""
 
 from __future__ import annotations
 

@@ -13,9 +13,8 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from gripmon.laser.refinement import Refined
 from gripmon.model.camera import LensSettings
-from gripmon.model.geometry import from_record, invert, perturb, skew, to_record
+from gripmon.model.geometry import from_record, invert, perturb, skew
 from gripmon.model.provenance import Provenance
 from gripmon.model.records import Array, Transform
 
@@ -195,49 +194,6 @@ def pose_jacobian(cam_T_base: Array) -> Array:
     out[:3, :3] = out[3:, 3:] = -turn
     out[:3, 3:] = -turn @ skew(cam_T_base[:3, 3])
     return out
-
-
-def base_covariance(refined: Refined) -> Array:
-    """(13, 13) of :data:`NAMES`."""
-    change = np.eye(len(NAMES))
-    change[:6, :6] = pose_jacobian(refined.setup.cam_T_base)
-    out: Array = change @ refined.covariance @ change.T
-    return out
-
-
-def document(
-    refined: Refined, names: tuple[str, ...], orientations: int, warnings: tuple[str, ...], provenance: Provenance
-) -> LaserCalibration:
-    """What is written of a result."""
-    setup, covariance = refined.setup, base_covariance(refined)
-    base_T_cam = invert(setup.cam_T_base)
-    normal_base = base_T_cam[:3, :3] @ setup.normal_cam
-    sigmas = np.sqrt(covariance.diagonal())
-    return LaserCalibration(
-        camera=refined.camera,
-        base_T_cam=to_record(base_T_cam),
-        plane=Plane(
-            normal_cam=_vector(setup.normal_cam),
-            distance_cam_m=setup.distance_m,
-            normal_base=_vector(normal_base),
-            distance_base_m=setup.distance_m + float(normal_base @ base_T_cam[:3, 3]),
-        ),
-        laser=LaserLine(point_ee_m=_vector(setup.point_ee_m), direction_ee=_vector(setup.direction_ee)),
-        parameters=NAMES,
-        sigmas=dict(zip(NAMES, sigmas.tolist(), strict=True)),
-        covariance=tuple(covariance.ravel().tolist()),
-        residuals=LaserResiduals(
-            rms_px=refined.rms_px,
-            sigma_px=refined.scale_px,
-            spots=len(names),
-            used=int(refined.used.sum()),
-            orientations=orientations,
-            degrees_of_freedom=refined.degrees_of_freedom,
-            outliers=tuple(name for name, used in zip(names, refined.used, strict=True) if not used),
-        ),
-        warnings=warnings,
-        provenance=provenance,
-    )
 
 
 def setup_of(calibration: LaserCalibration) -> LaserSetup:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import cv2
 
-from gripmon.io.sources.folder import TIMESTAMPS_NAME
+from gripmon.io.sources.files import TIMESTAMPS_NAME
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError, NoResultError
 from gripmon.model.gripper import Gripper

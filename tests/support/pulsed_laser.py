@@ -7,9 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gripmon.laser.calibrating import Spots, calibrate
+from gripmon.laser.calibrating import Spots, calibrate, document
 from gripmon.laser.judgement import SpotSeen
-from gripmon.laser.setup import LaserCalibration, LaserSetup, document
+from gripmon.laser.setup import LaserCalibration, LaserSetup
 from gripmon.laser.spots import plain_spot
 from gripmon.laser.world import Calibrated, World, calibrated, foresee
 from gripmon.model.geometry import invert, perturb

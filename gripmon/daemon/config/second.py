@@ -19,14 +19,14 @@ from gripmon.daemon.config.typed import Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_yaml
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
-from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, SourceSettings, VideoSettings
-from gripmon.io.sources.pulses import read_pulses
+from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceSettings, VideoSettings
 from gripmon.io.wire import Joining, PublishSettings
 from gripmon.laser.judgement import SpotWatchSettings
-from gripmon.laser.matching import PulseSettings, Told
+from gripmon.laser.matching import PulseSettings, Told, read_pulses
 from gripmon.laser.setup import LaserCalibration
 from gripmon.laser.watching import PulsedWatch
 from gripmon.model.camera import Camera, make_camera
+from gripmon.model.errors import InputError
 from gripmon.record.write import RecordingSettings, ViewSettings
 
 SECTION = "laser"
@@ -164,7 +164,7 @@ def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
 def _pulses(path: Path, name: str) -> tuple[Told, ...]:
     try:
         return tuple(read_pulses(path.parent / name))
-    except SourceError as error:
+    except InputError as error:
         wrong, _, right = str(error).rpartition("; ")
         raise ConfigError(path, "laser.pulses", wrong, right) from None
 

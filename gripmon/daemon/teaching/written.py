@@ -18,7 +18,7 @@ from gripmon import __version__
 from gripmon.daemon.config import Config, Settings, load_config
 from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.io.sources import FolderSettings, SourceError
-from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord

@@ -10,10 +10,9 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from gripmon.io.publish.answers import Answers, send_now
-from gripmon.io.publish.presence import Presence, in_words
+from gripmon.io.publish.presence import Answers, Presence, in_words, send_now
 from gripmon.io.wire import Keys, Link
-from gripmon.io.wire.malformed import Malformed
+from gripmon.io.wire.link import Malformed
 from gripmon.model.records import (
     Command,
     CommandError,

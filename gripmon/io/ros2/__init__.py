@@ -6,19 +6,34 @@ imported at the first message.
 
 from __future__ import annotations
 
-from gripmon.io.ros2.decode import (
+from gripmon.io.ros2.names import (
+    Layout,
+    NodeName,
+    Qos,
+    Ros2Fault,
+    Ros2Settings,
+    RosNameError,
+    as_token,
+    fault_of,
+    layout_of,
+    network_of,
+    subscription_key,
+)
+from gripmon.io.ros2.node import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    JOINT_STATE,
+    HeardTopic,
     JointOpening,
+    Listeners,
     MessageError,
+    Node,
+    Ros2Missing,
     decode_compressed_image,
     decode_image,
     decode_joint_state,
 )
-from gripmon.io.ros2.names import NodeName, Qos, RosNameError, as_token, subscription_key
-from gripmon.io.ros2.node import Node
-from gripmon.io.ros2.presence import HeardTopic, Listeners
 from gripmon.io.ros2.publisher import Ros2Publisher
-from gripmon.io.ros2.settings import Layout, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
-from gripmon.io.ros2.types import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, Ros2Missing
 
 __all__ = [
     "COMPRESSED_IMAGE",
