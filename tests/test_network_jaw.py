@@ -14,8 +14,8 @@ from support.loopback import free_endpoint, plain_session, wait_until
 
 from gripmon.io.publish import ZenohJaw
 from gripmon.io.publish.inputs import MOST_REPORTS, DecodeOpening, Reported, StampedOpenings, opening_of_joints
-from gripmon.io.ros2 import JOINT_STATE, JointOpening, subscription_key
-from gripmon.io.ros2.node import type_hash, typestore
+from gripmon.io.ros2.names import subscription_key
+from gripmon.io.ros2.node import JOINT_STATE, JointOpening, type_hash, typestore
 from gripmon.io.wire import Link, PublishSettings, link
 from gripmon.io.wire.link import Malformed
 

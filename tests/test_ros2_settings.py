@@ -21,16 +21,8 @@ from support.stand_ins import Listener, ScriptedMonitor, TickingSource
 from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
 from gripmon.io.publish import Publishers
-from gripmon.io.ros2 import (
-    Layout,
-    NodeName,
-    Ros2Fault,
-    Ros2Publisher,
-    Ros2Settings,
-    fault_of,
-    layout_of,
-    network_of,
-)
+from gripmon.io.ros2.names import Layout, NodeName, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
+from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.wire import Link, PublishSettings
 
 

@@ -148,10 +148,10 @@ def _on_link(config: SecondConfig, link: Link, *, take_over: bool) -> _Network:
 def _with_metrics(config: SecondConfig, publisher: SpotPublisher) -> SpotPublisher:
     """The publisher, and beside it the server for Prometheus where the configuration wants one."""
     from gripmon.daemon.network import metrics_server
-    from gripmon.io.publish import SpotPublishers
+    from gripmon.io.publish import Publishers
 
     metrics = metrics_server(config)
-    return publisher if metrics is None else SpotPublishers(publisher, {"metrics": metrics})
+    return publisher if metrics is None else Publishers(publisher, {"metrics": metrics})
 
 
 def _open_recorder(config: SecondConfig, out: Path | None, live: LiveView | None, patience_s: float) -> SpotRecorder:

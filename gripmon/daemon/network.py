@@ -12,19 +12,9 @@ from gripmon.io.metrics import MetricsError, MetricsServer
 from gripmon.io.publish import NullPublisher, Presence, Publisher, Publishers, ZenohCommands, ZenohJaw, ZenohPublisher
 from gripmon.io.publish.inputs import opening_of_joints
 from gripmon.io.publish.presence import in_words
-from gripmon.io.ros2 import (
-    COMPRESSED_IMAGE,
-    IMAGE,
-    JOINT_STATE,
-    HeardTopic,
-    Listeners,
-    NodeName,
-    Ros2Publisher,
-    as_token,
-    layout_of,
-    network_of,
-    subscription_key,
-)
+from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
+from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
+from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.sources import NetworkCamera, NetworkSettings, Source
 from gripmon.io.wire import Keys, Link, PublishError
 from gripmon.model.errors import NoResultError

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from gripmon.daemon.config.settings import JawSettings, Settings
 from gripmon.daemon.config.typed import Fault
-from gripmon.io.ros2 import JOINT_STATE, RosNameError, subscription_key
+from gripmon.io.ros2.names import RosNameError, subscription_key
+from gripmon.io.ros2.node import JOINT_STATE
 from gripmon.io.sources import (
     FolderSettings,
     LiveSettings,

@@ -7,8 +7,8 @@ from pathlib import Path
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import Fault
 from gripmon.io.metrics import MetricsSettings, package_fault
-from gripmon.io.ros2 import Ros2Missing, network_of
-from gripmon.io.ros2.node import typestore
+from gripmon.io.ros2.names import network_of
+from gripmon.io.ros2.node import Ros2Missing, typestore
 from gripmon.io.sources import NetworkSettings, SourceError, SourceSettings
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.wire import Joining, PublishError, PublishSettings, joining

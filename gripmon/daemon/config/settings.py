@@ -9,7 +9,8 @@ from msgspec import Meta
 
 from gripmon.daemon.settings import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
-from gripmon.io.ros2 import JointOpening, Ros2Settings
+from gripmon.io.ros2.names import Ros2Settings
+from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources import SourceSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.judge.statefile import StateSettings

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import msgspec
 import zenoh
 
-from gripmon.io.ros2 import JointOpening, MessageError, decode_joint_state
+from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state
 from gripmon.io.wire import Link
 from gripmon.io.wire.link import Malformed
 from gripmon.laser.matching import Told, of_message
@@ -89,7 +89,42 @@ class StampedOpenings:
         return last.opening_m + share * (first.opening_m - last.opening_m)
 
 
-class ZenohJaw:
+class _Input:
+    """Messages on a key: Zenoh's thread stores what arrives; any thread may ask.  What is malformed is counted."""
+
+    def __init__(self, link: Link, key: str, what: str) -> None:
+        self._malformed = Malformed(what, key)
+        self._key = key
+        self._subscriber: zenoh.Subscriber[None] | None = None
+        link.attach(self._attach)
+
+    @property
+    def malformed(self) -> int:
+        """Messages so far that were none."""
+        return self._malformed.count
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._arrived, indirect=False))
+
+    def _arrived(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        try:
+            if self._take(sample.payload):
+                self._malformed.good()
+        except (MessageRefused, ValueError) as error:
+            self._malformed.add(str(error))
+        except Exception as error:  # noqa: BLE001  Zenoh would swallow it, and it would stay unknown
+            self._malformed.add(f"{type(error).__name__}: {error}")
+            _log.debug("message on %s", self._key, exc_info=error)
+
+    def _take(self, payload: zenoh.ZBytes) -> bool:
+        """Store a message, False if it is about something else.  ValueError for one that is malformed."""
+        raise NotImplementedError
+
+
+class ZenohJaw(_Input):
     """The jaw opening that the robot sent: at an image's stamp where the reports have stamps of the same clock, else
     the newest.
 
@@ -112,21 +147,13 @@ class ZenohJaw:
         """
         self._decode = decode or opening_of_json
         self._travel_m = travel_m
-        self._key = key
         self._max_age_s = link.settings.jaw_max_age_s
-        self._subscriber: zenoh.Subscriber[None] | None = None
-        self._malformed = Malformed("jaw message", key)
         self._lock = threading.Lock()  # guards what follows against Zenoh's thread
         self._newest_m: float | None = None
         self._arrival_s = 0.0
         self._stamped = StampedOpenings()
         self._apart_s: float | None = None  # reports' stamps from the images', where they are of different clocks
-        link.attach(self._attach)
-
-    @property
-    def malformed(self) -> int:
-        """Messages so far that told no opening."""
-        return self._malformed.count
+        super().__init__(link, key, "jaw message")
 
     def opening_m(self, stamp_ns: int | None = None) -> float | None:
         """The opening at an image's stamp, or the newest (m); None if none came, or none for ``jaw_max_age_s``.
@@ -163,29 +190,19 @@ class ZenohJaw:
     def _is_old(self) -> bool:
         return time.monotonic() - self._arrival_s > self._max_age_s
 
-    def _attach(self, session: zenoh.Session) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._receive, indirect=False))
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
+    def _take(self, payload: zenoh.ZBytes) -> bool:
         arrival_s = time.monotonic()
-        try:
-            reported = self._decode(_bounded(sample.payload))
-            if reported is None:
-                return
-            self._check(reported.opening_m)
-        except JawError as error:
-            self._malformed.add(str(error))
-            return
-        self._malformed.good()
+        reported = self._decode(_bounded(payload))
+        if reported is None:
+            return False
+        self._check(reported.opening_m)
         with self._lock:
             self._newest_m, self._arrival_s = reported.opening_m, arrival_s
             if reported.stamp_ns > 0:
                 self._stamped.add(reported, arrival_s, self._max_age_s)
             else:
                 self._stamped.clear()  # of one robot all reports have stamps, or none
+        return True
 
     def _check(self, opening_m: float) -> None:
         low_m, high_m = self._travel_m
@@ -240,7 +257,7 @@ _log = logging.getLogger(__name__)
 _WAITING_MOST = 64
 
 
-class ZenohPulses:
+class ZenohPulses(_Input):
     """Pulses in the order in which they came.
 
     Zenoh's thread stores what arrives; any thread may ask.  What is malformed, or no pulse that can be, is counted and
@@ -248,16 +265,8 @@ class ZenohPulses:
     """
 
     def __init__(self, link: Link, key: str) -> None:
-        self._key = key
         self._waiting: deque[Told] = deque(maxlen=_WAITING_MOST)
-        self._malformed = Malformed("pulse message", key)
-        self._subscriber: zenoh.Subscriber[None] | None = None
-        link.attach(self._attach)
-
-    @property
-    def malformed(self) -> int:
-        """Messages so far that told no pulse."""
-        return self._malformed.count
+        super().__init__(link, key, "pulse message")
 
     def poll(self) -> Told | None:
         """The next pulse, at once; None if there is none."""
@@ -267,27 +276,8 @@ class ZenohPulses:
         """What is wrong with what came, in a few words for a person; empty if nothing is."""
         return self._malformed.fault()
 
-    def _attach(self, session: zenoh.Session) -> None:
-        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
-        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._receive, indirect=False))
-
-    def _receive(self, sample: zenoh.Sample) -> None:
-        if sample.kind != zenoh.SampleKind.PUT:
-            return
-        try:
-            told = _told(sample.payload)
-        except (MessageRefused, ValueError) as error:
-            self._malformed.add(str(error))
-            return
-        except Exception as error:  # noqa: BLE001  Zenoh would swallow it, and nobody learn of it
-            self._malformed.add(f"{type(error).__name__}: {error}")
-            _log.debug("pulse on %s", self._key, exc_info=error)
-            return
-        self._malformed.good()
-        self._waiting.append(told)
-
-
-def _told(payload: zenoh.ZBytes) -> Told:
-    if len(payload) > (most := largest_bytes(LaserPulse)):  # before a copy of it is made
-        raise MessageRefused(f"{len(payload)} bytes; at most {most}")
-    return of_message(from_json(payload.to_bytes(), LaserPulse))
+    def _take(self, payload: zenoh.ZBytes) -> bool:
+        if len(payload) > (most := largest_bytes(LaserPulse)):  # before a copy of it is made
+            raise MessageRefused(f"{len(payload)} bytes; at most {most}")
+        self._waiting.append(of_message(from_json(payload.to_bytes(), LaserPulse)))
+        return True

@@ -7,7 +7,7 @@ import threading
 import uuid
 from collections import deque
 from collections.abc import Callable, Mapping
-from typing import ParamSpec, Protocol, TypeVar
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import zenoh
@@ -296,89 +296,63 @@ class _Wire:
 
 
 _log = logging.getLogger(__name__)
-_P = ParamSpec("_P")
 
 
-class _Several:
-    """Hands each record to the first publisher and then to the others.
+class Publishers:
+    """Hands each record to the first publisher and then to those of the others that take such records.
 
     What the first raises is raised, after the others had the record.  What another one raises never reaches the caller:
     it is logged once, until it changes, and :meth:`fault` says it.
     """
 
-    def __init__(self, first: StatePublisher, others: Mapping[str, StatePublisher]) -> None:
-        self._first_state, self._other_states = first, others
+    def __init__(self, first: Any, others: Mapping[str, StatePublisher]) -> None:
+        """``first``: a :class:`Publisher` or a :class:`SpotPublisher`; ``others`` by their names in messages."""
+        self._first, self._others = first, others
         self._faults: dict[tuple[str, str], str] = {}  # by publisher and method, of which one may work and one not
 
+    def transform(self, record: FrameRecord) -> None:
+        self._hand("transform", record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self._hand("reference", record)
+
+    def spot(self, record: SpotRecord) -> None:
+        self._hand("spot", record)
+
     def state(self, record: StateRecord) -> None:
-        try:
-            self._first_state.state(record)
-        finally:
-            for name, other in self._other_states.items():
-                self._hand(name, other.state, record)
+        self._hand("state", record)
 
     def alert(self, record: AlertRecord) -> None:
-        try:
-            self._first_state.alert(record)
-        finally:
-            for name, other in self._other_states.items():
-                self._hand(name, other.alert, record)
+        self._hand("alert", record)
 
     def close(self) -> None:
         """Close all, the first last."""
-        for name, other in self._other_states.items():
-            self._hand(name, other.close)
-        self._first_state.close()
+        for name in self._others:
+            self._hand_other(name, "close")
+        self._first.close()
 
     def fault(self) -> str:
         """What is wrong with the others, in a few words for a person; empty if nothing is."""
         return "; ".join(dict.fromkeys(self._faults.values()))
 
-    def _hand(self, name: str, put: Callable[_P, None], *values: _P.args, **named: _P.kwargs) -> None:
-        what = (name, put.__name__)
+    def _hand(self, what: str, record: object) -> None:
         try:
-            put(*values, **named)
+            getattr(self._first, what)(record)
+        finally:
+            for name in self._others:
+                self._hand_other(name, what, record)
+
+    def _hand_other(self, name: str, what: str, *values: object) -> None:
+        put = getattr(self._others[name], what, None)
+        if put is None:
+            return
+        try:
+            put(*values)
         except Exception as error:  # noqa: BLE001  said here and in the state
             text = f"{name} fails: {' '.join(str(error).split()) or type(error).__name__}"
-            if self._faults.get(what) != text:
+            if self._faults.get((name, what)) != text:
                 _log.error("%s", text)
                 _log.debug("%s", name, exc_info=error)
-            self._faults[what] = text
+            self._faults[name, what] = text
         else:
-            self._faults.pop(what, None)
-
-
-class Publishers(_Several):
-    """Those of a wrist camera."""
-
-    def __init__(self, first: Publisher, others: Mapping[str, Publisher]) -> None:
-        """``others`` by the names that they have in messages."""
-        super().__init__(first, others)
-        self._first = first
-        self._others = others
-
-    def transform(self, record: FrameRecord) -> None:
-        try:
-            self._first.transform(record)
-        finally:
-            for name, other in self._others.items():
-                self._hand(name, other.transform, record)
-
-    def reference(self, record: ReferenceRecord) -> None:
-        try:
-            self._first.reference(record)
-        finally:
-            for name, other in self._others.items():
-                self._hand(name, other.reference, record)
-
-
-class SpotPublishers(_Several):
-    """Those of a second camera: the others take its states and alerts."""
-
-    def __init__(self, first: SpotPublisher, others: Mapping[str, StatePublisher]) -> None:
-        """``others`` by the names that they have in messages."""
-        super().__init__(first, others)
-        self._first = first
-
-    def spot(self, record: SpotRecord) -> None:
-        self._first.spot(record)
+            self._faults.pop((name, what), None)

@@ -186,7 +186,7 @@ class Listeners:
     """
 
     def __init__(self, link: Link, name: NodeName, topics: Sequence[HeardTopic]) -> None:
-        """Raises :class:`gripmon.io.ros2.RosNameError` for a topic that ROS doesn't allow."""
+        """Raises :class:`gripmon.io.ros2.names.RosNameError` for a topic that ROS doesn't allow."""
         self._name = name
         self._topics = [each._replace(topic=name.expand(each.topic)) for each in topics]
         self._nodes: dict[int, Node] = {}

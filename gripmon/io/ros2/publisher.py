@@ -60,7 +60,7 @@ class Messages:
     """Makes the messages of one camera; ``transform`` stands for ``parent_T_child``."""
 
     def __init__(self, parent_frame: str, child_frame: str) -> None:
-        """Raises :class:`gripmon.io.ros2.Ros2Missing`."""
+        """Raises :class:`gripmon.io.ros2.node.Ros2Missing`."""
         self._parent, self._child = parent_frame, child_frame
         prepare(TF, POSE, DIAGNOSTICS)
         types = typestore().types
@@ -211,7 +211,7 @@ class Ros2Publisher:
     """
 
     def __init__(self, link: Link, settings: Ros2Settings, layout: Layout) -> None:
-        """Raises :class:`gripmon.io.ros2.Ros2Missing` without ``rosbags``."""
+        """Raises :class:`gripmon.io.ros2.node.Ros2Missing` without ``rosbags``."""
         self._layout = layout
         self._verdicts = frozenset(settings.verdicts)
         self._smoothed = settings.transform == "smoothed"

@@ -122,7 +122,7 @@ class PayloadDecoder:
         return "raw"
 
     def _of_ros(self, payload: bytes) -> Content:
-        from gripmon.io import ros2
+        from gripmon.io.ros2 import node as ros2
 
         try:
             if self._format == "ros2_image":
@@ -330,12 +330,12 @@ def network_key(settings: NetworkSettings, image_key: str) -> str:
         raise SourceError("topic: has no effect beside key; one of them")
     if not ros:
         raise SourceError(f"format: {settings.format} doesn't come on a ROS 2 topic; {' or '.join(ROS_FORMATS)}")
-    from gripmon.io import ros2
+    from gripmon.io.ros2 import names, node
 
-    message = ros2.IMAGE if settings.format == "ros2_image" else ros2.COMPRESSED_IMAGE
+    message = node.IMAGE if settings.format == "ros2_image" else node.COMPRESSED_IMAGE
     try:
-        return ros2.subscription_key(settings.domain_id, settings.topic, message)
-    except ros2.RosNameError as error:
+        return names.subscription_key(settings.domain_id, settings.topic, message)
+    except names.RosNameError as error:
         raise SourceError(f"topic: {error}") from None
 
 
