@@ -193,10 +193,10 @@ def test_the_common_planes_start_is_exact():
     shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
     start = planar_start(ideal(data), shifts, [o.members for o in orientations])
     assert np.abs(start.normal - data.truth.normal_cam).max() < 1e-9
-    turn = closed_form.turn_from_motions([m[:, :3] for m in start.matrices], start.normal)
-    assert np.abs(turn.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    assert abs(turn.distance_m - data.truth.distance_m) < 1e-9
-    for beam, orientation in zip(turn.beams_cam, orientations, strict=True):
+    cam_R_base, beams_cam, distance_m = closed_form.turn_from_motions([m[:, :3] for m in start.matrices], start.normal)
+    assert np.abs(cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
+    assert abs(distance_m - data.truth.distance_m) < 1e-9
+    for beam, orientation in zip(beams_cam, orientations, strict=True):
         u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
         assert np.abs(np.cross(beam, u)).max() < 1e-9
 

@@ -450,6 +450,11 @@ class GivenCamera:
     covariance: Array | None = None
 
     @property
+    def model(self) -> LensModel:
+        """Its lens with derivatives.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+        return LensModel(model_of(self.lens), self.lens.width_px, self.lens.height_px)
+
+    @property
     def free(self) -> Array:
         """(k, p): what changes of the p ``parameters`` do to all k; fy follows fx where the aspect was held."""
         names = parameter_names(model_of(self.lens))
@@ -469,8 +474,7 @@ def pose_slopes(camera: GivenCamera, sighting: Sighting, cam_T_plate: Array) -> 
     """
     if camera.covariance is None or not camera.parameters:
         return np.zeros((6, 0))
-    lens_model = LensModel(model_of(camera.lens), camera.lens.width_px, camera.lens.height_px)
-    problem = BundleProblem(lens_model, [sighting], camera.free)
+    problem = BundleProblem(camera.model, [sighting], camera.free)
     normal = problem.normal_matrix(lens_vector(camera.lens), cam_T_plate)
     p = len(camera.parameters)
     out: Array = -np.linalg.solve(normal[p:, p:], normal[p:, :p]) @ independent_errors(camera.covariance).T

@@ -17,10 +17,8 @@ from scipy.stats import chi2
 from gripmon.calibrate.bundle import (
     Bundle,
     GivenCamera,
-    LensModel,
     independent_errors,
     lens_vector,
-    model_of,
     plate_pose,
 )
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
@@ -293,8 +291,7 @@ def _camera_directions(given: _Given, camera: GivenCamera, sighting: Sighting) -
     """The plate's pose follows: with another camera the same image shows the plate elsewhere."""
     if camera.covariance is None or not camera.parameters:
         return []
-    model = LensModel(model_of(camera.lens), camera.lens.width_px, camera.lens.height_px)
-    vector, free = lens_vector(camera.lens), camera.free
+    model, vector, free = camera.model, lens_vector(camera.lens), camera.free
 
     def changed(change: Array) -> _Given:
         moved = vector + free @ change

@@ -44,28 +44,30 @@ _TABLE = "a table of samples"
 _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
 
 
-def rows_of(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """A table's rows, and where each stands.  :class:`~gripmon.model.errors.InputError` for what is none."""
+def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list[str]]:
+    """A table's rows, and where each stands; ``right``: what kind of table it should be, for messages.
+    :class:`~gripmon.model.errors.InputError` for what is none.
+    """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
         raise InputError(f"{path}: is no table; a .csv, .yaml or .json file")
     if suffix == ".csv":
-        return _csv_rows(path)
+        return _csv_rows(path, right)
     if suffix == ".json":
         try:
-            values = json.loads(_text(path))
+            values = json.loads(_text(path, right))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not JSON: {error}; a JSON file") from None
     else:
-        values = read_mapping(str(path), _text(path).encode(), _SAMPLES)
+        values = read_mapping(str(path), _text(path, right).encode(), _SAMPLES)
     samples = values.get("samples") if isinstance(values, dict) else values
     if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
         raise InputError(f"{path}: samples is no list of samples; {_SAMPLES}")
     return samples, [f"sample {k + 1}" for k in range(len(samples))]
 
 
-def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
+def _csv_rows(path: Path, right: str) -> tuple[list[dict[str, Any]], list[str]]:
+    reader = csv.DictReader(_text(path, right).splitlines(), skipinitialspace=True)
     rows: list[dict[str, Any]] = []
     places = []
     try:
@@ -82,21 +84,21 @@ def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
             rows.append({str(key).strip(): value.strip() for key, value in row.items()})
             places.append(f"line {reader.line_num}")
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {_TABLE}") from None
+        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {right}") from None
     if not rows:
-        raise InputError(f"{path}: holds no sample; a header line, then a line for each spot")
+        raise InputError(f"{path}: holds no row; a header line, then a line for each")
     return rows, places
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, right: str) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; {_TABLE}") from None
+        raise InputError(f"{path}: there is no such file; {right}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not text; {_TABLE}") from None
+        raise InputError(f"{path}: is not text; {right}") from None
     except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); {_TABLE}") from None
+        raise InputError(f"{path}: can't be read ({error.strerror}); {right}") from None
 
 
 def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:

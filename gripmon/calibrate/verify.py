@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from gripmon.calibrate.bundle import GivenCamera, LensModel, independent_errors, lens_vector, model_of
+from gripmon.calibrate.bundle import GivenCamera, independent_errors, lens_vector
 from gripmon.calibrate.documents import CalibratedGripper
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -290,10 +290,8 @@ def _root(calibrated: GivenCamera, xy: Array) -> Array:
     """(n, 2, p): what independent errors of unit size in the parameters do to each pixel."""
     if calibrated.covariance is None or not calibrated.parameters:
         return np.zeros((len(xy), 2, 0))
-    lens = calibrated.lens
-    model = LensModel(model_of(lens), lens.width_px, lens.height_px)
     points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    _, by_parameters, _ = model.project(lens_vector(lens), points)
+    _, by_parameters, _ = calibrated.model.project(lens_vector(calibrated.lens), points)
     out: Array = by_parameters @ calibrated.free @ independent_errors(calibrated.covariance).T
     return out
 

@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.bundle import LensModel, lens_vector, model_of, parameter_names
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CameraCalibration
 from gripmon.calibrate.picture import disc, line, write
 from gripmon.calibrate.sighting import CalibrationError, NotFound
 from gripmon.laser.calibrating import LaserResult, Spots, calibrate, document, groups_of
 from gripmon.laser.judgement import SpotJudgement, SpotSeen, SpotWatchSettings
 from gripmon.laser.planar_start import SEED
-from gripmon.laser.planning import Arm, Plan, plan
-from gripmon.laser.refinement import LensPrior, PoseNoise
+from gripmon.laser.planning import Plan, plan
+from gripmon.laser.refinement import PoseNoise
 from gripmon.laser.samples import Samples, read_samples, spots_of
 from gripmon.laser.setup import LaserCalibration, laser_lines, spots_on_plane
 from gripmon.laser.spots import Spot
@@ -65,7 +65,7 @@ class CalibratedLaser:
 
     def plan(self, reach_m: float, poses: int = 10) -> Plan:
         """The poses that would help the most next, for an arm that reaches as far."""
-        return plan(self.fit.refined, Arm(reach_m), poses)
+        return plan(self.fit.refined, reach_m, poses)
 
     def document(self, provenance: Provenance) -> LaserCalibration:
         """What a file holds of it."""
@@ -138,16 +138,16 @@ def _spots(found: Sequence[Sequence[Spot]], *, looked: bool) -> Spots:
     return Spots(uv_px, np.array(covariances), others)
 
 
-def _prior(calibration: CameraCalibration) -> LensPrior | None:
+def _prior(calibration: CameraCalibration) -> GivenCamera | None:
     """What a camera's calibration knows of its lens; None where it says nothing of its errors."""
-    camera, count = calibration.camera, len(calibration.parameters)
-    kind = model_of(camera)
-    names, values = parameter_names(kind), lens_vector(camera)
-    if count == 0 or not set(calibration.parameters) <= set(names) or len(values) != len(names):
+    count = len(calibration.parameters)
+    given = GivenCamera(
+        calibration.camera, calibration.parameters, np.reshape(np.array(calibration.covariance), (count, count))
+    )
+    try:
+        return given if given.free.size else None
+    except CalibrationError:
         return None
-    free = tuple(names.index(key) for key in calibration.parameters)
-    model = LensModel(kind, camera.width_px, camera.height_px)
-    return LensPrior(model, values, free, np.array(calibration.covariance).reshape(count, count))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.closed_form import FEWEST_ORIENTATIONS, FEWEST_SHIFTS, orientation_groups, solve
-from gripmon.laser.refinement import LensPrior, PoseNoise, Refined, SpotProblem, refine, with_held_lens
+from gripmon.laser.refinement import PoseNoise, Refined, SpotProblem, refine, with_held_lens
 from gripmon.laser.setup import (
     NAMES,
     LaserCalibration,
@@ -94,7 +95,7 @@ def calibrate(
     spots: Spots,
     labels: Sequence[str] | None = None,
     *,
-    lens: LensPrior | None = None,
+    lens: GivenCamera | None = None,
     refine_lens: bool = True,
     pose_noise: PoseNoise | None = None,
 ) -> LaserResult:
@@ -170,7 +171,7 @@ def _refined(
     base_T_ee: Array,
     spots: Spots,
     start: LaserSetup,
-    lens: LensPrior | None,
+    lens: GivenCamera | None,
     pose_noise: PoseNoise | None,
 ) -> LaserResult:
     def solved(uv_px: Array, setup: LaserSetup) -> Refined:

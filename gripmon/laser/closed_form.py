@@ -192,17 +192,6 @@ def _shifts_of(orientations: Sequence[Orientation], base_T_ee: Array) -> list[Ar
     return [base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
 
 
-@dataclass(frozen=True, slots=True)
-class Turn:
-    """``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, towards the plane's far side or back: no sign), and
-    the plane's ``distance_m``.
-    """
-
-    cam_R_base: Array
-    beams_cam: Array
-    distance_m: float
-
-
 def solve(
     xy: Array, base_T_ee: Array, groups: Sequence[NDArray[np.intp]] | None = None, *, robust: bool = True
 ) -> LaserSetup:
@@ -212,21 +201,22 @@ def solve(
     shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
     start = planar_start(xy, shifts, [o.members for o in usable], robust=robust)
     usable = [replace(o, matrix=m) for o, m in zip(usable, start.matrices, strict=True)]
-    turn = turn_from_motions([o.matrix[:, :3] for o in usable], start.normal)
-    direction = beam_in_hand(list(turn.beams_cam), [o.base_R_ee for o in usable], turn.cam_R_base)
-    point, shift, scales = positions(usable, base_T_ee, turn.cam_R_base, direction, one_plane=True)
+    cam_R_base, beams, _ = turn_from_motions([o.matrix[:, :3] for o in usable], start.normal)
+    direction = beam_in_hand(list(beams), [o.base_R_ee for o in usable], cam_R_base)
+    point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction, one_plane=True)
     distance = float(scales[0])
     if distance <= 0.0:
         raise CalibrationError(
             "the spots put the plane behind the camera: poses and spots don't belong together (out of step, or "
             "ee_T_base for base_T_ee); each spot with the pose that it was seen at"
         )
-    return LaserSetup(make_transform(turn.cam_R_base, shift), start.normal, distance, point, direction)
+    return LaserSetup(make_transform(cam_R_base, shift), start.normal, distance, point, direction)
 
 
-def turn_from_motions(motions: Sequence[Array], normal: Array) -> Turn:
+def turn_from_motions(motions: Sequence[Array], normal: Array) -> tuple[Array, Array, float]:
     """Steps 4 and 5 together, from the matrices (3, 3) by which shifts in base axes move the spots of the plane
-    ``normalᵀ s = 1`` (camera axes).
+    ``normalᵀ s = 1`` (camera axes): ``cam_R_base`` (3, 3), the beams (M, 3) in camera axes (unit, towards the plane's
+    far side or back: no sign), and the plane's distance (m).
     """
     plane = np.stack(basis(normal))
     flat = np.stack([plane @ m for m in motions])
@@ -249,4 +239,4 @@ def turn_from_motions(motions: Sequence[Array], normal: Array) -> Turn:
     # A_m third = -(P v_m) / distance
     leaning = -(flat @ third) / scale
     beams = normal + leaning @ plane
-    return Turn(cam_R_base, beams / np.linalg.norm(beams, axis=1)[:, None], 1.0 / scale)
+    return cam_R_base, beams / np.linalg.norm(beams, axis=1)[:, None], 1.0 / scale

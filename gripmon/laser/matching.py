@@ -333,7 +333,7 @@ def read_pulses(path: Path) -> list[Told]:
 
     Raises :class:`~gripmon.model.errors.InputError`: "file: line: what is wrong; what would be right".
     """
-    rows, places = rows_of(path)
+    rows, places = rows_of(path, "a table stamp_ns,until_ns,tx_m,ty_m,tz_m,qx,qy,qz,qw")
     try:
         return of_rows(rows, places)
     except ValueError as error:

@@ -37,13 +37,10 @@ _STEPS = 20
 
 @dataclass(frozen=True, slots=True)
 class PlanarStart:
-    """``normal`` (3,), unit, away from the camera; one matrix (3, 4) an orientation with ``s = matrix [w 1]``; ``good``
-    (n,) which spots the fits rest on.
-    """
+    """``normal`` (3,), unit, away from the camera; one matrix (3, 4) an orientation with ``s = matrix [w 1]``."""
 
     normal: Array
     matrices: tuple[Array, ...]
-    good: NDArray[np.bool_]
 
 
 class _Group:
@@ -163,10 +160,7 @@ def planar_start(
         matrix = fit.T.copy()
         matrix[:, :3] /= group.scale
         matrices.append(matrix)
-    used = np.zeros(len(xy), dtype=bool)
-    for index, part in zip(members, good, strict=True):
-        used[index[part]] = True
-    return PlanarStart(normal, tuple(matrices), used)
+    return PlanarStart(normal, tuple(matrices))
 
 
 def _sums(fits: _Fits, normals: Array) -> Array:

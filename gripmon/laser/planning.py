@@ -29,12 +29,8 @@ BORDER = 0.05
 SEED = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Arm:
-    """How far the end-effector reaches from the base's origin (m)."""
-
-    reach_m: float
-    least_m: float = 0.15
+LEAST_REACH_M = 0.15
+"""Nearer to the base's origin an arm's own body is in the way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,13 +45,14 @@ class Plan:
     sigmas: Array
 
 
-def plan(refined: Refined, arm: Arm, count: int, *, seed: int = SEED) -> Plan:
-    """Greedy: each time the pose after which a point on the plane, seen by the camera, is known best in the base.
+def plan(refined: Refined, reach_m: float, count: int, *, seed: int = SEED) -> Plan:
+    """Greedy, for an arm that reaches as far from the base's origin: each time the pose after which a point on the
+    plane, seen by the camera, is known best in the base.
 
     Raises :class:`CalibrationError` where the arm reaches no pose whose spot the camera sees.
     """
     setup, camera = refined.setup, make_camera(refined.camera)
-    poses = candidates(setup, refined, arm, np.random.default_rng(seed))
+    poses = candidates(setup, refined, reach_m, np.random.default_rng(seed))
     spots, slopes = spots_on_plane(setup, poses)
     uv_px, by_point = camera.project_with_jacobian(spots)
     rows = by_point @ slopes
@@ -75,7 +72,7 @@ def plan(refined: Refined, arm: Arm, count: int, *, seed: int = SEED) -> Plan:
     return Plan(poses[chosen], uv_px[chosen], np.array(sigmas))
 
 
-def candidates(setup: LaserSetup, refined: Refined, arm: Arm, rng: np.random.Generator) -> Array:
+def candidates(setup: LaserSetup, refined: Refined, reach_m: float, rng: np.random.Generator) -> Array:
     """Poses (m, 4, 4) within reach, on the camera's side of the plane, whose spot the camera sees."""
     camera = make_camera(refined.camera)
     size = np.array([camera.width_px, camera.height_px])
@@ -101,11 +98,11 @@ def candidates(setup: LaserSetup, refined: Refined, arm: Arm, rng: np.random.Gen
     places = base_R_cam.apply(hands) + base_T_cam[:3, 3]
     reached = np.linalg.norm(places, axis=1)
     above = setup.distance_m - hands @ setup.normal_cam
-    good = (depth > 0.0) & (reached <= arm.reach_m) & (reached >= arm.least_m) & (above > 0.5 * NEAREST_M)
+    good = (depth > 0.0) & (reached <= reach_m) & (reached >= LEAST_REACH_M) & (above > 0.5 * NEAREST_M)
     good &= np.isfinite(hands).all(axis=1)
     if not good.any():
         raise CalibrationError(
-            f"within {arm.reach_m:g} m of its base the arm has no pose whose spot the camera would see; a longer reach"
+            f"within {reach_m:g} m of its base the arm has no pose whose spot the camera would see; a longer reach"
         )
     turns = (base_R_cam * cam_R_ee).as_matrix()
     return np.stack([make_transform(turns[k], places[k]) for k in np.flatnonzero(good)])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 from scipy.stats import f as fisher_f
 
-from gripmon.calibrate.bundle import LensModel
+from gripmon.calibrate.bundle import GivenCamera, lens_vector
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
 from gripmon.model.camera import Camera, LensSettings
@@ -219,55 +219,18 @@ def _scale(problem: SpotProblem, state: State) -> float:
     return max(scale / float(np.sqrt(left)), _LEAST)
 
 
-def with_held_lens(refined: Refined, problem: SpotProblem, lens: LensPrior) -> Refined:
+def with_held_lens(refined: Refined, problem: SpotProblem, lens: GivenCamera) -> Refined:
     """``refined``, which held the lens that is its ``problem``'s prior: its ``covariance`` grows by what an error of
     the lens does to the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up stays as it is.
     """
-    by_lens = _by_lens(refined, problem)
-    return replace(refined, covariance=refined.covariance + by_lens @ lens.covariance @ by_lens.T)
-
-
-def _by_lens(refined: Refined, problem: SpotProblem) -> Array:
-    """(13, p): least squares' answer to a change of the lens's free parameters."""
     state = problem.start(refined.setup)
     rows, _ = problem.with_pose_noise(state).linearised(state)
     rows = rows[refined.used].reshape(-1, problem.unknowns)
-    own, lens = rows[:, : len(PARAMETERS)], rows[:, len(PARAMETERS) :]
+    own = rows[:, : len(PARAMETERS)]
     size = np.linalg.norm(own, axis=0)
-    out: Array = -np.linalg.lstsq(own / size, lens, rcond=None)[0] / size[:, None]
-    return out
-
-
-_FX, _FY = 0, 1  # the first two parameters of every lens model
-
-
-@dataclass(frozen=True, slots=True)
-class LensPrior:
-    """A calibrated lens that may be refined, too: all its ``parameters`` (k,); ``free`` (p,) which of them were
-    estimated; ``covariance`` (p, p) of these.  Where fx alone was, the aspect was held and fy follows.
-    """
-
-    model: LensModel
-    parameters: Array
-    free: tuple[int, ...]
-    covariance: Array
-
-    @property
-    def root(self) -> Array:
-        """(p, p), makes changes of the free parameters normal with unit variance.  Raises :class:`CalibrationError`."""
-        try:
-            return whitening(self.covariance)
-        except np.linalg.LinAlgError:
-            raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
-
-    @property
-    def slopes(self) -> Array:
-        """(k, p), all parameters by the free ones."""
-        out = np.zeros((len(self.parameters), len(self.free)))
-        out[list(self.free), np.arange(len(self.free))] = 1.0
-        if _FX in self.free and _FY not in self.free:
-            out[_FY, self.free.index(_FX)] = self.parameters[_FY] / self.parameters[_FX]
-        return out
+    # Least squares' answer (13, p) to a change of the lens's free parameters.
+    by_lens = np.linalg.lstsq(own / size, rows[:, len(PARAMETERS) :], rcond=None)[0] / size[:, None]
+    return replace(refined, covariance=refined.covariance + by_lens @ np.asarray(lens.covariance) @ by_lens.T)
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,14 +269,14 @@ class SpotProblem:
         uv_px: Array,
         covariance_px: Array | None = None,
         *,
-        lens: LensPrior | None = None,
+        lens: GivenCamera | None = None,
         pose_noise: PoseNoise | None = None,
     ):
         self.base_T_ee, self.uv_px = base_T_ee, uv_px
         self._camera, self._lens, self._pose_noise = camera, lens, pose_noise
         self._spots_px2 = np.tile(np.eye(2), (len(uv_px), 1, 1)) if covariance_px is None else covariance_px
         self._whiten = whitening(self._spots_px2)
-        self._root = np.empty((0, 0)) if lens is None else lens.root
+        self._root = np.empty((0, 0)) if lens is None else _root(lens)
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -329,9 +292,7 @@ class SpotProblem:
 
     def camera(self, state: State) -> Camera:
         """The camera of a state."""
-        if self._lens is None:
-            return self._camera
-        return self._lens.model.camera(self._parameters(self._lens, state))
+        return self._camera if self._lens is None else self._lens.model.camera(self._parameters(self._lens, state))
 
     def with_pose_noise(self, state: State) -> SpotProblem:
         """With what the arm's noise adds to the spots' covariances at a state."""
@@ -364,7 +325,7 @@ class SpotProblem:
             rows = by_point @ slopes
         else:
             uv_px, by_lens, by_point = self._lens.model.project(self._parameters(self._lens, state), spots)
-            rows = np.concatenate([by_point @ slopes, by_lens @ self._lens.slopes], axis=2)
+            rows = np.concatenate([by_point @ slopes, by_lens @ self._lens.free], axis=2)
         rows = self._whiten @ rows
         values = np.einsum("nij,nj->ni", self._whiten, self.uv_px - uv_px)
         good = np.isfinite(values).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
@@ -378,6 +339,14 @@ class SpotProblem:
         return rows, -self._root @ state.lens
 
     @staticmethod
-    def _parameters(lens: LensPrior, state: State) -> Array:
-        out: Array = lens.parameters + lens.slopes @ state.lens
+    def _parameters(lens: GivenCamera, state: State) -> Array:
+        out: Array = lens_vector(lens.lens) + lens.free @ state.lens
         return out
+
+
+def _root(lens: GivenCamera) -> Array:
+    """(p, p), makes changes of the lens's free parameters normal with unit variance.  :class:`CalibrationError`."""
+    try:
+        return whitening(np.asarray(lens.covariance))
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
