@@ -10,10 +10,10 @@ from support.pulsed_laser import AXES, calibration, drawn_world, poses, pulses, 
 
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.judgement import SpotFault, SpotSeen, SpotWatchSettings
-from gripmon.laser.planning import foresight
+from gripmon.laser.planning import forecast
 from gripmon.laser.spots import Spot, plain_spot
 from gripmon.laser.watch import SpotWatch
-from gripmon.laser.world import calibrated, foresee
+from gripmon.laser.world import calibrated, predict
 from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 
 
@@ -70,7 +70,7 @@ def test_errors_that_pulses_have_in_common_are_not_counted_as_many(known):
     pulses from one pose average their noise away, but not that.
     """
     pose = poses()[0]
-    rows = foresee(known.world, known.camera, pose).rows
+    rows = predict(known.world, known.camera, pose).rows
     root = np.linalg.cholesky(known.covariance)
     worst = root @ np.linalg.svd(rows @ root)[2][0]
     watch = SpotWatch(calibration())
@@ -303,7 +303,7 @@ def test_a_single_spot_s_square_has_two_degrees_of_freedom(known):
 @pytest.mark.parametrize(("index", "axis"), [(1, 0), (1, 4), (2, 2)])
 def test_motions_are_noticed_about_as_soon_as_foreseen(known, index, axis):
     """What is foreseen is for pulses right after a calibration: those before the motion only help."""
-    foreseen = foresight(known, SpotWatchSettings(), poses())
+    foreseen = forecast(known, SpotWatchSettings(), poses())
     size, promised = foreseen.sizes[index, axis], foreseen.pulses[index]
     change, count = size * AXES[axis], 5 + 3 * promised
     delays = [first_alarm(known, change, 200 + seed, after=5, count=count)[0] for seed in range(3)]

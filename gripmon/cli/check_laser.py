@@ -13,7 +13,7 @@ from gripmon.model.errors import InputError, NoResultError
 
 if TYPE_CHECKING:
     from gripmon.laser.judgement import CameraMotion, SpotJudgement, SpotWatchSettings
-    from gripmon.laser.planning import Foresight
+    from gripmon.laser.planning import Forecast
     from gripmon.laser.setup import LaserCalibration
     from gripmon.model.records import Array
 
@@ -101,12 +101,12 @@ def _calibration(path: Path) -> LaserCalibration:
 
 def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSettings) -> dict[str, Any]:
     """What fresh spots would tell, as plain values for JSON: metres, radians, px."""
-    from gripmon.laser.planning import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, foresight
+    from gripmon.laser.planning import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, assumed_poses, forecast
     from gripmon.laser.world import calibrated
 
     known = calibrated(calibration)
     try:
-        found = foresight(known, settings, assumed_poses(known))
+        found = forecast(known, settings, assumed_poses(known))
     except NoResultError as error:
         raise NoResultError(f"{name}: {error}") from None
     return {
@@ -132,7 +132,7 @@ def _header(name: str, calibration: LaserCalibration, settings: SpotWatchSetting
     }
 
 
-def _foresight_values(found: Foresight) -> dict[str, Any]:
+def _foresight_values(found: Forecast) -> dict[str, Any]:
     return {
         "spot_sigma": {
             "px": [float(found.sigma_px.min()), float(found.sigma_px.max())],
@@ -203,7 +203,7 @@ def _row(name: str, judged: SpotJudgement) -> dict[str, Any]:
         "fault": None if judged.fault is None else str(judged.fault),
         "reason": judged.reason,
         "uv_px": _values(judged.uv_px),
-        "foreseen_px": _values(judged.foreseen_px),
+        "foreseen_px": _values(judged.predicted_px),
         "off_px": _values(judged.off_px),
         "sigmas": None if judged.square is None else math.sqrt(judged.square),
         "spots_base_m": _values(judged.spots_base_m),

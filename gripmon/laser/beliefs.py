@@ -24,7 +24,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.laser.world import CAMERA, COUNT, LASER, PLANE, Calibrated, foresee_moved
+from gripmon.laser.world import CAMERA, COUNT, LASER, PLANE, Calibrated, predict_moved
 from gripmon.model.geometry import rotation_angle
 from gripmon.model.records import Array, Cause
 
@@ -43,7 +43,7 @@ SAME_M, SAME_RAD = 5e-3, 0.02
 class Beliefs:
     """n of them: ``mean`` (n, 50) of the calibration's error (13), the motion since (13), and the places' offsets (12
     times 2, px), with ``covariance`` (n, 50, 50); ``weight`` (n,) logarithm of how much better than the reigning belief
-    it has foreseen the pulses; ``kind`` and ``scale`` (n,) what moved in it at last and by what order, ``pulses`` (n,)
+    it has predicted the pulses; ``kind`` and ``scale`` (n,) what moved in it at last and by what order, ``pulses`` (n,)
     which of them were believed since, ``born`` (n,) how many there were before, ``prior`` (n, 13, 13) what was assumed
     of that motion and ``motions`` (n,) how many there were.
     """
@@ -94,35 +94,35 @@ def as_calibrated(calibrated: Calibrated) -> Beliefs:
 @dataclass(frozen=True, slots=True)
 class Pulse:
     """``uv_px`` (k, 2) of the candidates with ``covariance_px`` (k, 2, 2), seen at a pose (4, 4) of a ``place``; the
-    calibration foresees ``foreseen_px`` (2,) with derivatives ``rows`` (2, 13).
+    calibration predicts ``predicted_px`` (2,) with derivatives ``rows`` (2, 13).
     """
 
     base_T_ee: Array
     place: int
     uv_px: Array
     covariance_px: Array
-    foreseen_px: Array
+    predicted_px: Array
     rows: Array
 
 
 class Bank:
-    """Foresees pulses by beliefs and lets these learn from them."""
+    """Predicts pulses by beliefs and lets these learn from them."""
 
     def __init__(self, calibrated: Calibrated):
         self._calibrated = calibrated
         self._focal_px = 0.5 * (calibrated.camera.fx_px + calibrated.camera.fy_px)
 
-    def foreseen(self, beliefs: Beliefs, pulse: Pulse) -> tuple[Array, Array]:
-        """Pixels (n, 2), NaN where a belief foresees none, and derivatives (n, 2, 50) by the beliefs' means."""
+    def predicted(self, beliefs: Beliefs, pulse: Pulse) -> tuple[Array, Array]:
+        """Pixels (n, 2), NaN where a belief predicts none, and derivatives (n, 2, 50) by the beliefs' means."""
         change = beliefs.mean[:, :COUNT] + beliefs.mean[:, MOVED]
         shifts = change[:, None, :] * pulse.rows
-        uv_px = pulse.foreseen_px + shifts.sum(axis=2)
+        uv_px = pulse.predicted_px + shifts.sum(axis=2)
         rows = np.tile(pulse.rows, (len(beliefs), 1, 1))
         reach = np.sqrt(_FAR * self._calibrated.sigma_px * self._focal_px)
         left = np.flatnonzero(np.abs(shifts).sum(axis=2).max(axis=1) > reach)
         while len(left):
             # Derivatives where one of them is serve all that are near it.
-            found = foresee_moved(self._calibrated, change[left[0]], pulse.base_T_ee)
+            found = predict_moved(self._calibrated, change[left[0]], pulse.base_T_ee)
             shifts = (change[left] - change[left[0]])[:, None, :] * found.rows
             near = np.abs(shifts).sum(axis=2).max(axis=1) <= reach
             near[0] = True
@@ -148,7 +148,7 @@ class Bank:
         but wrong ones.  Returns logarithms (n,) of how probable the candidates are, over all of them being wrong; which
         candidate (n,) is the spot; and whether any is (n,).
         """
-        uv_px, rows = self.foreseen(beliefs, pulse)
+        uv_px, rows = self.predicted(beliefs, pulse)
         spread = beliefs.covariance @ rows.transpose(0, 2, 1)
         own = rows @ spread
         total = own[:, None] + pulse.covariance_px + self._bent(own)[:, None]  # (n, k, 2, 2)
@@ -165,7 +165,7 @@ class Bank:
         return np.log(share + right), best, believed
 
     def _bent(self, own: Array) -> Array:
-        """Covariance (n, 2, 2) of what derivatives miss of an image that is foreseen so roughly: a central projection
+        """Covariance (n, 2, 2) of what derivatives miss of an image that is predicted so roughly: a central projection
         bends by the square of a shift over the focal length.
         """
         bent: Array = np.square(0.5 * np.trace(own, axis1=1, axis2=2) / self._focal_px)[:, None, None] * np.eye(2)
@@ -202,7 +202,7 @@ class Bank:
         one = np.array([k])
         prior = beliefs.covariance[k] + taken
         for _ in range(_ITERATIONS):
-            uv_px, there = self.foreseen(beliefs.picked(one), pulse)
+            uv_px, there = self.predicted(beliefs.picked(one), pulse)
             if not np.isfinite(uv_px).all():
                 return
             h = there[0]
@@ -359,12 +359,12 @@ class MotionTest:
         if not self.moved:
             self._history.append(self.reigning.picked(np.array([self.best])))
         self._pulses += 1
-        told, candidates, believed = self._bank.weigh(self.reigning, pulse, wrong, self._share)
-        weight = self.reigning.weight + told
-        all_told = float(np.logaddexp.reduce(weight))
-        self.reigning.weight = weight - all_told
+        gained, candidates, believed = self._bank.weigh(self.reigning, pulse, wrong, self._share)
+        weight = self.reigning.weight + gained
+        total = float(np.logaddexp.reduce(weight))
+        self.reigning.weight = weight - total
         best = self.best
-        others.weight = others.weight + self._bank.weigh(others, pulse, wrong, self._share)[0] - all_told
+        others.weight = others.weight + self._bank.weigh(others, pulse, wrong, self._share)[0] - total
         self._others = _kept(others, _KEPT, _HOPELESS)
         self._prune()
         odds, back_odds = self._odds()
@@ -381,7 +381,7 @@ class MotionTest:
     def _wrong(self, pulse: Pulse) -> Array:
         """(k,) density of wrong spots, around where the best belief has the right one; 1/px²."""
         best = self.reigning.picked(np.array([self.best]))
-        uv_px, rows = self._bank.foreseen(best, pulse)
+        uv_px, rows = self._bank.predicted(best, pulse)
         camera = self._calibrated.camera
         anywhere = 1.0 / (camera.width_px * camera.height_px)
         if not np.isfinite(uv_px).all():

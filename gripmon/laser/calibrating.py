@@ -179,9 +179,9 @@ def _refined(
         problem = SpotProblem(camera, base_T_ee, uv_px, noise, lens=lens, pose_noise=pose_noise)
         if pose_noise is None or noise is not None:
             return refine(problem, setup)
-        return _told_apart(problem, uv_px, refine(SpotProblem(camera, base_T_ee, uv_px, lens=lens), setup))
+        return _separated(problem, uv_px, refine(SpotProblem(camera, base_T_ee, uv_px, lens=lens), setup))
 
-    def _told_apart(problem: SpotProblem, uv_px: Array, found: Refined) -> Refined:
+    def _separated(problem: SpotProblem, uv_px: Array, found: Refined) -> Refined:
         # The arm's noise is given in metres: the spots' own is what is left of the residuals.
         sigma_px = found.scale
         for _ in range(_NOISE_ROUNDS):

@@ -14,7 +14,7 @@ from msgspec import Meta
 from gripmon.calibrate.sighting import NotFound
 from gripmon.laser.beliefs import KINDS, MOVED, SCALES, Beliefs, MotionTest
 from gripmon.laser.spots import Spot
-from gripmon.laser.world import CAMERA, Calibrated, Disagreement, World, foresee, foresee_moved
+from gripmon.laser.world import CAMERA, Calibrated, Disagreement, World, predict, predict_moved
 from gripmon.model.records import Alert, AlertKind, Array, Cause, CauseWeight, Severity, State, Verdict
 from gripmon.model.records.values import OpenEnum
 
@@ -113,9 +113,9 @@ class CameraMotion:
 class SpotJudgement:
     """What was made of one pulse.
 
-    ``chosen``: index of the candidate that was taken for the spot, at ``uv_px`` (2,); ``foreseen_px`` (2,) by the
-    calibration; ``off_px`` (2,) seen less foreseen, whose ``covariance_px`` (2, 2) counts the calibration, the spot and
-    the arm; ``square``: normalised, two degrees of freedom.  ``spots_base_m`` (3, 3): the spot in the base frame by
+    ``chosen``: index of the candidate that was taken for the spot, at ``uv_px`` (2,); ``predicted_px`` (2,) by the
+    calibration; ``off_px`` (2,) seen less predicted, whose ``covariance_px`` (2, 2) counts the calibration, the spot
+    and the arm; ``square``: normalised, two degrees of freedom.  ``spots_base_m`` (3, 3): the spot in the base frame by
     beam and plane, by ray and plane, by beam and ray; ``disagreements`` of these.  ``used``: the pulse was believed,
     else ``fault`` and ``reason`` say why not.  ``probability_moved``: that anything has moved; ``causes``: what, each
     with its probability.  ``motion`` of the camera, where it is the camera that moved or may be.  None is what isn't
@@ -128,7 +128,7 @@ class SpotJudgement:
     verdict: Verdict
     chosen: int | None = None
     uv_px: Array | None = None
-    foreseen_px: Array | None = None
+    predicted_px: Array | None = None
     off_px: Array | None = None
     covariance_px: Array | None = None
     square: float | None = None
@@ -143,7 +143,7 @@ class SpotJudgement:
 
 
 MAYBE = 0.05
-"""Probability from which a motion of the camera is told."""
+"""Probability from which a motion of the camera is reported."""
 RELIEF = 0.8
 """Part of a limit below which what was said to be past it no longer is."""
 UNIT = np.array([0.01] * 3 + [0.01] * 3)
@@ -196,7 +196,7 @@ def _text(shift: Array, covariance: Array, unknown: Array) -> str:
         names = [_NAMES[i] for i in np.argsort(-np.abs(direction)) if abs(direction[i]) > _TOLD]
         ways.append(" and ".join(names) + " at once" * (len(names) > 1))
     untold = "; nor ".join(dict.fromkeys(ways))
-    return f"{text}; pulses so far hardly tell a motion {untold}: others, from elsewhere or with the hand turned, would"
+    return f"{text}; pulses so far hardly show a motion {untold}: others, from elsewhere or with the hand turned, would"
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +236,7 @@ def _shift(calibrated: Calibrated, change: Array, poses: Sequence[Array]) -> tup
     world, largest, found = calibrated.world, 0.0, None
     missed = 0
     for pose in poses:
-        before, after = foresee(world, calibrated.camera, pose), foresee_moved(calibrated, change, pose)
+        before, after = predict(world, calibrated.camera, pose), predict_moved(calibrated, change, pose)
         if not before.finite:
             continue
         shift = on_plane(world, calibrated, after.uv_px) - before.spot_base_m
@@ -250,7 +250,7 @@ def _shift(calibrated: Calibrated, change: Array, poses: Sequence[Array]) -> tup
 
 
 def _plane(calibrated: Calibrated, change: Array, pose: Array) -> float:
-    lit, spot = calibrated.world.lit, foresee_moved(calibrated, change, pose).spot_base_m
+    lit, spot = calibrated.world.lit, predict_moved(calibrated, change, pose).spot_base_m
     off = float(lit.normal_cam @ spot) - lit.distance_m
     behind = lit.distance_m - float(lit.normal_cam @ calibrated.world.base_T_cam[:3, 3])
     return math.copysign(off, off * behind)

@@ -28,7 +28,7 @@ _MOST_WAITING = 64
 class Pulse:
     """The laser was on, and the hand stood still at ``base_T_ee`` (4, 4), between two stamps (ns, the frames' clock).
 
-    ``number`` counts the pulses as they were told.
+    ``number`` counts the pulses as they were reported.
     """
 
     number: int
@@ -40,7 +40,7 @@ class Pulse:
         return self.stamp_ns <= other.until_ns and other.stamp_ns <= self.until_ns
 
     def repeats(self, other: Pulse) -> bool:
-        """The same told again: whoever got no answer may do so."""
+        """The same reported again, as whoever got no answer may do."""
         same = (self.stamp_ns, self.until_ns) == (other.stamp_ns, other.until_ns)
         return same and bool(np.array_equal(self.base_T_ee, other.base_T_ee))
 
@@ -60,7 +60,7 @@ class Shown:
 
 @dataclass(slots=True)
 class _Waiting:
-    """Told, and not complete yet; ``until_s`` it is waited for, by the caller's clock (of a table for ever)."""
+    """Not complete yet; ``until_s`` it is waited for, by the caller's clock (of a table for ever)."""
 
     pulse: Pulse
     until_s: float
@@ -90,8 +90,8 @@ class Matcher:
     """Takes pulses and frames as they come, each in its own time; gives every pulse back once, with its frames.
 
     A pulse is complete with the first frame after its end, or when :meth:`finish` says that no more will come.  Two
-    pulses that overlap can't both be right, so neither is used; nor is one that was told out of order, before one that
-    has been judged.  The same pulse told twice counts once.
+    pulses that overlap can't both be right, so neither is used; nor is one that was reported out of order, before one
+    that has been judged.  The same pulse reported twice counts once.
     """
 
     def __init__(self, settings: PulseSettings) -> None:
@@ -102,23 +102,23 @@ class Matcher:
         self._waiting: list[_Waiting] = []
         self._done: deque[Pulse] = deque(maxlen=_ENDS_KEPT)
         self._newest_ns = -1
-        self._told = 0
+        self._count = 0
 
     @property
     def waiting(self) -> int:
         """Pulses whose last frame hasn't come."""
         return len(self._waiting)
 
-    def tell(self, told: Told, now_s: float) -> list[Shown]:
-        """A pulse was told; those that are complete now, oldest first.  ``now_s``: by any clock, the one that
+    def pulse(self, reported: ReportedPulse, now_s: float) -> list[Shown]:
+        """A pulse was reported; those that are complete now, oldest first.  ``now_s``: by any clock, the one that
         :meth:`tick` goes by.
         """
-        pulse = Pulse(self._told, *told)
+        pulse = Pulse(self._count, *reported)
         if any(pulse.repeats(known) for known in (*self._done, *(each.pulse for each in self._waiting))):
             return []
-        self._told += 1
+        self._count += 1
         if len(self._waiting) >= _MOST_WAITING:
-            text = f"{_MOST_WAITING} pulses wait for their frames already; each told when it is over"
+            text = f"{_MOST_WAITING} pulses wait for their frames already; each reported when it is over"
             return [Shown(pulse, fault=PulseFault.OUT_OF_ORDER, reason=text)]
         length_s = 1e-9 * (pulse.until_ns - pulse.stamp_ns)
         entry = _Waiting(pulse, now_s + length_s + self._settings.wait_s)
@@ -127,10 +127,10 @@ class Matcher:
         self._waiting.sort(key=lambda each: each.pulse.stamp_ns)
         return self._complete()
 
-    def load(self, table: Sequence[Told]) -> None:
+    def load(self, table: Sequence[ReportedPulse]) -> None:
         """All pulses of recorded frames at once, by their stamps, none of them overlapping; before any frame."""
-        self._waiting = [_Waiting(Pulse(k, *told), math.inf) for k, told in enumerate(table)]
-        self._told = len(table)
+        self._waiting = [_Waiting(Pulse(k, *reported), math.inf) for k, reported in enumerate(table)]
+        self._count = len(table)
 
     def frame(self, frame: Frame) -> list[Shown]:
         """A frame came, its image None if it is no use; the pulses that are complete with it."""
@@ -169,9 +169,9 @@ class Matcher:
             overlaps = any(pulse.overlaps(done) for done in self._done)
             entry.fault = PulseFault.OVERLAP if overlaps else PulseFault.OUT_OF_ORDER
             entry.reason = (
-                "overlaps with a pulse that was judged before it was told"
+                "overlaps with a pulse that was judged before it was reported"
                 if overlaps
-                else f"was told {_seconds(last.until_ns - pulse.stamp_ns)} out of order: a later one was judged before"
+                else f"was reported {_seconds(last.until_ns - pulse.stamp_ns)} out of order, after a later one was judged"
             )
 
     def _complete(self) -> list[Shown]:
@@ -225,8 +225,8 @@ class Matcher:
             )
         if pulse.stamp_ns <= self._kept.forgotten_ns:
             return PulseFault.TOO_LATE, (
-                f"was told {_seconds(self._newest_ns - pulse.until_ns)} after its end, and its frames are forgotten; "
-                "tell it sooner, or a larger history_s and history_bytes (or do the clocks differ?)"
+                f"was reported {_seconds(self._newest_ns - pulse.until_ns)} after its end, its frames are gone; "
+                "report it sooner, or a larger history_s and history_bytes (or do the clocks differ?)"
             )
         if not self._kept.frames or self._newest_ns < pulse.stamp_ns:
             behind = (
@@ -291,7 +291,7 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     ] = 0.05
     history_s: Annotated[
         float,
-        Meta(gt=0.0, le=600.0, description="frames are kept for so long, for pulses that are told afterwards (s)"),
+        Meta(gt=0.0, le=600.0, description="frames are kept for so long, for pulses that are reported afterwards (s)"),
     ] = 3.0
     history_bytes: Annotated[int, Meta(ge=1_000_000, description="memory for them; the oldest give way (bytes)")] = (
         500_000_000
@@ -306,12 +306,12 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 LONGEST_S = 60.0
-"""Nobody holds an arm still for so long to show a spot: such stamps are of two clocks, or of another unit."""
+"""An arm isn't held still for longer to show a spot: such stamps are of two clocks, or of another unit."""
 
 _LAST_NS = 2**63 - 1
 
 
-class Told(NamedTuple):
+class ReportedPulse(NamedTuple):
     """The laser was on, and the hand stood still at ``base_T_ee`` (4, 4), between two stamps (ns)."""
 
     stamp_ns: int
@@ -319,7 +319,7 @@ class Told(NamedTuple):
     base_T_ee: Array
 
 
-def of_message(pulse: LaserPulse) -> Told:
+def of_message(pulse: LaserPulse) -> ReportedPulse:
     """ValueError: "what is wrong; what would be right"."""
     pose = pulse.base_T_ee
     row = {
@@ -328,7 +328,7 @@ def of_message(pulse: LaserPulse) -> Told:
     return _checked(pulse.stamp_ns, pulse.until_ns, row, "the pulse")
 
 
-def read_pulses(path: Path) -> list[Told]:
+def read_pulses(path: Path) -> list[ReportedPulse]:
     """The pulses of a table, by their stamps; poses as in the tables of ``calibrate laser``.
 
     Raises :class:`~gripmon.model.errors.InputError`: "file: line: what is wrong; what would be right".
@@ -340,24 +340,24 @@ def read_pulses(path: Path) -> list[Told]:
         raise InputError(f"{path}: {error}") from None
 
 
-def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[Told]:
+def of_rows(rows: Sequence[Row], places: Sequence[str]) -> list[ReportedPulse]:
     """A table's, by their stamps.  ValueError: "place: what is wrong; what would be right"."""
     if not rows:
         raise ValueError("holds no pulse; a header line, then a line for each pulse")
-    told = [
+    found = [
         _checked(_stamp(row, "stamp_ns", place), _stamp(row, "until_ns", place), row, place)
         for row, place in zip(rows, places, strict=True)
     ]
-    order = sorted(range(len(told)), key=lambda k: told[k].stamp_ns)
+    order = sorted(range(len(found)), key=lambda k: found[k].stamp_ns)
     for earlier, later in itertools.pairwise(order):
-        if told[later].stamp_ns <= told[earlier].until_ns:
+        if found[later].stamp_ns <= found[earlier].until_ns:
             raise ValueError(
                 f"{places[later]}: begins before the pulse of {places[earlier]} ends; pulses one after the other"
             )
-    return [told[k] for k in order]
+    return [found[k] for k in order]
 
 
-def _checked(stamp_ns: int, until_ns: int, row: Row, place: str) -> Told:
+def _checked(stamp_ns: int, until_ns: int, row: Row, place: str) -> ReportedPulse:
     if until_ns <= stamp_ns:
         raise ValueError(f"{place}: until_ns is not after stamp_ns; when the laser went on, and when it went off")
     if until_ns - stamp_ns > LONGEST_S * _NS:
@@ -368,7 +368,7 @@ def _checked(stamp_ns: int, until_ns: int, row: Row, place: str) -> Told:
         check_scale(base_T_ee[None])
     except ValueError as error:
         raise ValueError(f"{place}: {error}") from None
-    return Told(stamp_ns, until_ns, base_T_ee)
+    return ReportedPulse(stamp_ns, until_ns, base_T_ee)
 
 
 def _stamp(row: Row, key: str, place: str) -> int:

@@ -14,7 +14,7 @@ from gripmon.laser.beliefs import KINDS, LEAST_PULSES, SCALES, assumed
 from gripmon.laser.judgement import UNIT, SpotWatchSettings, on_plane
 from gripmon.laser.refinement import Refined
 from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_jacobian, spots_on_plane
-from gripmon.laser.world import CAMERA, COUNT, Calibrated, Foreseen, foresee, larger, spread_px, visible
+from gripmon.laser.world import CAMERA, COUNT, Calibrated, Prediction, larger, predict, spread_px, visible
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array
@@ -132,11 +132,11 @@ _BORDER = 0.2
 
 
 @dataclass(frozen=True, slots=True)
-class Foresight:
-    """``sigma_px`` and ``sigma_m`` (k,): standard deviation of each pose's foreseen spot in its worst direction, in the
-    image and on the plane.  ``sizes`` (n, 6): motions of ``base_T_cam`` along its position's and rotation's axes (base;
-    m, rad) that are told on average ``pulses`` (n,) after they happened.  ``weakest`` (6,): the direction that is told
-    the least, its size as it is told after the most pulses, m and rad.
+class Forecast:
+    """``sigma_px`` and ``sigma_m`` (k,): standard deviation of each pose's predicted spot in its worst direction, in
+    the image and on the plane. ``sizes`` (n, 6): motions of ``base_T_cam`` along its position's and rotation's axes
+    (base; m, rad) that are detected on average ``pulses`` (n,) after they happened. ``weakest`` (6,): the direction
+    that is detected the least, its size after the most pulses, m and rad.
     """
 
     sigma_px: Array
@@ -146,12 +146,12 @@ class Foresight:
     weakest: Array
 
 
-def foresight(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequence[Array]) -> Foresight:
+def forecast(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequence[Array]) -> Forecast:
     """With pulses from these poses (4, 4) in turn, those only from which a spot is seen.  Raises
     :class:`CalibrationError` if there is none.
     """
     arm = settings.arm_covariance
-    seen = [foresee(calibrated.world, calibrated.camera, pose) for pose in poses]
+    seen = [predict(calibrated.world, calibrated.camera, pose) for pose in poses]
     seen = [found for found in seen if visible(calibrated, found, arm) is None and _inside(calibrated, found)]
     if not seen:
         raise CalibrationError("from none of the poses does the camera see the spot; poses of this set-up")
@@ -163,7 +163,7 @@ def foresight(calibrated: Calibrated, settings: SpotWatchSettings, poses: Sequen
     sizes = np.array([[gain.size(np.eye(6)[axis]) for axis in range(6)] for gain in gains])
     _, axes = np.linalg.eigh(gains[-1].information * np.outer(UNIT, UNIT))
     weakest = axes[:, 0] * UNIT
-    return Foresight(sigma_px, sigma_m, PULSES, sizes, weakest * gains[-1].size(weakest))
+    return Forecast(sigma_px, sigma_m, PULSES, sizes, weakest * gains[-1].size(weakest))
 
 
 def assumed_poses(calibrated: Calibrated) -> tuple[Array, ...]:
@@ -186,12 +186,12 @@ def assumed_poses(calibrated: Calibrated) -> tuple[Array, ...]:
     return tuple(out)
 
 
-def _inside(calibrated: Calibrated, found: Foreseen) -> bool:
+def _inside(calibrated: Calibrated, found: Prediction) -> bool:
     size = np.array([calibrated.camera.width_px, calibrated.camera.height_px])
     return bool((found.uv_px >= -0.5).all() and (found.uv_px <= size - 0.5).all())
 
 
-def _metres(calibrated: Calibrated, found: Foreseen, spread: Array) -> float:
+def _metres(calibrated: Calibrated, found: Prediction, spread: Array) -> float:
     values, axes = np.linalg.eigh(spread)
     largest = 0.0
     for value, axis in zip(values, axes.T, strict=True):
@@ -208,7 +208,7 @@ class _Gain:
     + ln|V|) / 2.
     """
 
-    def __init__(self, calibrated: Calibrated, settings: SpotWatchSettings, seen: Sequence[Foreseen], pulses: int):
+    def __init__(self, calibrated: Calibrated, settings: SpotWatchSettings, seen: Sequence[Prediction], pulses: int):
         index = np.arange(pulses) % len(seen)
         rows = np.stack([found.rows for found in seen])[index].reshape(-1, COUNT)
         common = rows @ calibrated.covariance @ rows.T
@@ -231,5 +231,5 @@ class _Gain:
         self.information = moved.T @ still @ moved
 
     def size(self, direction: Array) -> float:
-        """Times a direction (6,) that a motion must have to be told."""
+        """Times a direction (6,) that a motion must have to be detected."""
         return min(math.sqrt(needed / max(float(direction @ w @ direction), 1e-300)) for needed, w in self._terms)

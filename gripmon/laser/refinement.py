@@ -40,7 +40,7 @@ _ITERATIONS = 100
 _ITERATIONS_A_ROUND = 6
 _ROUNDS = 40
 _SELECTIONS = 10
-_LEAST_TOLD = 1e-6
+_LEAST_TESTED = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +149,9 @@ def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], sca
     pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
     spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
     # A spot that determines a parameter alone fits, however wrong it is: nothing speaks against it.
-    told = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TOLD
-    spread[~told] = np.eye(2)
-    sizes = np.where(told, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
+    tested = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TESTED
+    spread[~tested] = np.eye(2)
+    sizes = np.where(tested, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
     whole = 2 * int(used.sum()) - len(PARAMETERS)
     freedom = np.maximum(whole - 2.0 * used, 1.0)
     variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom

@@ -24,7 +24,7 @@ from gripmon.laser.judgement import (
 )
 from gripmon.laser.setup import LaserCalibration
 from gripmon.laser.spots import Spot
-from gripmon.laser.world import Foreseen, Single, alone, calibrated, foresee, larger, visible
+from gripmon.laser.world import Prediction, Single, alone, calibrated, larger, predict, visible
 from gripmon.model.records import Alert, State, Verdict
 
 MOTION, VIEW = "motion", "view"
@@ -67,70 +67,70 @@ class SpotWatch:
         self._good = 0
         self._odds = 0.0
         self._moved: Moved | None = None
-        self._said_sigma = math.inf  # of the camera's motion, in the alert as it was last told
+        self._said_sigma = math.inf  # of the camera's motion, in the alert as it was last said
 
     def judge(self, seen: SpotSeen) -> SpotJudgement:
         """What a pulse says.  Stamps that go back count as the last one's."""
         self.pulses += 1
         self._stamp_ns = max(self._stamp_ns, seen.stamp_ns)
         if not np.isfinite(seen.base_T_ee).all():
-            return self._told(seen, SpotFault.NOT_FINITE, "the arm's pose is not finite")
-        foreseen = foresee(self._calibrated.world, self._calibrated.camera, seen.base_T_ee)
-        why_not = visible(self._calibrated, foreseen, self._arm)
+            return self._judged(seen, SpotFault.NOT_FINITE, "the arm's pose is not finite")
+        predicted = predict(self._calibrated.world, self._calibrated.camera, seen.base_T_ee)
+        why_not = visible(self._calibrated, predicted, self._arm)
         if why_not is not None:
-            return self._told(seen, SpotFault.NOT_FORESEEN, why_not)
+            return self._judged(seen, SpotFault.NOT_FORESEEN, why_not)
         if isinstance(seen.candidates, NotFound):
-            return self._missing(seen, foreseen, seen.candidates.reason)
+            return self._missing(seen, predicted, seen.candidates.reason)
         spots = [
             (k, spot)
             for k, spot in enumerate(seen.candidates)
             if np.isfinite(spot.uv_px).all() and np.isfinite(spot.covariance_px).all()
         ]
         if not spots:
-            return self._missing(seen, foreseen, "no spot was found")
-        return self._seen(seen, foreseen, spots)
+            return self._missing(seen, predicted, "no spot was found")
+        return self._seen(seen, predicted, spots)
 
-    def _seen(self, seen: SpotSeen, foreseen: Foreseen, spots: list[tuple[int, Spot]]) -> SpotJudgement:
+    def _seen(self, seen: SpotSeen, predicted: Prediction, spots: list[tuple[int, Spot]]) -> SpotJudgement:
         noise = self._calibrated.sigma_px**2 * np.eye(2)
         place = self._places.find(seen.base_T_ee)
         if place is None:
             place = self._places.take(seen.base_T_ee)
-            self._test.at_new_place(place, larger(foreseen.arm_rows @ self._arm @ foreseen.arm_rows.T, noise))
+            self._test.at_new_place(place, larger(predicted.arm_rows @ self._arm @ predicted.arm_rows.T, noise))
         pulse = Pulse(
             seen.base_T_ee,
             place,
             np.stack([spot.uv_px for _, spot in spots]),
             np.stack([larger(spot.covariance_px, noise) for _, spot in spots]),
-            foreseen.uv_px,
-            foreseen.rows,
+            predicted.uv_px,
+            predicted.rows,
         )
         found = self._test.add(pulse)
         self._odds = found.odds
         chosen, spot = spots[found.candidate]
-        single = alone(self._calibrated, foreseen, seen.base_T_ee, spot, self._arm)
+        single = alone(self._calibrated, predicted, seen.base_T_ee, spot, self._arm)
         self._moved = how(self._test, self._calibrated, self._places.poses) if self._test.moved else None
         if found.believed:
-            return self._told(seen, None, "", foreseen, single, chosen)
+            return self._judged(seen, None, "", predicted, single, chosen)
         reason = outlier_text(single.off_px, single.square)
-        return self._told(seen, SpotFault.OUTLIER, reason, foreseen, single, chosen)
+        return self._judged(seen, SpotFault.OUTLIER, reason, predicted, single, chosen)
 
-    def _missing(self, seen: SpotSeen, foreseen: Foreseen, reason: str) -> SpotJudgement:
+    def _missing(self, seen: SpotSeen, predicted: Prediction, reason: str) -> SpotJudgement:
         """No spot: that says something only where there should be one."""
-        camera, spread = self._calibrated.camera, foreseen.rows @ self._calibrated.covariance @ foreseen.rows.T
+        camera, spread = self._calibrated.camera, predicted.rows @ self._calibrated.covariance @ predicted.rows.T
         margin = 3.0 * np.sqrt(spread.diagonal() + self._calibrated.sigma_px**2)
         size = np.array([camera.width_px, camera.height_px])
-        if (foreseen.uv_px < margin).any() or (foreseen.uv_px > size - 1.0 - margin).any():
-            u, v = foreseen.uv_px
+        if (predicted.uv_px < margin).any() or (predicted.uv_px > size - 1.0 - margin).any():
+            u, v = predicted.uv_px
             where = f"the spot should be at ({u:.0f}, {v:.0f}) px, not safely within the image, and was not seen"
-            return self._told(seen, SpotFault.NOT_FORESEEN, where, foreseen)
-        return self._told(seen, SpotFault.NO_SPOT, reason, foreseen)
+            return self._judged(seen, SpotFault.NOT_FORESEEN, where, predicted)
+        return self._judged(seen, SpotFault.NO_SPOT, reason, predicted)
 
-    def _told(
+    def _judged(
         self,
         seen: SpotSeen,
         fault: SpotFault | None,
         reason: str,
-        foreseen: Foreseen | None = None,
+        predicted: Prediction | None = None,
         single: Single | None = None,
         chosen: int | None = None,
     ) -> SpotJudgement:
@@ -146,7 +146,7 @@ class SpotWatch:
             fault is None,
             self.state,
             self.verdict,
-            foreseen_px=None if foreseen is None else foreseen.uv_px,
+            predicted_px=None if predicted is None else predicted.uv_px,
             fault=fault,
             reason=reason,
             probability_moved=1.0 if self._test.moved else self._odds / (1.0 + self._odds),
@@ -154,21 +154,10 @@ class SpotWatch:
             motion=None if moved is None else moved.motion,
             alerts=self._alerts(),
         )
-        if single is None:
-            return out
-        return replace(
-            out,
-            chosen=chosen,
-            uv_px=single.uv_px,
-            off_px=single.off_px,
-            covariance_px=single.covariance_px,
-            square=single.square,
-            spots_base_m=single.spots_base_m,
-            disagreements=single.disagreements,
-        )
+        return out if single is None else replace(out, chosen=chosen, **single._asdict())
 
     def _state(self) -> State:
-        # Wrong spots may be the beginning of a motion, which is told better as that: they count half.
+        # Wrong spots may be the beginning of a motion, which is better explained as one: they count half.
         astray = sum(fault is SpotFault.OUTLIER for fault in self._bad)
         if len(self._bad) - 0.5 * astray >= self.settings.pulses_until_lost:
             return State.LOST
@@ -196,10 +185,10 @@ class SpotWatch:
             alerts = book.absent(VIEW, "spots are seen again", now_s, at_once=True) if not self._bad else ()
         motion_alert = self.motion_alert
         if motion_alert is not None:
-            told = book.present(MOTION, motion_alert, now_s, stamp_ns, news=self._known_better())
-            if told:
+            raised = book.present(MOTION, motion_alert, now_s, stamp_ns, news=self._known_better())
+            if raised:
                 self._said_sigma = self._sigma
-            return alerts + told
+            return alerts + raised
         self._said_sigma = math.inf
         return alerts + book.absent(MOTION, "spots are where the calibration has them again", now_s, at_once=True)
 
@@ -215,7 +204,7 @@ class SpotWatch:
     @property
     def _sigma(self) -> float:
         """How well the camera's motion is known: its largest standard deviation, in 10 mm and 10 mrad; infinite where
-        none is told.
+        none is reported.
         """
         motion = None if self._moved is None else self._moved.motion
         if motion is None:
@@ -237,9 +226,9 @@ class SpotWatch:
         return self.book.acknowledge(alert_id)
 
     def reset(self) -> tuple[Alert, ...]:
-        """Begin anew, as after a repair: the calibration is believed again, alerts are cleared."""
+        """Begin again, as after a repair: the calibration is believed again, alerts are cleared."""
         self._begin()
-        text = "begun anew"
+        text = "begun again"
         alerts: tuple[Alert, ...] = ()
         for topic in (MOTION, VIEW):
             alerts += self.book.absent(topic, text, self._now_s, at_once=True)

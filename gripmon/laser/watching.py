@@ -13,7 +13,7 @@ import numpy as np
 from gripmon.calibrate.sighting import NotFound
 from gripmon.judge.policy import AlertBook
 from gripmon.laser.judgement import SpotFault, SpotJudgement, SpotSeen, SpotWatchSettings
-from gripmon.laser.matching import Matcher, PulseSettings, Shown, Told, mean_image
+from gripmon.laser.matching import Matcher, PulseSettings, ReportedPulse, Shown, mean_image
 from gripmon.laser.setup import LaserCalibration, setup_of
 from gripmon.laser.spots import SHARE_OF_PEAK, Spot, find_spots
 from gripmon.laser.watch import SpotWatch
@@ -67,7 +67,7 @@ class Displacement(NamedTuple):
 
 
 class PulsedWatch:
-    """A pure function of the frames and pulses so far; it has no clock."""
+    """A pure function of the frames and pulses so far; it has no clock.  The ``matcher`` takes the pulses."""
 
     def __init__(
         self, calibration: LaserCalibration, watch: SpotWatchSettings, pulses: PulseSettings, *, name: str = ""
@@ -80,7 +80,7 @@ class PulsedWatch:
         self.displacement: Displacement | None = None
         self.usable = 0
         self._watch = SpotWatch(calibration, watch)
-        self._matcher = Matcher(pulses)
+        self.matcher = Matcher(pulses)
         self._size_px = camera.width_px, camera.height_px
         self._base_T_cam = from_record(calibration.base_T_cam)
         setup = setup_of(calibration)
@@ -111,37 +111,21 @@ class PulsedWatch:
         self.displacement = None
         return self._watch.reset()
 
-    def load(self, table: Sequence[Told]) -> None:
-        """All pulses of recorded frames, before any frame."""
-        self._matcher.load(table)
-
-    def replayed(self, frames: Iterable[Frame], table: Sequence[Told]) -> Iterator[SpotRecord]:
+    def replayed(self, frames: Iterable[Frame], table: Sequence[ReportedPulse]) -> Iterator[SpotRecord]:
         """The records of a table's pulses, judged on recorded frames; the same input gives the same ones."""
-        self.load(table)
+        self.matcher.load(table)
         for frame in frames:
             for shown in self.frame(frame)[0]:
                 yield self.judge(shown).record
-        for shown in self.finish():
+        for shown in self.matcher.finish():
             yield self.judge(shown).record
-
-    def tell(self, told: Told, now_s: float) -> list[Shown]:
-        """A pulse was told; those that are to be judged now.  ``now_s``: by any clock, as in :meth:`tick`."""
-        return self._matcher.tell(told, now_s)
 
     def frame(self, frame: Frame) -> tuple[list[Shown], tuple[Alert, ...], str]:
         """A frame came: the pulses that are to be judged now, alerts about the image, and what is wrong with it."""
         fault = _fault(frame, self._size_px)
         self._seq = frame.seq
         alerts = self._image_alerts(frame, fault)
-        return self._matcher.frame(replace(frame, image=None, fault=fault) if fault else frame), alerts, fault
-
-    def tick(self, now_s: float) -> list[Shown]:
-        """Pulses that have waited for their frames for too long."""
-        return self._matcher.tick(now_s)
-
-    def finish(self) -> list[Shown]:
-        """No more frames will come: the pulses that still wait."""
-        return self._matcher.finish()
+        return self.matcher.frame(replace(frame, image=None, fault=fault) if fault else frame), alerts, fault
 
     def judge(self, shown: Shown) -> Outcome:
         """What a pulse says, in the order in which they are given back."""
@@ -172,7 +156,7 @@ class PulsedWatch:
         )
 
     def unjudged(self, shown: Shown, fault: PulseFault, reason: str) -> Outcome:
-        """A pulse of which nothing can be told."""
+        """A pulse that can't be judged."""
         nothing = SpotJudgement(shown.pulse.stamp_ns, False, self.state, self.verdict, reason=reason)
         return Outcome(self._record(shown, nothing, 0, fault))
 
@@ -195,7 +179,7 @@ class PulsedWatch:
             background=shown.dark is not None,
             candidates=candidates,
             uv_px=_numbers(judged.uv_px),
-            foreseen_px=_numbers(judged.foreseen_px),
+            foreseen_px=_numbers(judged.predicted_px),
             off_px=_numbers(judged.off_px),
             off_covariance_px2=_numbers(judged.covariance_px),
             square=judged.square,

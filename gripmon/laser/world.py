@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
-class Foreseen:
+class Prediction:
     """A pulse's spot: ``spot_base_m`` (3,), ``uv_px`` (2,), derivatives ``rows`` (2, 13) of the latter by
     :data:`PARAMETERS` and ``arm_rows`` (2, 6) by a perturbation of ``base_T_ee``, base axes.
     """
@@ -116,7 +117,7 @@ def _to_base(base_T_cam: Array, normal_cam: Array, normal_base: Array) -> Array:
     return out
 
 
-def foresee(world: World, camera: Camera, base_T_ee: Array) -> Foreseen:
+def predict(world: World, camera: Camera, base_T_ee: Array) -> Prediction:
     """The spot at a pose (4, 4) by beam and plane, equations (7) to (9); NaN where there is none."""
     pose = base_T_ee[None]
     spots, slopes = spots_on_plane(world.lit, pose)
@@ -127,14 +128,14 @@ def foresee(world: World, camera: Camera, base_T_ee: Array) -> Foreseen:
     rows = by_base @ slopes[0]
     rows[:, :3] = -by_base
     rows[:, 3:6] = by_base @ skew(lever)
-    return Foreseen(spots[0], uv_px[0], rows, by_base @ pose_slopes(world.lit, pose)[0])
+    return Prediction(spots[0], uv_px[0], rows, by_base @ pose_slopes(world.lit, pose)[0])
 
 
-def foresee_moved(calibrated: Calibrated, change: Array, base_T_ee: Array) -> Foreseen:
-    """As :func:`foresee` of the world moved by ``change`` (13,), ``rows`` the derivatives by ``change`` where it is."""
+def predict_moved(calibrated: Calibrated, change: Array, base_T_ee: Array) -> Prediction:
+    """As :func:`predict` of the world moved by ``change`` (13,), ``rows`` the derivatives by ``change`` where it is."""
     world = calibrated.world.moved(change)
-    found = foresee(world, calibrated.camera, base_T_ee)
-    return Foreseen(
+    found = predict(world, calibrated.camera, base_T_ee)
+    return Prediction(
         found.spot_base_m, found.uv_px, found.rows @ _chart(calibrated.world, world, change), found.arm_rows
     )
 
@@ -209,7 +210,7 @@ _PARALLEL = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Ways:
+class Triangulation:
     """``spots_base_m`` (3, 3) by beam and plane, by ray and plane, by beam and ray (the ray's point), with ``slopes``
     (3, 3, 21); ``gap_m`` (3,) from the ray's nearest point to the beam's, ``gap_slopes`` (3, 21).  NaN where there is
     none: beam or ray along the plane, both along each other.
@@ -231,18 +232,18 @@ class _Line:
     direction_slopes: Array
 
 
-def ways(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) -> Ways:
+def triangulate(world: World, camera: Camera, base_T_ee: Array, uv_px: Array) -> Triangulation:
     """Of a spot (2,) seen at a pose (4, 4)."""
     beam, ray = _beam(world, base_T_ee), _ray(world, camera, uv_px)
     first, first_slopes = _on_plane(world, beam)
     second, second_slopes = _on_plane(world, ray)
     third, third_slopes, gap, gap_slopes = _between(ray, beam)
-    return Ways(
+    return Triangulation(
         np.stack([first, second, third]), np.stack([first_slopes, second_slopes, third_slopes]), gap, gap_slopes
     )
 
 
-def disagreements(found: Ways, covariance: Array) -> tuple[Disagreement, ...]:
+def disagreements(found: Triangulation, covariance: Array) -> tuple[Disagreement, ...]:
     """Those of ways that exist; ``covariance`` (21, 21) of the inputs."""
     spots, slopes = found.spots_base_m, found.slopes
     names = (BEAM_PLANE, RAY_PLANE, BEAM_RAY)
@@ -334,11 +335,10 @@ def _between(ray: _Line, beam: _Line) -> tuple[Array, Array, Array, Array]:
 
 
 MOST_UNCERTAIN = 0.1
-"""Of the image's diagonal: a foreseen spot that is less certain is none."""
+"""Of the image's diagonal: a predicted spot that is less certain is none."""
 
 
-@dataclass(frozen=True, slots=True)
-class Single:
+class Single(NamedTuple):
     """See :class:`~gripmon.laser.judgement.SpotJudgement`."""
 
     uv_px: Array
@@ -349,37 +349,37 @@ class Single:
     disagreements: tuple[Disagreement, ...]
 
 
-def visible(calibrated: Calibrated, foreseen: Foreseen, arm: Array) -> str | None:
-    """Why there is no spot to be foreseen at a pose; ``arm`` (6, 6) covariance of its poses.  None if there is one."""
-    if not foreseen.finite:
-        if not np.isfinite(foreseen.spot_base_m).all():
+def visible(calibrated: Calibrated, predicted: Prediction, arm: Array) -> str | None:
+    """Why there is no spot to be predicted at a pose; ``arm`` (6, 6) covariance of its poses.  None if there is one."""
+    if not predicted.finite:
+        if not np.isfinite(predicted.spot_base_m).all():
             return "the beam runs along the plane"
         return "the beam meets the plane behind the camera or outside of its lens"
-    spread = spread_px(calibrated, foreseen, arm)
+    spread = spread_px(calibrated, predicted, arm)
     largest = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
     if largest > MOST_UNCERTAIN * math.hypot(calibrated.camera.width_px, calibrated.camera.height_px):
-        return f"the beam nearly runs along the plane: the spot can't be foreseen to better than {largest:.0f} px"
+        return f"the beam nearly runs along the plane: the spot can't be predicted to better than {largest:.0f} px"
     return None
 
 
-def spread_px(calibrated: Calibrated, foreseen: Foreseen, arm: Array) -> Array:
-    """Covariance (2, 2) of a foreseen spot: by the calibration and the arm."""
-    return foreseen.rows @ calibrated.covariance @ foreseen.rows.T + foreseen.arm_rows @ arm @ foreseen.arm_rows.T
+def spread_px(calibrated: Calibrated, predicted: Prediction, arm: Array) -> Array:
+    """Covariance (2, 2) of a predicted spot: by the calibration and the arm."""
+    return predicted.rows @ calibrated.covariance @ predicted.rows.T + predicted.arm_rows @ arm @ predicted.arm_rows.T
 
 
-def alone(calibrated: Calibrated, foreseen: Foreseen, base_T_ee: Array, spot: Spot, arm: Array) -> Single:
+def alone(calibrated: Calibrated, predicted: Prediction, base_T_ee: Array, spot: Spot, arm: Array) -> Single:
     """The calibration's residuals have the arm in them: noise is what they show, or what is said of spot and arm,
     whichever is more.
     """
     floor = calibrated.sigma_px**2 * np.eye(2)
-    by_arm = foreseen.arm_rows @ arm @ foreseen.arm_rows.T
+    by_arm = predicted.arm_rows @ arm @ predicted.arm_rows.T
     noise = larger(spot.covariance_px + by_arm, floor)
-    covariance = foreseen.rows @ calibrated.covariance @ foreseen.rows.T + noise
-    off = spot.uv_px - foreseen.uv_px
+    covariance = predicted.rows @ calibrated.covariance @ predicted.rows.T + noise
+    off = spot.uv_px - predicted.uv_px
     inputs = np.zeros((INPUTS, INPUTS))
     inputs[:COUNT, :COUNT] = calibrated.covariance
     inputs[COUNT : COUNT + 2, COUNT : COUNT + 2] = noise  # the arm is counted as pixels, once
-    found = ways(calibrated.world, calibrated.camera, base_T_ee, spot.uv_px)
+    found = triangulate(calibrated.world, calibrated.camera, base_T_ee, spot.uv_px)
     return Single(
         spot.uv_px,
         off,

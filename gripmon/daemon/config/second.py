@@ -22,7 +22,7 @@ from gripmon.io.metrics import MetricsSettings
 from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceSettings, VideoSettings
 from gripmon.io.wire import Joining, PublishSettings
 from gripmon.laser.judgement import SpotWatchSettings
-from gripmon.laser.matching import PulseSettings, Told, read_pulses
+from gripmon.laser.matching import PulseSettings, ReportedPulse, read_pulses
 from gripmon.laser.setup import LaserCalibration
 from gripmon.laser.watching import PulsedWatch
 from gripmon.model.camera import Camera, make_camera
@@ -84,7 +84,7 @@ class SecondConfig:
     calibration_path: Path
     calibration: LaserCalibration
     camera: Camera
-    pulses: tuple[Told, ...] = ()
+    pulses: tuple[ReportedPulse, ...] = ()
 
     @property
     def directory(self) -> Path:
@@ -161,7 +161,7 @@ def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
     return calibration
 
 
-def _pulses(path: Path, name: str) -> tuple[Told, ...]:
+def _pulses(path: Path, name: str) -> tuple[ReportedPulse, ...]:
     try:
         return tuple(read_pulses(path.parent / name))
     except InputError as error:

@@ -16,7 +16,7 @@ import zenoh
 from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state
 from gripmon.io.wire import Link
 from gripmon.io.wire.link import Malformed
-from gripmon.laser.matching import Told, of_message
+from gripmon.laser.matching import ReportedPulse, of_message
 from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_json, largest_bytes
 
 LARGEST_OPENING_M = 0.5
@@ -265,10 +265,10 @@ class ZenohPulses(_Input):
     """
 
     def __init__(self, link: Link, key: str) -> None:
-        self._waiting: deque[Told] = deque(maxlen=_WAITING_MOST)
+        self._waiting: deque[ReportedPulse] = deque(maxlen=_WAITING_MOST)
         super().__init__(link, key, "pulse message")
 
-    def poll(self) -> Told | None:
+    def poll(self) -> ReportedPulse | None:
         """The next pulse, at once; None if there is none."""
         return self._waiting.popleft() if self._waiting else None
 
