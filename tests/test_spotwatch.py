@@ -123,7 +123,7 @@ def test_one_orientation_does_not_tell_everything_and_says_so(known):
     assert {w.cause for w in alert.causes if w.probability > 0.1} >= {Cause.CAMERA_MOUNT, Cause.LASER_MOVED}
     assert sum(w.probability for w in alert.causes) == pytest.approx(1.0, abs=1e-4)
     assert last.motion is not None and not last.motion.complete and len(last.motion.observed) <= 2
-    assert "hardly tell a motion" in last.motion.text
+    assert "hardly show a motion" in last.motion.text
 
 
 def test_several_things_that_moved_at_once_are_not_called_one(known):

@@ -171,7 +171,7 @@ class Matcher:
             entry.reason = (
                 "overlaps with a pulse that was judged before it was reported"
                 if overlaps
-                else f"was reported {_seconds(last.until_ns - pulse.stamp_ns)} out of order, after a later one was judged"
+                else f"was reported {_seconds(last.until_ns - pulse.stamp_ns)} out of order: a later one was judged"
             )
 
     def _complete(self) -> list[Shown]:
