@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 
 import msgspec
 
@@ -66,6 +67,8 @@ class Daemon(Loop):
         self._jaw = jaw
         self._keeper = keeper or StateKeeper(None)
         self._kept_revision: int | None = None
+        self._beside = ThreadPoolExecutor(1, "analysis")
+        self._working: Future[None] | None = None
         self._reference, self._reference_due = monitor.reference, True
         self._next_keeping_s = self._start_s + KEEP_LAST_EVERY_S
 
@@ -81,6 +84,7 @@ class Daemon(Loop):
         """The frames bring all that there is."""
 
     def _finish(self) -> None:
+        self._beside.shutdown()
         self._deliver("state's keeping", lambda: self._keeper.soon(self._monitor.state()))
 
     def _handle(self, frame: Frame) -> None:
@@ -99,11 +103,17 @@ class Daemon(Loop):
             self._alert(alert, record.state, frame.stamp_ns)
         self._deliver("recording", self._recorder.offer, frame, record, self._monitor.trace, self._monitor.notes)
         self._deliver("estimates", self._estimates.write, record)
-        self._deliver("reflection", self._monitor.ponder)
+        self._deliver("learning", self._monitor.learn)
+        self._work_beside_the_frames()
         undelivered = "; ".join(self._faults.values())
         self._faults.clear()
         for alert in self._watch.end_of_frame(failure, undelivered, time.monotonic(), frame.stamp_ns):
             self._alert(alert, record.state, frame.stamp_ns)
+
+    def _work_beside_the_frames(self) -> None:
+        """The search and the analysis of causes go on in a thread of their own."""
+        if self._monitor.pending and (self._working is None or self._working.done()):
+            self._working = self._beside.submit(self._monitor.run_pending)
 
     def _judge(self, frame: Frame) -> tuple[Frame, FrameRecord, str]:
         """The frame with its jaw opening, what the monitor makes of it, and the monitor's failure (mostly empty).

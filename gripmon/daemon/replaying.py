@@ -83,10 +83,6 @@ def replay(
             recorder.reference(monitor.reference)
         recorder.offer(frame, record, monitor.trace, monitor.notes)
         yield record
-        try:
-            monitor.ponder()  # now, as the daemon: a command would find other thoughts
-        except Exception as error:  # noqa: BLE001  as the daemon does
-            warn(f"frame {frame.seq}: reflection failed: {_in_short(error)}")
 
 
 def _told(monitor: Monitor, then: RecordedCommand) -> RecordedCommand:

@@ -31,6 +31,7 @@ from gripmon.model.records import (
     CommandReply,
     CornerFault,
     Drift,
+    EdgeEvidence,
     Explanation,
     Frame,
     FrameRecord,
@@ -45,6 +46,7 @@ from gripmon.model.records import (
     Verdict,
     unmeasured_record,
 )
+from gripmon.monitor.analysis import CauseAnalysis
 from gripmon.monitor.answers import (
     after_restart,
     drift_between,
@@ -56,7 +58,6 @@ from gripmon.monitor.answers import (
     smoothed_record,
     unmeasured_corners,
 )
-from gripmon.monitor.asking import Inquiry
 from gripmon.monitor.notes import NoteTaker
 from gripmon.monitor.orders import Moment, obey
 from gripmon.monitor.renewal import Renewal
@@ -98,7 +99,7 @@ class Monitor:
         judge = CauseJudge(
             camera, gripper, settings.causes, np.zeros(6), settings.jaw_sigma_m, settings.jaw_offset_sigma_m
         )
-        self._inquiry = Inquiry(judge)
+        self._analysis = CauseAnalysis(judge)
         self._watches = Watches(len(gripper.finger_ids))
         self._average = PoseAverage(settings.smoothing)
         self._notes = NoteTaker(settings)
@@ -171,9 +172,10 @@ class Monitor:
         """One frame in, one decision out.  Never raises for a bad frame: that is a record with a reason.  The image is
         not looked at after that.
         """
-        self._inquiry.catch_up()
+        self.learn()
         frame = in_full_scale(frame, self._settings.bit_depth)
         self._tick(frame)
+        self._analysis.catch_up(self._now_s)
         faults = self._look_at_stream(frame)
         refusal = inspect(frame, self._camera, self._gripper) or frozen(faults)
         if refusal is not None:
@@ -187,7 +189,7 @@ class Monitor:
             )
         before_T = self._cam_T_grip
         rivals = self._trust.rivals(self._ref_cam_T_grip)
-        measurement = self._newest = self._tracker.measure(frame, before_T, rivals)
+        measurement = self._newest = self._tracker.measure(frame, before_T, self._now_s, rivals)
         standing = self._trust.judge(frame, measurement, self._now_s)
         if standing is None:
             explanation = self._explain(frame, measurement, wrong=True)
@@ -239,12 +241,23 @@ class Monitor:
             self._begin()
         return alerts
 
-    def ponder(self) -> None:
-        """Think about what moved, which takes the time of some frames, while nothing is urgent.
-
-        The next :meth:`process` does it first if nobody has; the records are the same.
+    def learn(self) -> None:
+        """Learn from the newest frame what nothing waits for, in some 2 ms; :meth:`process` does it first if nobody
+        has.
         """
-        self._inquiry.ponder()
+        self._trust.learn()
+
+    @property
+    def pending(self) -> bool:
+        """Whether there is something to do for :meth:`run_pending`."""
+        return self._tracker.searching.pending or self._analysis.pending
+
+    def run_pending(self) -> None:
+        """Search for a lost gripper and work out what moved, which takes the time of some frames, in another thread
+        than :meth:`process` if need be.  Without it :meth:`process` does that; the records are the same.
+        """
+        self._tracker.searching.run_pending()
+        self._analysis.run_pending()
 
     def trace(self) -> MeasurementTrace | None:
         """The pixels behind the newest record; None if its frame was refused."""
@@ -269,7 +282,7 @@ class Monitor:
         """What is wrong with the stream, told of in the next record; its rate, for the drift test."""
         faults = self._stream.add(frame)
         if any(fault.kind == "gap" for fault in faults):
-            self._inquiry.interrupted()
+            self._analysis.interrupted()
         told = tuple((fault.kind, fault.cause, fault.text) for fault in faults)
         self._due += self._policy.stream(told, self._now_s, frame.stamp_ns)
         if self._stream.frames_per_s is not None:
@@ -294,7 +307,7 @@ class Monitor:
         else:
             motion = self._watch.add(self._since_start(shift), self._covariance, self._now_s)
         if motion.stepped:
-            self._inquiry.moved_again()
+            self._analysis.moved_again()
         reported_m = frame.jaw_opening_m if self._gripper.has_jaw else None
         blur_px, residual_px = self._tracker.blur_px(measurement), self._tracker.edge_residuals_px(measurement)
         odd = self._watches.add(blur_px, shares, residual_px, reported_m, measurement.jaw_opening_m)
@@ -329,9 +342,13 @@ class Monitor:
 
     def _explain(self, frame: Frame, measurement: Measurement, wrong: bool) -> Explanation:
         if self._stream.repeats:
-            return self._inquiry.told()  # the image is an old one, what the robot reports is not
+            return self._analysis.known  # the image is an old one, what the robot reports is not
         here = self._ref_cam_T_grip
-        return self._inquiry.ask(wrong, frame, lambda kept: self._tracker.evidence(kept, measurement, here), here)
+
+        def gather(kept: Frame) -> EdgeEvidence:
+            return self._tracker.evidence(kept, measurement, here)
+
+        return self._analysis.ask(wrong, frame, gather, here, self._now_s)
 
     def _drift(self) -> Drift:
         return drift_between(self._ref_cam_T_grip, self._cam_T_grip)
@@ -365,7 +382,7 @@ class Monitor:
         self._watch.reset(covariance)
         if book.in_force != book.configured:
             self._trust.rebase(self.reference)
-        self._inquiry.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
+        self._analysis.rebase(np.sqrt(np.reshape(self.reference.covariance, (6, 6)).diagonal()))
         if self.reference.restores is None:
             # How edges look from where the camera is now; an undo doesn't move it.
             self._watches = Watches(len(self._gripper.finger_ids))

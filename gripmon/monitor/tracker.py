@@ -11,9 +11,10 @@ from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import Array, EdgeEvidence, Frame
+from gripmon.monitor.searching import GripperSearch
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.track.differential import DegenerateGeometry, Update, differential_update
-from gripmon.track.edges import FingerEndsSeen, FingertipMeter, Measurement, Patience, TaughtEdges
+from gripmon.track.edges import FingerEndsSeen, FingerMeter, FingertipMeter, Measurement, TaughtEdges
 from gripmon.track.jaw import JawKnowledge
 
 USUAL_SHARE = 0.6
@@ -36,51 +37,49 @@ class Tracker:
         self._floor = np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
         self.model_sigma_m = settings.model_sigma_m if taught is None else 0.0
         """By how much the model may have each finger out of its place; teaching measures that."""
-        self.jaw_opening_m = gripper.jaw_nominal_m
-        """Where the jaw was seen last: what to expect when nobody reports it."""
+        self._jaw_opening_m = gripper.jaw_nominal_m  # where it was seen last
         self._usual_share = USUAL_SHARE
-        self._credit = float(settings.corners.search.eager_frames)
-        self._untrusted = 0
+        self.searching = GripperSearch(camera, gripper, settings.corners.search)
+        # Its own, since it may run beside a measurement.
+        self._finger_meter = FingerMeter(camera, gripper, settings.corners, self._jaw.report_sigma_m, taught)
 
     @property
     def floor(self) -> Array:
         """(6, 6) covariance of the systematic error that no averaging removes."""
         return self._floor
 
-    def measure(self, frame: Frame, cam_T_grip: Array, rivals: tuple[Array, ...] = ()) -> Measurement:
+    def measure(self, frame: Frame, cam_T_grip: Array, now_s: float, rivals: tuple[Array, ...] = ()) -> Measurement:
         """Measure about ``cam_T_grip`` (4, 4), where the gripper is expected, and look further when clearly fewer edge
-        points agree than usually: at the ``rivals`` (4, 4) first.
-
-        A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is
-        searched for in the first frames, then in one of several.
+        points agree than usually: at the ``rivals`` (4, 4) first.  An opening that isn't reported is expected where it
+        was last.
         """
-        search = self._settings.corners.search
-        reported_m = frame.jaw_opening_m
         assert frame.image is not None
+        patience = self.searching.begin_frame(now_s)
         measurement = self._meter.measure(
             frame.image,
             cam_T_grip,
-            self.jaw_opening_m if reported_m is None else reported_m,
+            self._opening_m(frame),
             self._usual_share,
-            Patience(
-                when_doubtful=self._credit >= 1.0,
-                when_lost=self._untrusted < search.eager_frames or self._untrusted % search.patient_every == 0,
-            ),
-            jaw_reported=reported_m is not None,
+            patience,
+            jaw_reported=frame.jaw_opening_m is not None,
             rivals=rivals,
+            search=self.searching.poses,
         )
-        earned = -1.0 if measurement.looked_far else 1.0 / search.refill_frames
-        self._credit = min(max(self._credit + earned, 0.0), float(search.eager_frames))
-        self._untrusted = 0 if measurement.trusted else self._untrusted + 1
+        self.searching.end_frame(measurement)
+        if measurement.trusted:
+            self._jaw_opening_m = measurement.jaw_opening_m
         return measurement
+
+    def _opening_m(self, frame: Frame) -> float:
+        return self._jaw_opening_m if frame.jaw_opening_m is None else frame.jaw_opening_m
 
     def measure_held(self, frame: Frame, cam_T_grip: Array, sigma: Array) -> Measurement:
         """Measure at ``cam_T_grip`` (4, 4), with what lies within the standard deviations (6,) of it; nowhere else."""
         assert frame.image is not None
-        reported_m = frame.jaw_opening_m
-        opening_m = self.jaw_opening_m if reported_m is None else reported_m
-        measurement = self._meter.measure_held(frame.image, cam_T_grip, sigma, opening_m, self._usual_share)
-        return self.with_known_jaw(measurement, reported_m)
+        measurement = self._meter.measure_held(
+            frame.image, cam_T_grip, sigma, self._opening_m(frame), self._usual_share
+        )
+        return self.with_known_jaw(measurement, frame.jaw_opening_m)
 
     def learn(self, measurement: Measurement) -> None:
         """The gripper was where it was measured: that is what it usually shows, and the report's error."""
@@ -172,7 +171,9 @@ class Tracker:
         return self._meter.edge_residuals_px(measurement)
 
     def evidence(self, frame: Frame, measurement: Measurement, ref_cam_T_grip: Array) -> EdgeEvidence:
-        """What the fingers show one by one in a frame that was measured; takes as long as the measurement."""
+        """What the fingers show one by one in a frame that was measured; takes some times as long as the measurement,
+        and may run in another thread.
+        """
         assert frame.image is not None
         reported = frame.jaw_opening_m is not None
-        return self._meter.evidence(frame.image, measurement, ref_cam_T_grip, jaw_reported=reported)
+        return self._finger_meter.evidence(frame.image, measurement, ref_cam_T_grip, jaw_reported=reported)

@@ -15,7 +15,7 @@ from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
 from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
-from gripmon.model.records import Array, Frame, MonitorState, Protection, ReferenceRecord
+from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
 from gripmon.monitor.weigher import CORNERS_WHERE_EXPECTED, LOOK_RISK, Trust, Weigher
@@ -74,6 +74,7 @@ class Integrity:
         self._strips = FingerStrips(camera, gripper, tracker.along)
         self.look_refused: str | None = None
         """Why a look that was kept over a restart isn't used; None where it is, or none was kept."""
+        self._learn_from: tuple[Image, Array, float, float] | None = None
         self._frames = 0
         self._elsewhere = 0
         self._believed = False
@@ -100,6 +101,13 @@ class Integrity:
                 self._look.restore(state.look, reference.reference_id)
             except LookRefused as refused:
                 self.look_refused = str(refused)
+
+    def learn(self) -> None:
+        """Learn the look of the newest frame that proved where the gripper is; nothing if that has been done."""
+        learn_from, self._learn_from = self._learn_from, None
+        if learn_from is not None:
+            self._look.learn(*learn_from)
+            self._strips.learn(*learn_from)
 
     def last_known(self, cam_T_grip: Array) -> Array:
         """The newest pose (4, 4) if it was believed, else the anchor's."""
@@ -226,8 +234,8 @@ class Integrity:
         if trust.proven and (moved or not trust.displaced):
             self._weigher.settle(trust, cam_T_grip, covariance, now_s)
             if frame.image is not None and not moved:
-                self._look.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
-                self._strips.learn(frame.image, cam_T_grip, measurement.jaw_opening_m, now_s)
+                # A copy: learning can wait, and the caller may read the next image into the same memory.
+                self._learn_from = frame.image.copy(), cam_T_grip, measurement.jaw_opening_m, now_s
         believed = moved or not trust.displaced or (trust.proven and trust.ambiguous)
         return Standing(measurement, cam_T_grip, covariance, trust.protection, believed, where_it_was)
 

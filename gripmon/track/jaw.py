@@ -56,7 +56,7 @@ class JawKnowledge:
         self._reported_m: float | None = None
         self._correlation = _CORRELATED
         self._seen: tuple[float, float] | None = None
-        self._pending: tuple[float, float] | None = None
+        self._pending: tuple[float, float, bool] | None = None
         self._forget()
 
     @property
@@ -88,14 +88,15 @@ class JawKnowledge:
         error_m = seen_variance * (jaw_opening_m - reported_m) / variance  # of the report, by this image alone
         self._travel(reported_m)
         surprise = (error_m - self._mean.sum()) / math.sqrt(seen_variance + self._known_variance)
-        if abs(surprise) > CONTRADICTION:
-            self._forget()
         known_m, known = float(self._mean.sum()), self._known_variance
+        contradicted = abs(surprise) > CONTRADICTION
+        if contradicted:
+            known_m, known = 0.0, prior
         fused = 1.0 / (image + 1.0 / known)
         opening_m = reported_m + fused * (image * error_m + known_m / known)
         gain = covariance[:6, 6] / variance
         conditioned = covariance[:6, :6] + np.outer(gain, gain) * (fused - variance)
-        self._pending = error_m, seen_variance
+        self._pending = error_m, seen_variance, contradicted
         xi = gain * (opening_m - jaw_opening_m)
         return Fused(
             xi,
@@ -132,8 +133,10 @@ class JawKnowledge:
         """
         if self._pending is None:
             return
-        error_m, variance = self._pending
+        error_m, variance, contradicted = self._pending
         self._pending = None
+        if contradicted:
+            self._forget()
         if self._seen is not None:
             before_m, before = self._seen
             differing = (error_m - before_m) ** 2 / (variance + before)

@@ -81,7 +81,11 @@ class ScriptedMonitor:
     def state(self) -> MonitorState:
         return MonitorState((self.reference,))
 
-    def ponder(self) -> None: ...
+    def learn(self) -> None: ...
+
+    pending = False
+
+    def run_pending(self) -> None: ...
 
     def trace(self) -> MeasurementTrace | None:
         return None

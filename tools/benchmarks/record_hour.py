@@ -97,7 +97,7 @@ def _judge(ring: scene.Ring, count: int) -> _Part:
             trace = None if measured is None else pack_trace(measured)
         notes = monitor.notes()
         rows.append(Row(record, picture, trace, None, frame.jaw_opening_m, notes.statistic_share, notes.limits))
-        monitor.ponder()
+        monitor.learn()
     return _Part(rows, monitor)
 
 

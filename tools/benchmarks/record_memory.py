@@ -73,7 +73,7 @@ def measure(path: Path, plan: Plan) -> dict[str, Any]:
 def _judge(monitor: Monitor, frame: Frame) -> tuple[Frame, FrameRecord, MeasurementTrace | None]:
     record = monitor.process(frame)
     trace = monitor.trace()
-    monitor.ponder()
+    monitor.learn()
     # An alert pins its file, which then stays.
     return frame, msgspec.structs.replace(record, alerts=()), trace
 

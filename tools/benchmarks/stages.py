@@ -19,7 +19,7 @@ from gripmon.judge.policy import Policy
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamWatch
 from gripmon.monitor import Monitor, Tracker
-from gripmon.monitor.asking import Inquiry
+from gripmon.monitor.analysis import CauseAnalysis
 from gripmon.track.edges import FingertipMeter
 
 STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
@@ -34,7 +34,7 @@ STAGES: dict[str, tuple[tuple[Any, str], ...]] = {
     "corners": ((gripmon.track.edges.settling, "intersect_edges"),),
     "look at the stream": ((StreamWatch, "add"),),
     "drift test": ((MotionWatch, "add"),),
-    "causes": ((Inquiry, "ponder"),),
+    "causes": ((CauseAnalysis, "ask"),),
     "update and judge": (
         (Tracker, "update"),
         (Monitor, "_evidence"),

@@ -2,6 +2,7 @@
 
 from gripmon.track.edges.consensus import prior_information
 from gripmon.track.edges.ends import FingerEnds, FingerEndsSeen
+from gripmon.track.edges.evidence import FingerMeter
 from gripmon.track.edges.measure import FingertipMeter, Patience
 from gripmon.track.edges.settling import JAW_UNREPORTED_SIGMA_M, Effort, Measurement, MeasurementSettings
 from gripmon.track.edges.sums import edge_sums
@@ -14,6 +15,7 @@ __all__ = [
     "Effort",
     "FingerEnds",
     "FingerEndsSeen",
+    "FingerMeter",
     "FingertipMeter",
     "Measurement",
     "MeasurementSettings",

@@ -73,6 +73,7 @@ class FingerMeter(Settler):
         ``jaw_reported``: the robot reported the opening of this frame.  A frame in which nothing agrees gives evidence
         without stretches.
         """
+        self._zoom_to(measurement.candidates.zoom)
         votes = self._votes(measurement.candidates, measurement.prediction)
         places = [
             self._finger_place(image, measurement, votes, finger, elsewhere)

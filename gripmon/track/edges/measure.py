@@ -7,6 +7,7 @@ are other starts tried, and only when those fail, too, is the gripper searched f
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,6 +63,12 @@ class Patience:
     when_lost: bool
 
 
+Search = Callable[[Image, Array, float, bool], Array]
+"""From an image, an expected pose (4, 4) and opening, and whether the gripper is lost there, to poses (s, 4, 4) at which
+it may be, best first.
+"""
+
+
 @dataclass(frozen=True, slots=True)
 class _Place:
     """Where the gripper may be, and the share that a rough fit shows there."""
@@ -92,13 +99,15 @@ class FingertipMeter(FingerMeter):
         patience: Patience,
         jaw_reported: bool = True,
         rivals: tuple[Array, ...] = (),
+        search: Search | None = None,
     ) -> Measurement:
         """Measure about an expected pose and jaw opening (``jaw_reported``: by the robot; else it is only a guess to
         start from).
 
         ``usual_share`` of the profiles agree when all is well.  With clearly less the ``rivals`` (4, 4) are looked at:
         poses at which the gripper was.  If it is not there either, and where ``patience`` allows, it is looked for
-        elsewhere: another place than one that may be true must show the fingers' ends.
+        elsewhere, last of all where ``search`` proposes (if None, a search in this image): another place than one that
+        may be true must show the fingers' ends.
         """
         self._prior = self._prior_reported if jaw_reported else self._prior_unreported
         jaw_opening_m = self._possible_opening_m(jaw_opening_m)
@@ -119,7 +128,7 @@ class FingertipMeter(FingerMeter):
         best.trusted = self._trusted(image, best, usual_share)
         if not (patience.when_doubtful if best.trusted else patience.when_lost):
             return best
-        best = self._from_elsewhere(image, expected, best, usual_share)
+        best = self._from_elsewhere(image, expected, best, usual_share, search or self._search)
         best.looked_far = True
         return best
 
@@ -131,14 +140,21 @@ class FingertipMeter(FingerMeter):
                 best = max(best, other, key=lambda m: m.consensus.share)
         return best
 
-    def _from_elsewhere(self, image: Image, expected: Expected, best: Measurement, usual_share: float) -> Measurement:
+    def _from_elsewhere(
+        self, image: Image, expected: Expected, best: Measurement, usual_share: float, search: Search
+    ) -> Measurement:
         """The best of the places farther away, if one is better than the expected one."""
         # Fingers look alike when they slide along themselves: elsewhere must be clearly better than a place that may
         # be true, and such a place is not given up for one that isn't believed.
         beat = (CLEARLY_BETTER if best.trusted else 1.0) * best.consensus.share
         least = max(self._settings.consensus.found_share, TRUSTED * usual_share)
-        for effort, places in ((Effort.GRID, self._near_places), (Effort.SEARCH, self._far_places)):
-            again = [self._tried(image, place.expected) for place in _best(places(image, expected, usual_share))]
+        for effort in (Effort.GRID, Effort.SEARCH):
+            if effort is Effort.GRID:
+                places = self._near_places(image, expected)
+            else:
+                poses = search(image, expected.cam_T_grip, expected.jaw_opening_m, not best.trusted)
+                places = self._far_places(image, expected, poses, usual_share)
+            again = [self._tried(image, place.expected) for place in _best(places)]
             for place in _promising(again, PROMISING * max(beat, least)):
                 other = replace(self._settle(image, place.expected), effort=effort)
                 other.trusted = self._trusted(image, other, usual_share)
@@ -204,6 +220,8 @@ class FingertipMeter(FingerMeter):
         """Starts at other openings, for a jaw that moves and doesn't report it: nearby first, then in its whole range
         until nearly all edges are seen.
         """
+        if best.consensus.share >= satisfied and _shows_nearly_all(best):
+            return best
         prediction, _ = self._predicted(expected)
         rate = float(np.abs(prediction.jacobian[:, 6]).max(initial=0.0))  # px/m
         if rate == 0.0:
@@ -229,7 +247,10 @@ class FingertipMeter(FingerMeter):
                 best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
         return best
 
-    def _near_places(self, image: Image, expected: Expected, _usual_share: float) -> list[_Place]:
+    def _search(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, _lost: bool) -> Array:
+        return search_poses(image, self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.search)
+
+    def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
         """The best of starts all over the reach of the profiles."""
         prediction, start = self._predicted(expected)
         if not prediction.ok.any():
@@ -240,12 +261,11 @@ class FingertipMeter(FingerMeter):
         fit = agree_from_grid(self._look(image, prediction), prior, starts + start, settings)
         return [_Place(fit.share, self._moved(prediction, fit.xi, expected))]
 
-    def _far_places(self, image: Image, expected: Expected, usual_share: float) -> list[_Place]:
-        """What a search in a reduced image proposes, up to the first that shows as well as usual."""
-        search, jaw_opening_m = self._settings.search, expected.jaw_opening_m
+    def _far_places(self, image: Image, expected: Expected, poses: Array, usual_share: float) -> list[_Place]:
+        """Proposed ``poses`` (s, 4, 4) up to the first that shows as well as usual."""
         found: list[_Place] = []
         layout = None
-        for pose in search_poses(image, self._camera, self._gripper, expected.cam_T_grip, jaw_opening_m, search):
+        for pose in poses:
             there = replace(expected, cam_T_grip=pose)
             layout = layout or self._lay_out(there)
             found.append(self._tried(image, there, layout))

@@ -1,0 +1,134 @@
+"""Work beside the frames: its results count from a moment of the frames' clock on, whoever has done it."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from support.meters import box_gripper
+from support.simulated import PAPER_LENS, nominal_cam_T_grip
+from support.watched import frames_of, new_monitor, rendered, replaced
+
+from gripmon.model.camera import make_camera
+from gripmon.model.records import Origin, to_json
+from gripmon.monitor import Tracker
+from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
+from gripmon.monitor.settings import MonitorSettings
+from gripmon.simulate import Scenario
+from gripmon.simulate.scenario import JawScript
+from gripmon.track.edges import FingertipMeter
+from gripmon.track.edges.search import search_poses
+
+
+def test_results_come_in_order_when_they_are_due_and_not_before():
+    backlog: Backlog[str] = Backlog()
+    done = []
+    for name, now_s in (("first", 1.0), ("second", 1.05)):
+        backlog.add(lambda name=name: done.append(name) or name, now_s)
+    assert list(backlog.results(1.0 + 0.99 * RESULT_AFTER_S)) == [] and done == []
+    assert list(backlog.results(1.0 + RESULT_AFTER_S)) == ["first"] and done == ["first"]
+    backlog.run()
+    assert done == ["first", "second"] and len(backlog) == 1, "done, and not yet due"
+    assert list(backlog.results(2.0)) == ["second"] and done == ["first", "second"], "nothing is done twice"
+
+
+def test_what_fails_is_a_result_and_what_follows_is_done():
+    backlog: Backlog[int] = Backlog()
+    backlog.add(lambda: 1 // 0, 0.0)
+    backlog.add(lambda: 7)
+    error, seven = backlog.results(RESULT_AFTER_S)
+    assert isinstance(error, ZeroDivisionError) and seven == 7
+
+
+def test_who_needs_a_result_waits_for_the_thread_that_makes_it():
+    backlog: Backlog[str] = Backlog()
+    began, may_end = threading.Event(), threading.Event()
+
+    def slow() -> str:
+        began.set()
+        assert may_end.wait(10.0)
+        return threading.current_thread().name
+
+    backlog.add(slow, 0.0)
+    worker = threading.Thread(target=backlog.run, name="worker")
+    worker.start()
+    assert began.wait(10.0)
+    threading.Timer(0.05, may_end.set).start()
+    assert list(backlog.results(1.0)) == ["worker"]
+    worker.join()
+
+
+@pytest.mark.parametrize("scene", ["bump", "bent_finger"])
+def test_a_thread_beside_the_frames_changes_no_record(scene: str):
+    """A bump that has to be searched for, and a finger whose bend has to be worked out."""
+    alone, helped = new_monitor(), new_monitor()
+    wanted, stop, busy = threading.Event(), threading.Event(), []
+
+    def work() -> None:
+        while not stop.is_set():
+            if wanted.wait(0.05):
+                wanted.clear()
+                busy.append(helped.pending)
+                helped.run_pending()
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        for frame in frames_of(scene)[0]:
+            expected, found = alone.process(frame), helped.process(frame)
+            wanted.set()
+            assert to_json(found) == to_json(expected)
+    finally:
+        stop.set()
+        worker.join()
+    assert sum(busy) >= 2, "the thread had something to do"
+
+
+def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monkeypatch: pytest.MonkeyPatch):
+    frames, _ = frames_of("static")
+    noise = np.random.default_rng(1).integers(0, 256, frames[0].image.shape, dtype=np.uint8)
+    monitor, ran_in = new_monitor(), []
+
+    def watched(*args: object) -> np.ndarray:
+        ran_in.append(threading.current_thread().name)
+        return search_poses(*args)
+
+    monkeypatch.setattr("gripmon.monitor.searching.search_poses", watched)
+    for number, frame in enumerate(frames[:40]):
+        record = monitor.process(frame if number < 5 else replaced(frame, image=noise))
+        assert (record.source is Origin.HELD) == (number >= 5)
+        if monitor.pending:
+            worker = threading.Thread(target=monitor.run_pending, name="worker")
+            worker.start()
+            worker.join()
+    assert ran_in[0] == "MainThread" and len(ran_in) >= 3 and set(ran_in[1:]) == {"worker"}
+
+
+@pytest.mark.parametrize("opening_m", [0.022, 0.045])
+def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, monkeypatch: pytest.MonkeyPatch):
+    """The jaw stands where neither the gripper file nor anybody says: found at first, expected there then."""
+    jaw = JawScript(knots=((0.0, opening_m),), reported=False)
+    frames, _ = rendered(Scenario(name="unreported", duration_s=0.5, fps=30.0, jaw=jaw))
+    assert all(frame.jaw_opening_m is None for frame in frames)
+    fits = []
+    settle = FingertipMeter._settle
+
+    def counted(self: FingertipMeter, *args: object) -> object:
+        fits.append(len(fits))
+        return settle(self, *args)
+
+    monkeypatch.setattr(FingertipMeter, "_settle", counted)
+    tracker = Tracker(make_camera(PAPER_LENS), box_gripper(sharp=False), MonitorSettings())
+    pose, needed = nominal_cam_T_grip(), []
+    for number, frame in enumerate(frames):
+        before = len(fits)
+        found = tracker.measure(frame, pose, number / 30.0)
+        needed.append(len(fits) - before)
+        assert found.trusted and abs(found.jaw_opening_m - opening_m) < 2e-4
+        pose = found.cam_T_grip
+    assert needed[0] > 1 and set(needed[1:]) == {1}, needed
+    # Moved on without a word: looked for from there.
+    other = rendered(Scenario(name="other", duration_s=0.1, fps=30.0, jaw=JawScript(knots=((0.0, 0.034),))))[0][0]
+    found = tracker.measure(replaced(other, jaw_opening_m=None), pose, 1.0)
+    assert found.trusted and abs(found.jaw_opening_m - 0.034) < 2e-4
