@@ -191,9 +191,9 @@ def test_the_common_planes_start_is_exact():
     data = scene(2)
     orientations, _ = true_orientations(data)
     shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
-    start = planar_start(ideal(data), shifts, [o.members for o in orientations])
-    assert np.abs(start.normal - data.truth.normal_cam).max() < 1e-9
-    cam_R_base, beams_cam, distance_m = closed_form.turn_from_motions([m[:, :3] for m in start.matrices], start.normal)
+    normal, matrices = planar_start(ideal(data), shifts, [o.members for o in orientations])
+    assert np.abs(normal - data.truth.normal_cam).max() < 1e-9
+    cam_R_base, beams_cam, distance_m = closed_form.turn_from_motions([m[:, :3] for m in matrices], normal)
     assert np.abs(cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
     assert abs(distance_m - data.truth.distance_m) < 1e-9
     for beam, orientation in zip(beams_cam, orientations, strict=True):

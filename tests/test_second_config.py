@@ -100,7 +100,7 @@ def bad_table(folder: Path, change: str) -> Path:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("empty", "bad.csv: holds no pulse"),
+        ("empty", "bad.csv: holds no row"),
         ("ragged", "bad.csv: line 2 has another number of fields than the header; 9"),
         ("no end", "bad.csv: line 2: has no until_ns; a whole number of nanoseconds"),
         ("text", "bad.csv: line 2: stamp_ns is 'soon'"),

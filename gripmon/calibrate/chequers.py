@@ -90,7 +90,7 @@ def find_corners(grey: Grey, columns: int, rows: int) -> list[dict[Index, tuple[
 
 
 def fits(lattice: dict[Index, tuple[float, float]], columns: int, rows: int) -> bool:
-    """Whether it can be a part of so many columns and rows, either way round, and is enough of it to be told."""
+    """Whether it can be a part of as many columns and rows, either way round, and is enough of it to be recognised."""
     if len(lattice) < 9:
         return False
     cells = np.array(list(lattice))

@@ -37,7 +37,7 @@ TOO_BLURRED = 0.16
 half as wide.
 """
 BLURRED_PX = 3.0
-"""Standard deviation of the edges' blur that is said."""
+"""Standard deviation of the edges' blur from which it is reported."""
 
 
 def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
@@ -265,13 +265,13 @@ def _note(count: int, total: int, blur_px: float = 0.0) -> str:
 
 
 def _blurred(grey: Grey) -> str:
-    """What is said of an image without target that isn't sharp anywhere."""
+    """The reason for an image without target that isn't sharp anywhere."""
     blur_px = sharpest_blur_px(grey)
     return _too_blurred(blur_px) if blur_px > BLURRED_PX else ""
 
 
 def _too_coarse(blur_px: float, steps: Array) -> str:
-    """What is said of a target whose edges are too wide for it: blurred, or too small in a sharp image."""
+    """The reason for a target whose edges are too wide for it: blurred, or too small in a sharp image."""
     if blur_px > BLURRED_PX:
         return _too_blurred(blur_px)
     return (

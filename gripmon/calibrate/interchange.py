@@ -97,7 +97,7 @@ def write_camera(
     messages; ``suffix`` of the file to write chooses OpenCV's syntax, YAML unless it is .xml or .json.
 
     A lens that the format hasn't is refused with :class:`InterchangeError`, or with ``fit`` written as the nearest one
-    that it has, and how far off that is anywhere in the image is said.
+    that it has, with a warning of how far off it is anywhere in the image.
     """
     warnings: list[str] = []
     if not _has(kind, camera):

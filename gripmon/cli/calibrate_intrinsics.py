@@ -74,8 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Handle ``gripmon calibrate intrinsics``."""
     import cv2
 
-    from gripmon.calibrate.api import calibrate_intrinsics
-    from gripmon.calibrate.picture import draw_maps
+    from gripmon.calibrate.api import calibrate_intrinsics, draw_maps
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of
 

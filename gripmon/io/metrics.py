@@ -132,7 +132,7 @@ class MetricsServer(Tally):
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """A thread for each question: who asks and doesn't listen holds up nobody."""
+    """A thread for each question: who asks and doesn't listen holds up no one else."""
 
     daemon_threads = True
 

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.calibrate.api import disc, line, write
 from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CameraCalibration
-from gripmon.calibrate.picture import disc, line, write
 from gripmon.calibrate.sighting import CalibrationError, NotFound
 from gripmon.laser.calibrating import LaserResult, Spots, calibrate, document, groups_of
 from gripmon.laser.judgement import SpotJudgement, SpotSeen, SpotWatchSettings

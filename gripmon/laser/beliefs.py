@@ -294,7 +294,7 @@ def newborn() -> tuple[Array, Array, Array, Array]:
 
 
 LEAST_PULSES = 3
-"""That speak for a motion before it is said: two wrong spots may look like one."""
+"""That speak for a motion before it is reported: two wrong spots may look like one."""
 BACK_AGAIN = 100.0
 """Odds from which what had moved is where it was."""
 _KEPT = 32

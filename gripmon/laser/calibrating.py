@@ -35,7 +35,7 @@ FARTHEST_LASER_M = 1.0
 LEAST_AGREEING = 0.5
 """Part of the spots that has to agree: with fewer, another set-up might explain as many."""
 MOST_TURN_RAD = 0.02
-"""Of samples that are said to be of one orientation: more than an arm's noise."""
+"""Of samples that share an orientation by their labels: more than an arm's noise."""
 LARGEST_NOISE_SHARE = 0.01
 """The spots' noise over the image's width beyond which they aren't explained at all."""
 LEAST_OF_ORIENTATION = 0.5
@@ -43,7 +43,7 @@ LEAST_OF_ORIENTATION = 0.5
 contradicts the others.
 """
 MOST_CONTRADICTING = 1.0 / 3.0
-"""Part of the orientations that may contradict the rest: beyond it nobody knows which are right."""
+"""Part of the orientations that may contradict the rest: beyond it no one knows which are right."""
 LEAST_NOISE_PX = 0.02
 """Of spots, however much an arm's noise explains."""
 _NOISE_ROUNDS = 8

@@ -37,9 +37,9 @@ FEWEST_ORIENTATIONS = 3
 LEAST_TURN_RAD = 5e-3
 """How far a direction of the end-effector has to turn, root mean square over the orientations."""
 ON_A_LINE = 3e-3
-"""Second singular value over the first below which image points are said to lie on a line."""
+"""Second singular value over the first below which image points count as lying on a line."""
 FLAT = 1e-3
-"""Third singular value over the first below which shifts are said to lie in a plane."""
+"""Third singular value over the first below which shifts count as lying in a plane."""
 SAME_ORIENTATION_RAD = 4e-3
 
 
@@ -199,9 +199,9 @@ def solve(
     check_spots(xy)
     usable = usable_orientations(base_T_ee, groups, SUBSET + 1)
     shifts = [base_T_ee[o.members, :3, 3] - o.centre_m for o in usable]
-    start = planar_start(xy, shifts, [o.members for o in usable], robust=robust)
-    usable = [replace(o, matrix=m) for o, m in zip(usable, start.matrices, strict=True)]
-    cam_R_base, beams, _ = turn_from_motions([o.matrix[:, :3] for o in usable], start.normal)
+    normal, matrices = planar_start(xy, shifts, [o.members for o in usable], robust=robust)
+    usable = [replace(o, matrix=m) for o, m in zip(usable, matrices, strict=True)]
+    cam_R_base, beams, _ = turn_from_motions([o.matrix[:, :3] for o in usable], normal)
     direction = beam_in_hand(list(beams), [o.base_R_ee for o in usable], cam_R_base)
     point, shift, scales = positions(usable, base_T_ee, cam_R_base, direction, one_plane=True)
     distance = float(scales[0])
@@ -210,7 +210,7 @@ def solve(
             "the spots put the plane behind the camera: poses and spots don't belong together (out of step, or "
             "ee_T_base for base_T_ee); each spot with the pose that it was seen at"
         )
-    return LaserSetup(make_transform(cam_R_base, shift), start.normal, distance, point, direction)
+    return LaserSetup(make_transform(cam_R_base, shift), normal, distance, point, direction)
 
 
 def turn_from_motions(motions: Sequence[Array], normal: Array) -> tuple[Array, Array, float]:

@@ -297,7 +297,7 @@ class PulseSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         500_000_000
     )
     most_frames: Annotated[
-        int, Meta(ge=1, le=1000, description="so many frames of a pulse, the last ones, are averaged at most (frames)")
+        int, Meta(ge=1, le=1000, description="of a pulse at most as many frames, the last ones, are averaged (frames)")
     ] = 8
     wait_s: Annotated[
         float,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,14 +32,6 @@ OUTLIER = 4.0
 SEED = 0
 """Of the subsets that are drawn where there are too many."""
 _STEPS = 20
-
-
-@dataclass(frozen=True, slots=True)
-class PlanarStart:
-    """``normal`` (3,), unit, away from the camera; one matrix (3, 4) an orientation with ``s = matrix [w 1]``."""
-
-    normal: Array
-    matrices: tuple[Array, ...]
 
 
 class _Group:
@@ -135,9 +126,10 @@ class _Fits:
 
 def planar_start(
     xy: Array, shifts_m: Sequence[Array], members: Sequence[NDArray[np.intp]], *, robust: bool = True, seed: int = SEED
-) -> PlanarStart:
-    """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3).  Without
-    ``robust`` all spots are believed.
+) -> tuple[Array, list[Array]]:
+    """From ideal image points (n, 2) and, for each orientation, its spots' indices and shifts (k, 3): the plane's
+    normal (3,), unit, away from the camera, and a matrix (3, 4) for each orientation with ``s = matrix [w 1]``.
+    Without ``robust`` all spots are believed.
 
     Raises :class:`CalibrationError` where no plane before the camera explains the spots.
     """
@@ -160,7 +152,7 @@ def planar_start(
         matrix = fit.T.copy()
         matrix[:, :3] /= group.scale
         matrices.append(matrix)
-    return PlanarStart(normal, tuple(matrices))
+    return normal, matrices
 
 
 def _sums(fits: _Fits, normals: Array) -> Array:

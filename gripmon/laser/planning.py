@@ -201,7 +201,7 @@ def _metres(calibrated: Calibrated, found: Prediction, spread: Array) -> float:
 
 
 class _Gain:
-    """How far so many pulses move the logarithm of a motion's likelihood ratio, on average.
+    """How far a number of pulses moves the logarithm of a motion's likelihood ratio, on average.
 
     Off-sets r of all pulses are normal with covariance V (noise, calibration, what is off at each pose) if nothing
     moved, and with V + M if a motion of the assumed size did: the ratio's logarithm is (rᵀ (V⁻¹ - (V+M)⁻¹) r - ln|V+M|

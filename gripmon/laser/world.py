@@ -368,7 +368,7 @@ def spread_px(calibrated: Calibrated, predicted: Prediction, arm: Array) -> Arra
 
 
 def alone(calibrated: Calibrated, predicted: Prediction, base_T_ee: Array, spot: Spot, arm: Array) -> Single:
-    """The calibration's residuals have the arm in them: noise is what they show, or what is said of spot and arm,
+    """The calibration's residuals have the arm in them: noise is what they show, or what spot and arm have,
     whichever is more.
     """
     floor = calibrated.sigma_px**2 * np.eye(2)

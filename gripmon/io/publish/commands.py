@@ -29,12 +29,12 @@ from gripmon.model.records import (
 _log = logging.getLogger(__name__)
 
 TIMEOUT_S = 2.0
-"""So long the loop has for a command; then the asker is told that it has not answered."""
+"""Time that the loop has for a command; then the asker learns that it has not answered."""
 
 _WAITING_MOST = 16
 _REMEMBERED_MOST = 256
 _QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
-"""They change nothing, and their answers are large: asked again they are answered anew, not from memory."""
+"""They change nothing, and their answers are large: asked again they are answered afresh, not from memory."""
 
 _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
 
@@ -42,7 +42,7 @@ _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command 
 class PendingCommand:
     """A command, and all who wait for its answer: whoever sent it, perhaps several times under the same id.
 
-    It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
+    It is carried out once at most.  Each asker gets one reply: the answer, or that the time is over.
     """
 
     def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
@@ -138,7 +138,7 @@ class ZenohCommands:
 
     def close(self) -> None:
         """Tell those who still wait that the monitor stops."""
-        with self._lock:  # what is being taken in just now is told below, too
+        with self._lock:  # what is being taken in just now is answered below, too
             self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(_STOPPING)

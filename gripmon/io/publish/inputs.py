@@ -261,7 +261,7 @@ class ZenohPulses(_Input):
     """Pulses in the order in which they came.
 
     Zenoh's thread stores what arrives; any thread may ask.  What is malformed, or no pulse that can be, is counted and
-    said.  Pulses that nobody asks for, more than 64 of them, give way to newer ones.
+    said.  Pulses that are not asked for, more than 64 of them, give way to newer ones.
     """
 
     def __init__(self, link: Link, key: str) -> None:

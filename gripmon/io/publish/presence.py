@@ -47,7 +47,7 @@ class Presence:
         self._others: frozenset[str] = frozenset()
         self._lock = threading.Lock()  # guards it against Zenoh's other threads
         self._session: zenoh.Session | None = None
-        self._declared: object = None  # Zenoh undeclares what nobody refers to
+        self._declared: object = None  # Zenoh undeclares what has no reference left
         link.attach(self._attach, self._leave)
 
     def others(self) -> tuple[str, ...]:
@@ -55,10 +55,10 @@ class Presence:
         return tuple(sorted(self._others)) if self._others else ()
 
     def wait_alone(self, timeout_s: float = VANISHES_WITHIN_S) -> tuple[str, ...]:
-        """Before the own token is shown: who has the name and keeps it for ``timeout_s``; mostly nobody, at once.
+        """Before the own token is shown: who has the name and keeps it for ``timeout_s``; mostly no one, at once.
 
         A predecessor that was killed vanishes meanwhile.  An empty id is that of a version of gripmon without ids.
-        Nobody is found while there is no connection: then :meth:`others` says it later.
+        Without a connection no one is found: :meth:`others` shows them later.
         """
         if not self._connected():
             return ()
@@ -128,7 +128,7 @@ def _id_in(key: object) -> str:
 _AT_ONCE = 2
 _WAITING_MOST = 64
 _REFUSED_MOST = 4096
-"""Queries beyond the waiting ones that are told that too many wait: seconds of a flood, at some bytes each."""
+"""Queries beyond the waiting ones that get the answer that too many wait: seconds of a flood, at some bytes each."""
 _CLOSE_WITHIN_S = 1.0
 
 
@@ -141,7 +141,7 @@ class Answers:
 
     def __init__(self, name: str, busy: Callable[[zenoh.Query], None] | None = None) -> None:
         """``busy`` tells an asker that too many wait; without it such a query ends unanswered."""
-        # Its threads end with the process, also if nobody closes it, but none in the middle of a call into Zenoh.
+        # Its threads end with the process, also if it is never closed, but none in the middle of a call into Zenoh.
         self._pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix=f"gripmon-{name}")
         self._busy = busy
         self._refusals = ThreadPoolExecutor(1, thread_name_prefix=f"gripmon-{name}-busy")
@@ -151,7 +151,7 @@ class Answers:
         self._closed = False
 
     def send(self, query: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
-        """Let ``reply`` answer the query, soon; where too many wait, it is told so instead.  Once closed: at once."""
+        """Let ``reply`` answer the query, soon; where too many wait, it answers that instead.  Once closed: at once."""
         future: Future[None] | None = None
         with self._lock:
             closed = self._closed

@@ -66,7 +66,7 @@ class _ZenohStates:
     """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
 
     def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
-        """``presence``: whose id stands in everything that is said.  Raises ValueError for a name that can't be part of
+        """``presence``: whose id stands in every message.  Raises ValueError for a name that can't be part of
         a key.
         """
         self.keys = Keys(check_name("robot", robot), check_name("camera", camera))

@@ -194,7 +194,9 @@ class Ros2Settings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     child_frame: (
         Annotated[
             Frame,
-            Meta(description="the new frame in tf, which nobody else may publish; null: <robot>_<camera_name>_gripmon"),
+            Meta(
+                description="the new frame in tf, which no other node may publish; null: <robot>_<camera_name>_gripmon"
+            ),
         ]
         | None
     ) = None

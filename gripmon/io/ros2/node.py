@@ -181,7 +181,7 @@ class HeardTopic(NamedTuple):
 class Listeners:
     """Shows a node with subscriptions in the graph of each domain; the subscribers themselves are others' affair.
 
-    They would hear without.  But publishers of images look whether anybody listens, and publish nothing if nobody does
+    They would hear without.  But publishers of images look whether there are listeners, and publish nothing without
     (``image_transport``).
     """
 

@@ -207,7 +207,7 @@ class Ros2Publisher:
     Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
     capture time; one that waited in the monitor does not.  Diagnostics go out with every state record (once a second
     and on every change) and every alert.  While the link isn't open, nothing is kept: what comes late to tf is old, and
-    diagnostics are said again.
+    diagnostics are sent again.
     """
 
     def __init__(self, link: Link, settings: Ros2Settings, layout: Layout) -> None:
@@ -299,7 +299,7 @@ class Ros2Publisher:
         return self._topics
 
     def _adopt(self, session: zenoh.Session) -> None:
-        """Enter the graph.  Others wait for the session, too: what goes wrong here is said later."""
+        """Enter the graph.  Others wait for the session, too: what goes wrong here is reported later."""
         import zenoh
 
         layout = self._layout

@@ -71,7 +71,7 @@ class NetworkSettings(
 
 
 class Content(NamedTuple):
-    """What is in a payload; ``stamp_ns`` None where nobody says when it was captured."""
+    """What is in a payload; ``stamp_ns`` None where it is not known when it was captured."""
 
     image: Image
     stamp_ns: int | None

@@ -120,7 +120,7 @@ def _builder(
     )
     if ca:
         return builder
-    # A name for everyone, since some implementations refuse a certificate without; that it may serve is said apart.
+    # A name for everyone, since some implementations refuse a certificate without; that it may serve stands apart.
     alternatives = [_alternative(host) for host in hosts] or [x509.DNSName(f"{name}.invalid")]
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     return builder.add_extension(x509.SubjectAlternativeName(alternatives), critical=False).add_extension(

@@ -254,9 +254,9 @@ class Malformed:
     """Counts the payloads on a key that could not be used.
 
     An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is silent sooner, when good ones have
-    come for :data:`CALM_S`, and what comes after such a calm is counted anew.  The log gets one line an occasion for
+    come for :data:`CALM_S`, and what comes after such a calm counts from one.  The log gets one line an occasion for
     each of the first few kinds of reasons, and the words of :meth:`fault`, with the most frequent reason, change only
-    when the count passes a power of ten, so that nobody can fill a log, or keep the network busy, by sending rubbish.
+    when the count passes a power of ten, so that no one can fill a log, or keep the network busy, by sending rubbish.
     Any thread may call.
     """
 

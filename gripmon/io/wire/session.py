@@ -141,7 +141,7 @@ class PublishError(InputError):
 
 
 class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How to join the network.  The default is a peer that listens on loopback only and looks for nobody."""
+    """How to join the network.  The default is a peer that listens on loopback only and does not look for others."""
 
     enabled: Annotated[bool, msgspec.Meta(description="false: nothing is published")] = True
     mode: Annotated[
@@ -292,7 +292,7 @@ def _find_tls_files(config: zenoh.Config, path: Path) -> None:
 
 
 def _remedy(name: str, file: Path) -> str:
-    """Where a missing certificate or key is to come from: a second authority would help nobody."""
+    """Where a missing certificate or key is to come from: a second authority would not help."""
     if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
         host = " --host ADDRESS" if name.startswith("listen") else ""
         return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
@@ -337,7 +337,7 @@ def in_short(error: zenoh.ZError) -> str:
 def _unreached(ends: str) -> str:
     """Whom there is no connection to, and what may be the reason: Zenoh says the same of all of them."""
     endpoints = re.findall(r"Single\((.*?)\)(?=, |$)", ends) or [ends]
-    reason = "nobody listens there"
+    reason = "no program listens there"
     if any(endpoint.startswith(_ENCRYPTED) for endpoint in endpoints):
         reason += (
             ", or the certificates don't fit: of another authority, expired, or the router's is not for this address"
