@@ -68,7 +68,7 @@ def test_zenohs_thread_does_not_wait_for_a_late_joiner_that_does_not_read(stalle
     publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     try:
         publisher.transform(frame_record(5))
-        publisher._wire.values["transform"]._answer(stalled)  # type: ignore[union-attr, arg-type]
+        publisher._wire.puts["transform"].__self__._answer(stalled)  # type: ignore[union-attr, arg-type]
         assert stalled.begun.wait(WAIT_S) and not stalled.payloads
         with plain_session(connect=endpoint) as session:
             assert [record["seq"] for record in ask(session, "gripmon/arm/wrist/transform")] == [5]

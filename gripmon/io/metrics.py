@@ -39,9 +39,9 @@ from gripmon.model.records import (
 if TYPE_CHECKING:
     from prometheus_client.metrics_core import Metric
 
-_POLL_S = 0.1  # how long a stop waits for the server at most
-
 _log = logging.getLogger(__name__)
+
+_POLL_S = 0.1  # how long a stop waits for the server at most
 
 
 LATENCY_BOUNDS_S = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.05, 0.1, 0.25, 1.0)

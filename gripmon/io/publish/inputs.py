@@ -19,6 +19,8 @@ from gripmon.io.wire.link import Malformed
 from gripmon.laser.matching import ReportedPulse, of_message
 from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_json, largest_bytes
 
+_log = logging.getLogger(__name__)
+
 LARGEST_OPENING_M = 0.5
 """No gripper file allows more."""
 
@@ -253,7 +255,6 @@ def opening_of_joints(joints: JointOpening) -> DecodeOpening:
 _decode_number = msgspec.json.Decoder(float).decode
 
 
-_log = logging.getLogger(__name__)
 _WAITING_MOST = 64
 
 

@@ -24,6 +24,8 @@ from gripmon.model.records import (
     to_json,
 )
 
+_log = logging.getLogger(__name__)
+
 _T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON
 _ALERTS_KEPT = 32  # for subscribers that ask for history, and while there is no session yet
@@ -256,7 +258,6 @@ class _Wire:
         self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
-        self.values: dict[str, _LastValue] = {}
         self.declare_kept("state")
         self._alive: list[zenoh.LivelinessToken] = []
 
@@ -269,33 +270,21 @@ class _Wire:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self._add(leaf, publisher, _TimedStream)
+        self.puts[leaf] = _TimedStream(self._session, self._keys[leaf], publisher, self._answers).put
 
     def declare_kept(self, leaf: str, kept: int = 1) -> None:
         """A key whose last ``kept`` messages are there for who comes late."""
         publisher = _keeping_publisher(self._session, self._keys[leaf], zenoh.Priority.DATA_HIGH, kept)
-        self._add(leaf, publisher)
+        self.puts[leaf] = _LastValue(self._session, self._keys[leaf], publisher, self._answers).put
 
     def appear(self) -> None:
         """Show the liveliness tokens, when all is declared: the one that every monitor has, and that of this start."""
         self._alive = [self._session.liveliness().declare_token(key) for key in self._tokens]
 
-    def _add(
-        self,
-        leaf: str,
-        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
-        kind: type[_LastValue] = _LastValue,
-    ) -> None:
-        self.values[leaf] = kind(self._session, self._keys[leaf], publisher, self._answers)
-        self.puts[leaf] = self.values[leaf].put
-
     def close(self) -> None:
         for token in reversed(self._alive):
             token.undeclare()
         self._answers.close()
-
-
-_log = logging.getLogger(__name__)
 
 
 class Publishers:

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     import zenoh
     from rosbags.typesys.store import Typestore
 
+_log = logging.getLogger(__name__)
+
 TF = "tf2_msgs/msg/TFMessage"
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
@@ -164,8 +166,6 @@ class TopicPublisher:
         beside = attachment(self._sequence_number, time.time_ns(), self._gid)
         self._publisher.put(payload, attachment=beside)
 
-
-_log = logging.getLogger(__name__)
 
 _SENSOR_DATA = Qos(depth=5, reliable=False)
 

@@ -32,6 +32,8 @@ from gripmon.model.records import (
 if TYPE_CHECKING:
     import zenoh
 
+_log = logging.getLogger(__name__)
+
 OK, WARN, ERROR, STALE = range(4)
 """Levels of ``diagnostic_msgs/DiagnosticStatus``."""
 
@@ -180,8 +182,6 @@ def _bounds_of(state: StateRecord, protection: Protection | None) -> list[tuple[
         values.append(("alert limit (mm)", f"{1e3 * state.alert_limit_m:g}"))
     return values
 
-
-_log = logging.getLogger(__name__)
 
 _TF_QOS = Qos(depth=100)
 """That of ``tf2_ros``' broadcasters: reliable, volatile, keep last 100."""

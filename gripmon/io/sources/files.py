@@ -23,6 +23,8 @@ from gripmon.model.records import Frame
 if TYPE_CHECKING:
     from _csv import Reader as _Lines
 
+_log = logging.getLogger(__name__)
+
 TIMESTAMPS_NAME = "timestamps.csv"
 COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
 _NS = 1_000_000_000
@@ -169,9 +171,6 @@ def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> Non
             raise SourceError(
                 f"{path}: stamp_ns doesn't rise from {earlier} to {later}; stamps that rise in the files' order"
             )
-
-
-_log = logging.getLogger(__name__)
 
 
 class VideoSettings(
