@@ -18,12 +18,16 @@ from support.loopback import (
 from support.ros2_graph import ON, layout, tokens
 from support.stand_ins import Listener, ScriptedMonitor, TickingSource
 
-from gripmon.daemon import Daemon, DaemonSettings, EstimatesFile, Reports, StopRequest
 from gripmon.daemon.config import ConfigError, builtin_config, load_config
+from gripmon.daemon.estimates import EstimatesFile
+from gripmon.daemon.loop import Daemon
+from gripmon.daemon.neighbours import Reports
+from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish import Publishers
 from gripmon.io.ros2.names import Layout, NodeName, Ros2Fault, Ros2Settings, fault_of, layout_of, network_of
 from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.wire import Link, PublishSettings
+from gripmon.model.stopping import StopRequest
 
 
 def test_one_line_turns_it_on(tmp_path: Path):

@@ -15,8 +15,8 @@ NOWHERE = np.zeros((0, 4, 4))
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper that
-    was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
+    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper
+    that was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for
     some times one after the other, then in one of several frames.
@@ -64,9 +64,7 @@ class GripperSearch:
         if lost and self._searches == 1:
             return search_poses(image, camera, gripper, cam_T_grip, jaw_opening_m, settings)
         kept = image.copy()
-        self._backlog.add(
-            lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s
-        )
+        self._backlog.add(lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s)
         return NOWHERE
 
     def end_frame(self, measurement: Measurement) -> None:

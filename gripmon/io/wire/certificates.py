@@ -1,8 +1,7 @@
-"""A small private certificate authority, for mutual TLS between the programs of one site, and a router's rules for it.
+"""A small private certificate authority, for mutual TLS between the programs of one site.
 
 An example that is sound by itself, not a replacement for the authority that a company may already have: any one whose
-certificates carry the common names of the access rules does.  A robot's own certificates speak for it, and for no other
-one.
+certificates carry the common names of the access rules does.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ from __future__ import annotations
 import datetime
 import ipaddress
 import os
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -120,7 +118,7 @@ def _builder(
     )
     if ca:
         return builder
-    # A name for everyone, since some implementations refuse a certificate without; that it may serve stands apart.
+    # A name for everyone, since some implementations refuse a certificate without; that it may serve is said apart.
     alternatives = [_alternative(host) for host in hosts] or [x509.DNSName(f"{name}.invalid")]
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     return builder.add_extension(x509.SubjectAlternativeName(alternatives), critical=False).add_extension(
@@ -170,57 +168,3 @@ def _write(path: Path, data: bytes, *, secret: bool = False) -> None:
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if secret else 0o644)
     with os.fdopen(descriptor, "wb") as file:
         file.write(data)
-
-
-_ROBOT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*(\.[A-Za-z0-9_-]+)*")
-
-
-def names_of(robot: str) -> tuple[str, str]:
-    """The common names of a robot's monitor, and of its gripper and camera driver.
-
-    Raises ValueError for a name that can't be part of them.
-    """
-    if not _ROBOT.fullmatch(robot):
-        raise ValueError(f"'{robot}' can't be a robot's name in a certificate; letters, digits, - _ and .")
-    return f"monitor-{robot}", f"robot-{robot}"
-
-
-def with_robot(text: str, robot: str) -> str:
-    """A router's file, json5, with the rules for this robot, too; the same text if it has them.
-
-    They are put before the lines ``// robots: rules``, ``subjects`` and ``policies`` of the shipped files.  Raises
-    ValueError for a file without these.
-    """
-    monitor, driver = names_of(robot)
-    if re.search(rf'^[^/\n]*cert_common_names: \["{re.escape(monitor)}"\]', text, re.MULTILINE):
-        return text
-    for part, lines in _parts(robot, monitor, driver).items():
-        mark = re.search(rf"^ *// robots: {part}\n", text, re.MULTILINE)
-        if mark is None:
-            raise ValueError(f"has no line '// robots: {part}', before which the robot's would stand")
-        text = text[: mark.start()] + lines + text[mark.start() :]
-    return text
-
-
-def _parts(robot: str, monitor: str, driver: str) -> dict[str, str]:
-    everything = f'["gripmon/{robot}/**", "gripmon/{robot}/*/*/@adv/**"]'
-    inputs = ", ".join(f'"gripmon/{robot}/*/{leaf}"' for leaf in ("jaw", "pulse", "image"))
-    rules = f"""\
-      {{ id: "{monitor} says", permission: "allow", flows: ["ingress"],
-        messages: ["put", "declare_queryable", "reply", "liveliness_token", "declare_subscriber", "liveliness_query",
-                   "declare_liveliness_subscriber"],
-        key_exprs: {everything} }},
-      {{ id: "{monitor} hears", permission: "allow", flows: ["egress"],
-        messages: ["put", "reply", "liveliness_token"],
-        key_exprs: {everything} }},
-      {{ id: "{driver} reports", permission: "allow", flows: ["ingress"], messages: ["put"],
-        key_exprs: [{inputs}] }},
-      {{ id: "{driver} is heard", permission: "allow", flows: ["egress"], messages: ["declare_subscriber"],
-        key_exprs: [{inputs}] }},
-"""
-    subjects = "".join(f'      {{ id: "{name}", cert_common_names: ["{name}"] }},\n' for name in (monitor, driver))
-    policies = f"""\
-      {{ subjects: ["{monitor}"], rules: ["{monitor} says", "{monitor} hears", "be asked"] }},
-      {{ subjects: ["{driver}"], rules: ["{driver} reports", "{driver} is heard"] }},
-"""
-    return {"rules": rules, "subjects": subjects, "policies": policies}
