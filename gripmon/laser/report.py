@@ -28,7 +28,7 @@ def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSet
         "assumed": {
             "spots": len(found.sigma_px), "tilt_rad": ASSUMED_TILT_RAD, "distance_m": ASSUMED_DISTANCE_M,
         },
-        **_foresight_values(found),
+        **_forecast_values(found),
     }  # fmt: skip
 
 
@@ -63,7 +63,7 @@ def _header(name: str, calibration: LaserCalibration, settings: SpotWatchSetting
     }
 
 
-def _foresight_values(found: Forecast) -> dict[str, Any]:
+def _forecast_values(found: Forecast) -> dict[str, Any]:
     return {
         "spot_sigma": {
             "px": [float(found.sigma_px.min()), float(found.sigma_px.max())],
