@@ -12,8 +12,8 @@ import zenoh
 from support.loopback import WAIT_S, ask, frame_record, free_endpoint, plain_session, wait_until
 from support.published import Published
 
-from gripmon.io.publish.answers import _WAITING_MOST, Answers
 from gripmon.io.publish.commands import PendingCommand
+from gripmon.io.publish.presence import _WAITING_MOST, Answers
 from gripmon.io.wire import PublishSettings
 from gripmon.model.records import Command, CommandName, CommandReply
 
@@ -68,7 +68,7 @@ def test_zenohs_thread_does_not_wait_for_a_late_joiner_that_does_not_read(stalle
     publisher = Published(PublishSettings(listen=(endpoint,)), "arm", "wrist")
     try:
         publisher.transform(frame_record(5))
-        publisher._wire.values["transform"]._answer(stalled)  # type: ignore[union-attr, arg-type]
+        publisher._wire.puts["transform"].__self__._answer(stalled)  # type: ignore[union-attr, arg-type]
         assert stalled.begun.wait(WAIT_S) and not stalled.payloads
         with plain_session(connect=endpoint) as session:
             assert [record["seq"] for record in ask(session, "gripmon/arm/wrist/transform")] == [5]
@@ -127,7 +127,7 @@ def test_a_flood_of_commands_is_answered_to_the_last_one():
 
 
 def test_close_completes_what_is_under_way_and_ends_the_threads(stalled: StalledQuery, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("gripmon.io.publish.answers._CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
+    monkeypatch.setattr("gripmon.io.publish.presence._CLOSE_WITHIN_S", WAIT_S)  # a slow machine's second is short
     before = set(threading.enumerate())
     answers = Answers("test")
     answers.send(stalled, lambda query: query.reply("", b"in time"))  # type: ignore[arg-type]

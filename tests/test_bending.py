@@ -7,7 +7,7 @@ import pytest
 from support.plates import pose, true_uv
 from support.simulated import PAPER_LENS, STRONG_LENS
 
-from gripmon.calibrate.detection.bending import FEWEST, bends
+from gripmon.calibrate.chequers import FEWEST, bends
 from gripmon.model.camera import FisheyeLens, LensSettings
 from gripmon.model.targets import Chequerboard
 

@@ -10,16 +10,8 @@ import pytest
 from scipy.stats import chi2
 from support.sightings import CAMERAS, PLATE_M, poses, seen
 
-from gripmon.calibrate.intrinsics import (
-    calibrate,
-    calibrate_best,
-    calibrate_single_view,
-    cross_validate,
-    lens_vector,
-    plate_pose,
-)
-from gripmon.calibrate.intrinsics_result import doubts_of
-from gripmon.calibrate.lens_models import MODELS
+from gripmon.calibrate.bundle import MODELS, lens_vector, plate_pose
+from gripmon.calibrate.intrinsics import calibrate, calibrate_best, calibrate_single_view, cross_validate, doubts_of
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import PaperLens
 from gripmon.model.geometry import exp_rotation, log_rotation

@@ -15,7 +15,7 @@ from support.pulsed_laser import AXES, calibration, poses, pulses, true_world
 
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.laser.world import calibrated, predict
 from gripmon.simulate.laser import spot_image
 
 POSE = ("tx_m", "ty_m", "tz_m", "qx", "qy", "qz", "qw")
@@ -78,7 +78,7 @@ def test_fresh_spots_are_judged(laser, tmp_path, capsys, change, code, verdict, 
     known = calibrated(calibration())
     first = report["spots_judged"][0]
     seen = next(iter(pulses(world, poses(), 1, np.random.default_rng(1))))
-    foreseen = foresee(known.world, known.camera, seen.base_T_ee)
+    foreseen = predict(known.world, known.camera, seen.base_T_ee)
     assert np.allclose(first["off_px"], seen.candidates[0].uv_px - foreseen.uv_px)
     assert [d["ways"] for d in first["disagreements"]][-1] == ["beam", "ray"]
     assert main(["check", "--laser", str(laser), str(spots)]) == code
@@ -109,7 +109,7 @@ def test_spots_are_found_in_images_too(laser, tmp_path, capsys):
     rows = []
     camera = calibrated(calibration()).camera
     for k, pose in enumerate(poses()[:5]):
-        uv = foresee(true_world(), camera, pose).uv_px
+        uv = predict(true_world(), camera, pose).uv_px
         image = spot_image(uv, rng) if k != 2 else np.full((480, 640), 20, np.uint8)
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
         rows.append({"image": f"{k}.png", **pose_columns(pose)})

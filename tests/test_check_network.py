@@ -11,8 +11,8 @@ import yaml
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.io.ros2.types import typestore
-from gripmon.io.wire.endpoints import endpoint_fault
+from gripmon.io.ros2.node import typestore
+from gripmon.io.wire.session import endpoint_fault
 
 TLS_FILE = '{listen: {endpoints: ["tls/127.0.0.1:7449"]}, transport: {link: {tls: {listen_certificate: "gone.pem"}}}}'
 ROS_JAW = {"source": "ros2_joint_state", "topic": "/joint_states", "opening": {"joints": ["finger"]}}

@@ -11,9 +11,8 @@ import pytest
 from scipy.spatial import cKDTree
 from support.plates import Look, fingers, points_of, pose, render, true_uv
 
-from gripmon.calibrate.detection import detect
-from gripmon.calibrate.detection.boards import ends_all_round
-from gripmon.calibrate.detection.chequers import _Turns
+from gripmon.calibrate.chequers import _Turns
+from gripmon.calibrate.detection import detect, ends_all_round
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings
 from gripmon.model.records import Array, Image

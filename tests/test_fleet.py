@@ -15,7 +15,7 @@ from support.router_process import ROOT, RouterProcess, running
 from gripmon.cli import main
 from gripmon.client import Client, NotCarriedOut
 from gripmon.io.wire import PublishSettings
-from gripmon.io.wire.files import load_file, said
+from gripmon.io.wire.session import load_file, said
 from gripmon.model.records import CommandName
 
 PREFIX = "gripmon/arm/wrist"

@@ -13,8 +13,8 @@ from support.plate_views import LENS, solved, trial
 from support.plates import Look
 from support.simulated import PAPER_LENS, nominal_cam_T_grip, sharp_gripper
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.plane import GivenCamera
 from gripmon.calibrate.plane_equations import FreePose, off_plate
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from support.rubbish import SIZE_PX, Rubbish, broken_json, files, frames, good_note, image, jaws, ros
 
 from gripmon.io.publish.commands import _name, _request
-from gripmon.io.publish.jaw import JawError, opening_of_joints, opening_of_json
-from gripmon.io.ros2 import JointOpening
-from gripmon.io.ros2.types import typestore
+from gripmon.io.publish.inputs import JawError, opening_of_joints, opening_of_json
+from gripmon.io.ros2.node import JointOpening, typestore
 from gripmon.io.sources.network import PayloadDecoder
 from gripmon.io.sources.payload import PayloadError
 from gripmon.io.wire import Keys

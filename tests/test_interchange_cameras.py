@@ -14,9 +14,8 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from gripmon.calibrate.interchange.cameras import FORMATS, ReadOptions, format_of, read_camera, write_camera
-from gripmon.calibrate.interchange.fault import InterchangeError
-from gripmon.calibrate.interchange.fitting import fit_brown_conrady
+from gripmon.calibrate.formats import InterchangeError
+from gripmon.calibrate.interchange import FORMATS, fit_brown_conrady, format_of, read_camera, write_camera
 from gripmon.model.camera import BrownConradyLens, FisheyeLens, LensSettings, PaperLens, make_camera
 
 SIZE = {"width_px": 1280, "height_px": 962}
@@ -228,8 +227,8 @@ def test_opencv_4_s_yaml_with_options_for_what_it_does_not_say():
     assert format_of(data, "x") == "opencv"
     with pytest.raises(InterchangeError, match=r"^f.yml: image_width: is missing; --size WIDTHxHEIGHT"):
         read_camera(data, "f.yml", "opencv")
-    plain = read_camera(data, "f.yml", "opencv", ReadOptions(size_px=(640, 480)))
-    bent = read_camera(data, "f.yml", "opencv", ReadOptions(size_px=(640, 480), fisheye=True))
+    plain = read_camera(data, "f.yml", "opencv", size_px=(640, 480))
+    bent = read_camera(data, "f.yml", "opencv", size_px=(640, 480), fisheye=True)
     assert isinstance(plain, BrownConradyLens) and isinstance(bent, FisheyeLens)
     assert (plain.width_px, plain.height_px, plain.coefficients) == (640, 480, bent.coefficients)
 
@@ -239,9 +238,9 @@ def test_a_camchain_of_several_cameras_needs_to_be_told_which():
     data = (one + one.replace("cam0:", "cam1:").replace("461.629", "500.5")).encode()
     with pytest.raises(InterchangeError, match="holds 2 cameras; --camera cam0 or cam1"):
         read_camera(data, "chain", "kalibr")
-    assert read_camera(data, "chain", "kalibr", ReadOptions(which="cam1")).fx_px == 500.5
+    assert read_camera(data, "chain", "kalibr", which="cam1").fx_px == 500.5
     with pytest.raises(InterchangeError, match="cam7: is no camera of this file; cam0 or cam1"):
-        read_camera(data, "chain", "kalibr", ReadOptions(which="cam7"))
+        read_camera(data, "chain", "kalibr", which="cam7")
 
 
 BAD = [

@@ -5,23 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.laser_scenes import assert_same, numeric, paper_setup, sampled, scene, translation_error
+from support.laser_scenes import assert_same, laser_printed, numeric, paper_setup, sampled, scene, translation_error
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer import closed_form, common_plane
-from gripmon.laser.pointer.planar_start import planar_start
-from gripmon.laser.pointer.refinement import refine
-from gripmon.laser.pointer.setup import (
+from gripmon.laser import closed_form
+from gripmon.laser.planar_start import planar_start
+from gripmon.laser.refinement import SpotProblem, refine
+from gripmon.laser.setup import (
     LaserSetup,
     basis,
     laser_lines,
     origin_axes,
     pose_slopes,
-    spots_between,
     spots_on_plane,
-    spots_on_rays,
 )
-from gripmon.laser.pointer.spot_problem import SpotProblem
 from gripmon.model.geometry import invert, make_transform, perturb
 
 
@@ -39,8 +36,8 @@ def test_the_three_predictions_meet_in_one_spot_that_lies_on_plane_line_and_ray(
     origin, u = laser_lines(data.truth, data.base_T_ee)
     assert np.abs(np.cross(spots - origin, u)).max() < 1e-12
     xy = spots[:, :2] / spots[:, 2:]
-    assert np.abs(spots_on_rays(data.truth, xy)[0] - spots).max() < 1e-12
-    between, apart, _ = spots_between(data.truth, data.base_T_ee, xy)
+    assert np.abs(laser_printed.spots_on_rays(data.truth, xy)[0] - spots).max() < 1e-12
+    between, apart, _ = laser_printed.spots_between(data.truth, data.base_T_ee, xy)
     assert np.abs(between - spots).max() < 1e-12
     assert apart.max() < 1e-12
 
@@ -50,9 +47,9 @@ def test_a_moved_plane_and_a_moved_camera_show_in_different_residuals():
     xy = ideal(data)
     lower = LaserSetup(data.truth.cam_T_base, data.truth.normal_cam, data.truth.distance_m + 0.01,
                        data.truth.point_ee_m, data.truth.direction_ee)  # fmt: skip
-    assert spots_between(lower, data.base_T_ee, xy)[1].max() < 1e-12  # no plane in it
+    assert laser_printed.spots_between(lower, data.base_T_ee, xy)[1].max() < 1e-12  # no plane in it
     moved = data.truth.moved(np.array([0.0, 0.005, 0.0, 0.0, 0.0, 0.0] + [0.0] * 7))
-    assert np.median(spots_between(moved, data.base_T_ee, xy)[1]) > 5e-4
+    assert np.median(laser_printed.spots_between(moved, data.base_T_ee, xy)[1]) > 5e-4
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -65,10 +62,12 @@ def test_jacobians_of_the_predictions_are_those_of_central_differences(seed):
     assert np.abs(pose_slopes(setup, poses) - by_pose).max() < 1e-7
     # Off the truth, so that line and ray don't meet.
     xy = ideal(data) + np.random.default_rng(seed).normal(0.0, 3e-3, data.uv_px.shape)
-    on_rays = numeric(lambda d: spots_on_rays(setup, xy + d)[0], 2)
-    assert np.abs(spots_on_rays(setup, xy)[1] - on_rays).max() < 1e-7
-    depths = numeric(lambda d: spots_between(setup, poses, xy + d)[0][:, 2], 2)
-    assert np.abs(spots_between(setup, poses, xy)[2] - depths).max() < 1e-7 * max(1.0, float(np.abs(depths).max()))
+    on_rays = numeric(lambda d: laser_printed.spots_on_rays(setup, xy + d)[0], 2)
+    assert np.abs(laser_printed.spots_on_rays(setup, xy)[1] - on_rays).max() < 1e-7
+    depths = numeric(lambda d: laser_printed.spots_between(setup, poses, xy + d)[0][:, 2], 2)
+    assert np.abs(laser_printed.spots_between(setup, poses, xy)[2] - depths).max() < 1e-7 * max(
+        1.0, float(np.abs(depths).max())
+    )
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.1, 0.2, 0.97)])
@@ -112,7 +111,7 @@ def test_step_2_the_matrix_of_an_orientation():
     data = scene()
     for orientation, _ in zip(*true_orientations(data), strict=True):
         shifts = data.base_T_ee[orientation.members, :3, 3] - orientation.centre_m
-        found = closed_form.spot_matrix(ideal(data)[orientation.members], shifts)
+        found = laser_printed.spot_matrix(ideal(data)[orientation.members], shifts)
         truth = orientation.matrix / np.linalg.norm(orientation.matrix[:, 3])
         assert np.abs(found - truth).max() < 1e-9 * np.abs(truth).max()
 
@@ -120,7 +119,7 @@ def test_step_2_the_matrix_of_an_orientation():
 def test_step_3_the_plane_normal():
     data = scene()
     orientations, _ = true_orientations(data)
-    assert np.abs(closed_form.plane_normal([o.matrix for o in orientations]) - data.truth.normal_cam).max() < 1e-9
+    assert np.abs(laser_printed.plane_normal([o.matrix for o in orientations]) - data.truth.normal_cam).max() < 1e-9
 
 
 def test_step_4_one_of_two_beams_is_the_true_one_and_brings_the_rotation():
@@ -128,12 +127,12 @@ def test_step_4_one_of_two_beams_is_the_true_one_and_brings_the_rotation():
     orientations, _ = true_orientations(data)
     for orientation in orientations:
         u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
-        pair = closed_form.beam_candidates(orientation.matrix, data.truth.normal_cam)
+        pair = laser_printed.beam_candidates(orientation.matrix, data.truth.normal_cam)
         right = min(pair, key=lambda c: float(np.abs(np.cross(c.beam_cam, u)).max()))
         assert np.abs(np.cross(right.beam_cam, u)).max() < 1e-9
         assert np.abs(right.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    chosen = closed_form.consistent_beams(
-        [closed_form.beam_candidates(o.matrix, data.truth.normal_cam) for o in orientations]
+    chosen = laser_printed.consistent_beams(
+        [laser_printed.beam_candidates(o.matrix, data.truth.normal_cam) for o in orientations]
     )
     assert all(np.abs(c.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9 for c in chosen)
 
@@ -162,12 +161,12 @@ def test_steps_7_and_8_positions_scales_and_the_plane_distance():
     assert np.abs(point - data.truth.point_ee_m).max() < 1e-9  # the paper's point lies in the y-z plane, too
     assert np.abs(shift - data.truth.cam_T_base[:3, 3]).max() < 1e-9
     assert np.abs(found - scales).max() < 1e-9
-    distance = closed_form.plane_distance(orientations, scales, data.truth.normal_cam, data.base_T_ee)
+    distance = laser_printed.plane_distance(orientations, scales, data.truth.normal_cam, data.base_T_ee)
     assert abs(distance - data.truth.distance_m) < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("method", [closed_form.solve, common_plane.solve])
+@pytest.mark.parametrize("method", [laser_printed.solve, closed_form.solve])
 def test_the_whole_closed_form_is_exact_without_noise(method, seed):
     data = scene(seed, orientations=3 + seed)
     assert_same(method(ideal(data), data.base_T_ee), data.truth)
@@ -181,7 +180,7 @@ def test_beams_along_other_axes_choose_another_origin_plane():
         point = np.array([0.02, -0.03, 0.05]) * (1.0 - u)
         truth = LaserSetup(paper.cam_T_base, paper.normal_cam, paper.distance_m, point, u)
         data = sampled(truth, rng)
-        for method in (closed_form.solve, common_plane.solve):
+        for method in (laser_printed.solve, closed_form.solve):
             assert_same(method(ideal(data), data.base_T_ee), truth)
 
 
@@ -192,12 +191,12 @@ def test_the_common_planes_start_is_exact():
     data = scene(2)
     orientations, _ = true_orientations(data)
     shifts = [data.base_T_ee[o.members, :3, 3] - o.centre_m for o in orientations]
-    start = planar_start(ideal(data), shifts, [o.members for o in orientations])
-    assert np.abs(start.normal - data.truth.normal_cam).max() < 1e-9
-    turn = common_plane.turn_from_motions([m[:, :3] for m in start.matrices], start.normal)
-    assert np.abs(turn.cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
-    assert abs(turn.distance_m - data.truth.distance_m) < 1e-9
-    for beam, orientation in zip(turn.beams_cam, orientations, strict=True):
+    normal, matrices = planar_start(ideal(data), shifts, [o.members for o in orientations])
+    assert np.abs(normal - data.truth.normal_cam).max() < 1e-9
+    cam_R_base, beams_cam, distance_m = closed_form.turn_from_motions([m[:, :3] for m in matrices], normal)
+    assert np.abs(cam_R_base - data.truth.cam_T_base[:3, :3]).max() < 1e-9
+    assert abs(distance_m - data.truth.distance_m) < 1e-9
+    for beam, orientation in zip(beams_cam, orientations, strict=True):
         u = data.truth.cam_T_base[:3, :3] @ orientation.base_R_ee @ data.truth.direction_ee
         assert np.abs(np.cross(beam, u)).max() < 1e-9
 
@@ -208,8 +207,8 @@ def test_with_noise_the_common_plane_is_far_better_than_the_printed_closed_form(
         data = scene(seed, orientations=9)
         noisy = data.uv_px + np.random.default_rng(seed).normal(0.0, 0.5, data.uv_px.shape)
         xy = data.camera.undistort(noisy)
-        printed.append(translation_error(closed_form.solve(xy, data.base_T_ee), data.truth))
-        common.append(translation_error(common_plane.solve(xy, data.base_T_ee, robust=False), data.truth))
+        printed.append(translation_error(laser_printed.solve(xy, data.base_T_ee), data.truth))
+        common.append(translation_error(closed_form.solve(xy, data.base_T_ee, robust=False), data.truth))
     assert np.mean(common) < 0.5 * np.mean(printed)
 
 
@@ -220,7 +219,7 @@ def test_with_wrong_spots_the_start_still_refines_to_the_truth():
         uv = data.uv_px + rng.normal(0.0, 0.5, data.uv_px.shape)
         wrong = rng.permutation(len(uv)) < share * len(uv)
         uv[wrong] += rng.choice([-1.0, 1.0], (wrong.sum(), 2)) * rng.uniform(10.0, 60.0, (wrong.sum(), 2))
-        start = common_plane.solve(data.camera.undistort(uv), data.base_T_ee)
+        start = closed_form.solve(data.camera.undistort(uv), data.base_T_ee)
         found = refine(SpotProblem(data.camera, data.base_T_ee, uv), start)
         assert not found.used[wrong].any()
         assert found.used[~wrong].mean() > 0.95
@@ -235,7 +234,7 @@ def refused(data, poses=None, uv=None):
     poses = data.base_T_ee if poses is None else poses
     uv = data.uv_px if uv is None else uv
     texts = []
-    for method in (closed_form.solve, common_plane.solve):
+    for method in (laser_printed.solve, closed_form.solve):
         with pytest.raises(CalibrationError) as error:
             method(data.camera.undistort(uv), poses)
         texts.append(str(error.value))
@@ -297,11 +296,11 @@ def test_a_beam_that_meets_the_plane_at_the_same_angle_everywhere_is_named():
     normal = np.array([0.0, 0.1, 0.99]) / np.linalg.norm([0.0, 0.1, 0.99])
     motion = np.eye(3) - np.outer(normal, normal)
     with pytest.raises(CalibrationError, match="same angle at every orientation"):
-        common_plane.turn_from_motions([motion, motion, motion], normal)
+        closed_form.turn_from_motions([motion, motion, motion], normal)
 
 
 def test_poses_the_wrong_way_round_are_refused_or_fit_nothing():
     data = scene(orientations=5)
     inverted = np.stack([invert(T) for T in data.base_T_ee])
     with pytest.raises(CalibrationError):
-        common_plane.solve(ideal(data), inverted)
+        closed_form.solve(ideal(data), inverted)

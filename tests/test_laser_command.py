@@ -16,7 +16,7 @@ from support.laser_scenes import PAPER_LENS, paper_setup, sampled, write_csv
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.laser.pointer.document import NAMES, pose_jacobian
+from gripmon.laser.setup import NAMES, pose_jacobian
 from gripmon.model.geometry import invert, perturb, perturbation_between
 from gripmon.model.provenance import provenance_of
 from gripmon.simulate.laser import spot_image

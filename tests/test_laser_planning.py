@@ -10,10 +10,9 @@ from support.laser_scenes import paper_setup, sampled
 from test_laser_command import calibrate, camera, rows_of, scene, write_csv  # noqa: F401 - camera is a fixture
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.planning import Arm, candidates, plan
-from gripmon.laser.pointer.refinement import refine
-from gripmon.laser.pointer.setup import spots_on_plane
-from gripmon.laser.pointer.spot_problem import SpotProblem
+from gripmon.laser.planning import candidates, plan
+from gripmon.laser.refinement import SpotProblem, refine
+from gripmon.laser.setup import spots_on_plane
 from gripmon.model.geometry import perturbation_between
 
 
@@ -26,7 +25,7 @@ def calibrated(seed, orientations=4):
 
 def test_planned_poses_are_within_reach_and_their_spots_in_view():
     data, _, refined = calibrated(1)
-    planned = plan(refined, Arm(0.8), 12)
+    planned = plan(refined, 0.8, 12)
     assert planned.base_T_ee.shape == (12, 4, 4)
     assert (np.linalg.norm(planned.base_T_ee[:, :3, 3], axis=1) <= 0.8).all()
     rotations = planned.base_T_ee[:, :3, :3]
@@ -39,13 +38,13 @@ def test_planned_poses_are_within_reach_and_their_spots_in_view():
 
 def test_what_is_foretold_is_what_a_calibration_with_these_poses_says():
     data, _, refined = calibrated(2)
-    planned = plan(refined, Arm(1.0), 10)
+    planned = plan(refined, 1.0, 10)
     assert (np.diff(planned.sigmas[:, 0] ** 2 + (0.55 * planned.sigmas[:, 1]) ** 2) < 0.0).all()
     poses = np.concatenate([data.base_T_ee, planned.base_T_ee])
     exact = data.camera.project(spots_on_plane(data.truth, poses)[0])
     rng = np.random.default_rng(3)
     again = refine(SpotProblem(data.camera, poses, exact + rng.normal(0.0, refined.scale, exact.shape)), data.truth)
-    from gripmon.laser.pointer.document import base_covariance
+    from gripmon.laser.calibrating import base_covariance
 
     sigma = np.sqrt(np.trace(base_covariance(again)[:3, :3]))
     assert sigma == pytest.approx(planned.sigmas[-1, 0], rel=0.35)
@@ -56,9 +55,9 @@ def test_planned_poses_help_more_than_random_ones():
     for seed in range(15):
         data, uv, refined = calibrated(seed)
         rng = np.random.default_rng(seed + 100)
-        drawn = candidates(refined.setup, refined, Arm(1.0), rng)
+        drawn = candidates(refined.setup, refined, 1.0, rng)
         for name, more in (
-            ("planned", plan(refined, Arm(1.0), 8).base_T_ee),
+            ("planned", plan(refined, 1.0, 8).base_T_ee),
             ("random", drawn[rng.permutation(len(drawn))[:8]]),
         ):
             spots = data.camera.project(spots_on_plane(data.truth, more)[0])
@@ -73,7 +72,7 @@ def test_planned_poses_help_more_than_random_ones():
 def test_an_arm_that_reaches_nothing_is_told():
     _, _, refined = calibrated(1)
     with pytest.raises(CalibrationError, match="no pose whose spot the camera would see; a longer reach"):
-        plan(refined, Arm(0.01, 0.0), 3)
+        plan(refined, 0.01, 3)
 
 
 def test_the_command_writes_a_plan(tmp_path, camera, capsys):  # noqa: F811

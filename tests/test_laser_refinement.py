@@ -7,17 +7,21 @@ import pytest
 from scipy.stats import f as fisher_f
 from support.laser_scenes import PAPER_LENS, assert_same, numeric, scene
 
-from gripmon.calibrate.lens_models import LensModel
+from gripmon.calibrate.bundle import GivenCamera, LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer import common_plane, refinement
-from gripmon.laser.pointer.calibrating import Spots, calibrate, contradictions
-from gripmon.laser.pointer.refinement import FALSE_OUTLIERS, refine, with_held_lens
-from gripmon.laser.pointer.setup import (
+from gripmon.laser import closed_form, refinement
+from gripmon.laser.calibrating import Spots, calibrate, contradictions
+from gripmon.laser.refinement import FALSE_OUTLIERS, PoseNoise, SpotProblem, refine, with_held_lens
+from gripmon.laser.setup import (
     PARAMETERS,
     LaserSetup,
 )
-from gripmon.laser.pointer.spot_problem import LensPrior, PoseNoise, SpotProblem
 from gripmon.model.geometry import perturb, perturbation_between
+
+
+def prior_of(model, values, free, covariance):
+    names = parameter_names(model.name)
+    return GivenCamera(model.settings(values), tuple(names[k] for k in free), covariance)
 
 
 def noisy(seed, sigma_px=0.5, **options):
@@ -29,7 +33,7 @@ def test_rows_of_the_problem_are_central_differences():
     data = scene(3)
     model = LensModel("brown_conrady", 640, 480)
     values = np.array([543.0, 545.0, 322.0, 238.0, -0.1, 0.02, 1e-3, -5e-4])
-    lens = LensPrior(model, values, (0, 1, 2, 3, 4), np.diag([1.0, 1.0, 2.0, 2.0, 1e-4]))
+    lens = prior_of(model, values, (0, 1, 2, 3, 4), np.diag([1.0, 1.0, 2.0, 2.0, 1e-4]))
     covariance = np.tile([[0.3, 0.1], [0.1, 0.2]], (50, 1, 1))
     problem = SpotProblem(model.camera(values), data.base_T_ee, data.uv_px, covariance, lens=lens)
     state = problem.start(data.truth).moved(1e-3 * np.random.default_rng(1).normal(size=18))
@@ -113,8 +117,8 @@ def test_a_slightly_wrong_lens_needs_its_part_in_the_covariance():
         data, uv = noisy(seed, 0.2, orientations=12)
         believed = right.copy()
         believed[:4] += np.sqrt(prior.diagonal()) * np.random.default_rng(seed + 50).normal(size=4)
-        lens = LensPrior(model, believed, (0, 1, 2, 3), prior)
-        start = common_plane.solve(model.camera(believed).undistort(uv), data.base_T_ee)
+        lens = prior_of(model, believed, (0, 1, 2, 3), prior)
+        start = closed_form.solve(model.camera(believed).undistort(uv), data.base_T_ee)
         problem = SpotProblem(model.camera(believed), data.base_T_ee, uv, lens=lens)
         exact = refine(SpotProblem(model.camera(believed), data.base_T_ee, uv), start)
         for out, found in (
@@ -153,7 +157,7 @@ def test_a_held_lens_moves_the_solution_as_a_solution_with_another_lens_says(fre
     sigmas = np.array([1.0, 1.0, 1.0, 1.0, 1e-3])[list(free)] * 0.1
     ends = [[solved(s * sigmas * e).setup.cam_T_base for s in (-1.0, 1.0)] for e in np.eye(len(free))]
     by_lens = np.stack([perturbation_between(*pair) / 2.0 for pair in ends], axis=1)
-    lens = LensPrior(model, believed, free, np.diag(sigmas**2))
+    lens = prior_of(model, believed, free, np.diag(sigmas**2))
     problem = SpotProblem(model.camera(believed), data.base_T_ee[kept], uv[kept], lens=lens)
     added = (with_held_lens(found, problem, lens).covariance - found.covariance)[:6, :6]
     expected = by_lens @ by_lens.T

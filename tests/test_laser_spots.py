@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gripmon.calibrate.sighting import NotFound
-from gripmon.laser.pointer.spots import find_spots
+from gripmon.laser.spots import find_spots
 from gripmon.simulate.laser import cluttered, spot_image
 
 

@@ -15,7 +15,7 @@ from support.router_process import RouterProcess, plain_config, running
 
 from gripmon.client import Client
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.io.wire.reach import is_at
+from gripmon.io.wire.link import is_at
 
 HERE = Path(__file__).resolve().parent
 

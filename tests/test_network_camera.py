@@ -19,8 +19,7 @@ from support.network_daemon import ENVIRONMENT, PREFIX, ROOT, NetworkDaemon, net
 from support.router_process import plain_config, running
 
 from gripmon.cli import main
-from gripmon.io.ros2 import COMPRESSED_IMAGE, IMAGE
-from gripmon.io.ros2.types import type_hash
+from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, type_hash
 
 FEEDER = ROOT / "tests" / "support" / "frame_feeder.py"
 FRAMES = 12

@@ -22,8 +22,9 @@ from support.plate_fingers import (
 from support.plates import Look
 from support.simulated import BOX_FINGERS, PAPER_LENS, STRONG_LENS, nominal_cam_T_grip, sharp_gripper
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.plane import Coincidence, GivenCamera
+from gripmon.calibrate.plane import Coincidence
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import LensSettings, make_camera

@@ -10,9 +10,8 @@ from support.plate_fingers import CHARUCO, CHEQUERBOARD, DISCS, outline_pixels, 
 from support.plates import Look
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 
+from gripmon.calibrate.bundle import GivenCamera, plate_pose
 from gripmon.calibrate.detection import detect
-from gripmon.calibrate.plane import GivenCamera
-from gripmon.calibrate.plate_pose import plate_pose
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import make_camera
 from gripmon.model.geometry import perturbation_between

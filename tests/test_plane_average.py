@@ -9,7 +9,8 @@ import pytest
 from scipy.stats import chi2, kstest
 from support.plate_views import CORNERS_M, LENS, NAMES, Trial, solved, transform, trial
 
-from gripmon.calibrate.plane import Coincidence, FingerCorners, GivenCamera
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.plane import Coincidence, FingerCorners
 from gripmon.calibrate.plane_average import PlaneCalibration, against, average
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.geometry import perturb, perturbation_between

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gripmon.laser.pulses.matching import Matcher, Shown, mean_image
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import Told
+from gripmon.laser.matching import Matcher, PulseSettings, ReportedPulse, Shown, mean_image
 from gripmon.model.records import Frame, PulseFault
 
 POSE = np.eye(4)
@@ -34,11 +32,11 @@ class Bench:
     def pulse(self, begin: float, end: float, x_m: float = 0.0, now_s: float = 0.0) -> Bench:
         pose = POSE.copy()
         pose[0, 3] = x_m
-        self.shown += self.matcher.tell(Told(ns(begin), ns(end), pose), now_s)
+        self.shown += self.matcher.pulse(ReportedPulse(ns(begin), ns(end), pose), now_s)
         return self
 
     def table(self, *spans: tuple[float, float]) -> Bench:
-        self.matcher.load([Told(ns(begin), ns(end), POSE) for begin, end in spans])
+        self.matcher.load([ReportedPulse(ns(begin), ns(end), POSE) for begin, end in spans])
         return self
 
     def said(self) -> list[tuple[float, list[int], int | None, str]]:
@@ -102,7 +100,7 @@ def test_after_one_was_judged_neither_an_overlapping_nor_an_earlier_one_counts()
         ((0.9, 1.5), (1.0, 1.3), PulseFault.NO_FRAME, "nearest one is 0.1 s before its beginning"),
         ((0.9, 1.02, 1.27, 1.5), (1.0, 1.3), PulseFault.NO_FRAME, "no frame within its 0.3 s"),
         ((0.9, 1.03, 1.2), (1.0, 1.08), PulseFault.NO_FRAME, "lasts 0.08 s, of which margin_s, 0.05 s, is left out"),
-        ((1.0, 1.2, 2.0, 3.5, 4.0), (1.1, 1.4), PulseFault.TOO_LATE, "was told 2.6 s after its end"),
+        ((1.0, 1.2, 2.0, 3.5, 4.0), (1.1, 1.4), PulseFault.TOO_LATE, "was reported 2.6 s after its end"),
     ],
 )
 def test_why_no_frame_shows_it(

@@ -24,7 +24,7 @@ from gripmon.daemon.config import load_config
 from gripmon.daemon.config.recorded import to_recorded
 from gripmon.daemon.recorded_run import RecordedRun, as_recorded_before_bounds, one_recording
 from gripmon.daemon.replaying import replay
-from gripmon.io.sources.folder import FolderSettings, FolderSource
+from gripmon.io.sources.files import FolderSettings, FolderSource
 from gripmon.model.records import (
     Alert,
     AlertEvent,

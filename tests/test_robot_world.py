@@ -12,6 +12,7 @@ from scipy.stats import f
 
 from gripmon.calibrate import robot_world
 from gripmon.calibrate.sighting import CalibrationError
+from gripmon.calibrate.tables import pose_of, rows_of
 from gripmon.cli import main
 from gripmon.model.geometry import invert, make_transform, perturb, perturbation_between
 
@@ -110,6 +111,66 @@ def test_an_arm_that_is_less_exact_than_the_images_is_weighed_as_it_shows():
     assert 0.6 < np.mean(squared[True]) < 1.6
     assert np.mean(np.array(squared[True]) < f.ppf(0.95, 6, 60)) > 0.84  # 95 %: 38 of 40; 33 are 3 deviations below
     assert np.sqrt(np.mean(np.square(errors[True]))) < 0.8 * np.sqrt(np.mean(np.square(errors[False])))
+
+
+def squared_error(found, cam_T_base, ee_T_target):
+    """Over its expectation, the number of unknowns."""
+    error = np.concatenate(
+        [perturbation_between(found.cam_T_base, cam_T_base), perturbation_between(found.ee_T_target, ee_T_target)]
+    )
+    return error @ np.linalg.solve(found.covariance, error) / 12.0
+
+
+def test_an_arm_errs_at_its_hand_also_with_a_camera_on_it():
+    """The base stands 3 m away: rotations wrong about the base, not the hand, would shift the target ten times more."""
+    squared = {False: [], True: []}
+    for seed in range(30):
+        rng = np.random.default_rng(seed + 7000)
+        cam_T_ee, base_T_target, ee_T_base, cam_T_target = poses(seed, 20)
+        base_T_target[:3, 3] += [3.0, 0.0, 0.0]
+        ee_T_base = np.stack([invert(cam_T_ee) @ T @ invert(base_T_target) for T in cam_T_target])
+        # As an arm errs: its hand's position and its rotation about the hand.
+        said = np.stack([invert(perturb(invert(T), rng.normal(0.0, [1e-4] * 3 + [5e-4] * 3))) for T in ee_T_base])
+        covariance = np.tile(np.diag(np.square(0.02 * SIGMA)), (20, 1, 1))
+        seen = noisy(cam_T_target, 0.02 * SIGMA, seed)
+        start = robot_world.solve(seen, said)
+        for at_hand in (False, True):
+            found = robot_world.refine(seen, said, start, covariance, inexact_arm=True, eye_in_hand=at_hand)
+            squared[at_hand].append(squared_error(found, cam_T_ee, base_T_target))
+    assert 0.75 < np.mean(squared[True]) < 1.4
+    assert np.mean(squared[False]) > 1.3 * np.mean(squared[True])
+
+
+def test_what_all_poses_share_does_not_average_out():
+    squared = {False: [], True: []}
+    for seed in range(30):
+        rng = np.random.default_rng(seed + 8000)
+        cam_T_base, ee_T_target, base_T_ee, exact = poses(seed, 40)
+        # Two errors of the camera, which show differently in each pose.
+        common = 0.3 * SIGMA[:, None] * (1.0 + 0.3 * rng.normal(size=(40, 6, 2)))
+        shared = common @ rng.normal(size=2)
+        seen = np.stack([perturb(T, e) for T, e in zip(noisy(exact, 0.5 * SIGMA, seed), shared, strict=True)])
+        covariance = np.tile(np.diag(np.square(0.5 * SIGMA)), (40, 1, 1))
+        start = robot_world.solve(seen, base_T_ee)
+        for known in (False, True):
+            found = robot_world.refine(seen, base_T_ee, start, covariance, common=common if known else None)
+            squared[known].append(squared_error(found, cam_T_base, ee_T_target))
+    assert 0.75 < np.mean(squared[True]) < 1.4
+    assert np.mean(squared[False]) > 1.5 * np.mean(squared[True])
+
+
+def test_numbers_that_yaml_takes_for_text_are_numbers_also_in_nested_lists(tmp_path):
+    pose = "{translation_m: [1e-3, -2.5E-1, 3], rotation_xyzw: [0, 0, 1e0, 0.0]}"
+    rows = "[1, 0, 0, 1e-3], [0, 1, 0, 2], [0, 0, 1, -1e-1], [0, 0, 0, 1]"
+    path = tmp_path / "poses.yaml"
+    path.write_text(f"samples:\n- base_T_ee: {pose}\n- base_T_ee: [{rows}]\n- base_T_ee: [[a, 1, 1, 1]]\n")
+    samples, places = rows_of(path)
+    assert pose_of(samples[0], places[0])[:3, 3] == pytest.approx([1e-3, -0.25, 3.0])
+    assert pose_of(samples[1], places[1])[:3, 3] == pytest.approx([1e-3, 2.0, -0.1])
+    with pytest.raises(ValueError, match="sample 3: base_T_ee is no transform"):
+        pose_of(samples[2], places[2])
+    with pytest.raises(ValueError, match=r"translation_m is \['x', 0, 0\]; 3 numbers"):
+        pose_of({"base_T_ee": {"translation_m": ["x", 0, 0], "rotation_xyzw": [0, 0, 0, 1]}}, "sample 1")
 
 
 def test_wrong_poses_are_left_out():

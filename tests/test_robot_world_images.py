@@ -13,17 +13,17 @@ import yaml
 from support.plates import pose, render
 from test_robot_world import columns, transform
 
-from gripmon.calibrate.detection import detect
-from gripmon.calibrate.detection.boards import upright
+from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
+from gripmon.calibrate.detection import detect, upright
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
-from gripmon.calibrate.intrinsics import plate_pose
 from gripmon.calibrate.sighting import NotFound, Sighting
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.model.camera import BrownConradyLens
-from gripmon.model.geometry import invert
+from gripmon.model.camera import BrownConradyLens, make_camera
+from gripmon.model.geometry import invert, perturbation_between
 from gripmon.model.provenance import provenance_of
 from gripmon.model.targets import parse_target
+from gripmon.simulate.plates import points_of
 
 LENS = BrownConradyLens(width_px=640, height_px=480, fx_px=700.0, fy_px=700.0, cx_px=320.0, cy_px=240.0)
 TARGET = "charuco:8x6:0.03:0.022:DICT_4X4_250"
@@ -75,6 +75,38 @@ def test_images_of_a_board_become_both_transforms(tmp_path, capsys):
         assert main([*command, "--target", target, "--out", str(tmp_path / "no.yaml")]) == 2
         assert "doesn't tell which way up" in capsys.readouterr().err
     assert not (tmp_path / "no.yaml").exists()
+
+
+def test_what_the_camera_s_errors_do_to_a_target_s_pose_is_what_other_cameras_give():
+    target = parse_target("chequerboard:9x6:0.025")
+    true = pose(target, [0.02, -0.01, 0.45], [0.4, -0.3], 0.2)
+    plate_m = points_of(target)
+    uv_px = make_camera(LENS).project(plate_m @ true[:3, :3].T + true[:3, 3])
+    uv_px = uv_px + np.random.default_rng(3).normal(0.0, 0.1, uv_px.shape)
+    count = len(plate_m)
+    seen = Sighting(uv_px, plate_m, np.tile(0.01 * np.eye(2), (count, 1, 1)), np.arange(count), (640, 480))
+    sigmas = np.array([1.0, 0.5, 0.5])
+    names = ("fx_px", "cx_px", "coefficients.0")  # fy follows fx
+    given = GivenCamera(LENS, names, np.diag(np.square(sigmas * [1.0, 1.0, 0.01])))
+    found = pose_slopes(given, seen, plate_pose(LENS, seen)[0])
+    by_camera = np.empty((6, 3))
+    for k, change in enumerate(0.05 * sigmas):
+        values = {name: getattr(LENS, name) for name in ("fx_px", "fy_px", "cx_px")}
+        ends = []
+        for sign in (-1.0, 1.0):
+            moved = dict(values)
+            coefficients = (0.0, 0.0, 0.0, 0.0)
+            if k == 0:
+                moved |= {"fx_px": 700.0 + sign * change, "fy_px": 700.0 + sign * change}
+            elif k == 1:
+                moved |= {"cx_px": 320.0 + sign * change}
+            else:
+                coefficients = (sign * 0.01 * change, 0.0, 0.0, 0.0)
+            lens = BrownConradyLens(width_px=640, height_px=480, cy_px=240.0, **moved, coefficients=coefficients)
+            ends.append(plate_pose(lens, seen)[0])
+        by_camera[:, k] = perturbation_between(*ends) / 0.1
+    assert np.allclose(found @ found.T, by_camera @ by_camera.T, rtol=0.02, atol=2e-3 * np.abs(found @ found.T).max())
+    assert pose_slopes(GivenCamera(LENS), seen, true).shape == (6, 0)
 
 
 def test_a_chequerboard_is_turned_by_its_colours():

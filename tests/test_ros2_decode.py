@@ -14,16 +14,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support import ros2_idl as idl
 
-from gripmon.io.ros2 import (
+from gripmon.io.ros2.names import RosNameError, subscription_key
+from gripmon.io.ros2.node import (
+    MOST_JOINT_STATE_BYTES,
     JointOpening,
     MessageError,
-    RosNameError,
     decode_compressed_image,
     decode_image,
     decode_joint_state,
-    subscription_key,
 )
-from gripmon.io.ros2.decode import MOST_JOINT_STATE_BYTES
 
 HEADER = idl.Header(idl.Time(1_700_000_000, 123_456_789), "wrist_optical_frame")
 STAMP_NS = 1_700_000_000_123_456_789

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from support import ros2_idl as idl
 from support.loopback import frame_record, state_record
 
-from gripmon.io.ros2.messages import ERROR, OK, STALE, WARN, Messages, inverse
-from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF, typestore
+from gripmon.io.ros2.node import DIAGNOSTICS, POSE, TF, typestore
+from gripmon.io.ros2.publisher import ERROR, OK, STALE, WARN, Messages, inverse
 from gripmon.model.records import AlertKind, Severity, StandingAlert, State, Transform, Verdict
 
 STAMP_NS = 1_700_000_000_123_456_789

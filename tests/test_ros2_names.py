@@ -19,8 +19,7 @@ from zenoh_ros2_sdk import qos as other_qos
 from zenoh_ros2_sdk import utils as other_utils
 
 from gripmon.io.ros2.names import NodeName, Qos, RosNameError, as_token, dds_type, endpoint_token, node_token, topic_key
-from gripmon.io.ros2.node import attachment, gid_of
-from gripmon.io.ros2.types import type_hash
+from gripmon.io.ros2.node import attachment, gid_of, type_hash
 
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 

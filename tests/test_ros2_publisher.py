@@ -19,17 +19,9 @@ from support.loopback import (
 )
 from support.ros2_graph import ON, layout, tokens
 
-from gripmon.io.ros2 import (
-    HeardTopic,
-    Listeners,
-    NodeName,
-    Ros2Publisher,
-    Ros2Settings,
-)
-from gripmon.io.ros2.messages import inverse
-from gripmon.io.ros2.names import dds_type
-from gripmon.io.ros2.node import gid_of
-from gripmon.io.ros2.types import type_hash
+from gripmon.io.ros2.names import NodeName, Ros2Settings, dds_type
+from gripmon.io.ros2.node import HeardTopic, Listeners, gid_of, type_hash
+from gripmon.io.ros2.publisher import Ros2Publisher, inverse
 from gripmon.io.wire import Link, PublishSettings
 from gripmon.model.records import AlertEvent, AlertKind, Severity, StandingAlert, Verdict
 

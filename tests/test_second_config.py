@@ -46,7 +46,7 @@ def laser(**more: object) -> dict[str, object]:
         ({"laser": laser(frames={"margin_s": -1})}, "laser.frames.margin_s: is -1; a number >= 0"),
         ({"laser": laser(watch={"warn_m": "far"})}, "laser.watch.warn_m: is 'far'"),
         ({"laser": laser(pulses=None)}, "laser.pulses: is missing; a table of the recorded pulses"),
-        ({"laser": laser(pulses="none.csv")}, "laser.pulses: there is no file"),
+        ({"laser": laser(pulses="none.csv")}, "none.csv: there is no such file; a table stamp_ns,until_ns"),
         ({"source": {"kind": "folder", "path": "nowhere"}}, "source.path: there is no folder"),
         ({"source": {"kind": "simulator"}}, "source.kind: is simulator, which shows a gripper and no laser"),
         ({"source": {"kind": "live", "device": 0}}, "laser.pulses: has no effect with a live camera"),
@@ -100,7 +100,7 @@ def bad_table(folder: Path, change: str) -> Path:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ("empty", "bad.csv: holds no pulse"),
+        ("empty", "bad.csv: holds no row"),
         ("ragged", "bad.csv: line 2 has another number of fields than the header; 9"),
         ("no end", "bad.csv: line 2: has no until_ns; a whole number of nanoseconds"),
         ("text", "bad.csv: line 2: stamp_ns is 'soon'"),

@@ -18,10 +18,9 @@ from gripmon.daemon.config.second import read_laser
 from gripmon.daemon.running import run_second
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.sources import Waiting
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import LONGEST_S, Told, of_message
-from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.laser.watch import SpotWatchSettings
+from gripmon.laser.judgement import SpotWatchSettings
+from gripmon.laser.matching import LONGEST_S, PulseSettings, ReportedPulse, of_message
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import (
     AlertEvent,
     AlertKind,
@@ -59,9 +58,9 @@ class ScriptedPulses:
     """Pulses that are put in by the source's script."""
 
     def __init__(self) -> None:
-        self.waiting: list[Told] = []
+        self.waiting: list[ReportedPulse] = []
 
-    def poll(self) -> Told | None:
+    def poll(self) -> ReportedPulse | None:
         return self.waiting.pop(0) if self.waiting else None
 
 
@@ -82,7 +81,7 @@ class Bench:
         """A dark frame, one with the laser on, the word of the robot, and a frame after it."""
         begin_ns = START_NS + k * PERIOD_NS
         shown = lit(cell().uv_px(k), self._rng) if image is None else image
-        told = Told(begin_ns, begin_ns + PULSE_NS, cell().data.base_T_ee[k])
+        told = ReportedPulse(begin_ns, begin_ns + PULSE_NS, cell().data.base_T_ee[k])
         return [
             self.frame(begin_ns - 50_000_000, dark(self._rng)),
             self.frame(begin_ns + 100_000_000, shown),
@@ -232,14 +231,14 @@ def test_a_robot_that_forgets_its_laser_is_an_alert_until_it_remembers():
 def test_recorded_frames_with_a_table_need_no_feed():
     bench = Bench(live=False)
     items = [item for k in range(3) for item in bench.pulse(k) if isinstance(item, Frame)]
-    told = [Told(START_NS + k * PERIOD_NS, START_NS + k * PERIOD_NS + PULSE_NS, cell().data.base_T_ee[k])
+    told = [ReportedPulse(START_NS + k * PERIOD_NS, START_NS + k * PERIOD_NS + PULSE_NS, cell().data.base_T_ee[k])
             for k in range(4)]  # fmt: skip
     assert bench.run(items, table=told) == 0
     assert [spot.used for spot in bench.network.spots] == [True] * 3 + [False]
     assert bench.network.spots[3].fault is PulseFault.NO_FRAME, "the frames ended before it"
 
 
-def told_or_why_not(payload: bytes) -> Told | str:
+def told_or_why_not(payload: bytes) -> ReportedPulse | str:
     try:
         return of_message(from_json(payload, LaserPulse))
     except (MessageRefused, ValueError) as error:

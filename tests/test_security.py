@@ -25,7 +25,7 @@ from gripmon.cli import main
 from gripmon.client import Client, Condition, Fleet, NotCarriedOut, TransformClient, Unusable
 from gripmon.io.publish import ZenohPulses, ZenohSpotPublisher
 from gripmon.io.wire import Link, PublishSettings
-from gripmon.io.wire.files import load_file
+from gripmon.io.wire.session import load_file
 from gripmon.model.records import CommandName, CommandReply
 
 PREFIX = "gripmon/arm/wrist"

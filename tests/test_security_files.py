@@ -17,7 +17,7 @@ from support.router_process import ROOT, plain_config, running
 from gripmon.cli import main
 from gripmon.daemon.config import is_second, load_config, load_second
 from gripmon.io.wire import PublishError, PublishSettings, zenoh_config
-from gripmon.io.wire.files import ZenohFileError, load_file, said
+from gripmon.io.wire.session import ZenohFileError, load_file, said
 
 SHIPPED = sorted((ROOT / "configs" / "zenoh").glob("*.json5"))
 LOOPBACK = ("tcp/127.0.0.1:", "tcp/localhost:", "tcp/[::1]:")

@@ -9,10 +9,11 @@ import pytest
 from support.pulsed_laser import AXES, calibration, drawn_world, poses, pulses, true_world
 
 from gripmon.calibrate.sighting import NotFound
-from gripmon.laser.pointer.spots import Spot
-from gripmon.laser.watch import SpotFault, SpotSeen, SpotWatch, SpotWatchSettings, plain_spot
-from gripmon.laser.watch.foresight import foresight
-from gripmon.laser.watch.world import calibrated, foresee
+from gripmon.laser.judgement import SpotFault, SpotSeen, SpotWatchSettings
+from gripmon.laser.planning import forecast
+from gripmon.laser.spots import Spot, plain_spot
+from gripmon.laser.watch import SpotWatch
+from gripmon.laser.world import calibrated, predict
 from gripmon.model.records import AlertEvent, AlertKind, Cause, Severity, State, Verdict
 
 
@@ -69,7 +70,7 @@ def test_errors_that_pulses_have_in_common_are_not_counted_as_many(known):
     pulses from one pose average their noise away, but not that.
     """
     pose = poses()[0]
-    rows = foresee(known.world, known.camera, pose).rows
+    rows = predict(known.world, known.camera, pose).rows
     root = np.linalg.cholesky(known.covariance)
     worst = root @ np.linalg.svd(rows @ root)[2][0]
     watch = SpotWatch(calibration())
@@ -122,7 +123,7 @@ def test_one_orientation_does_not_tell_everything_and_says_so(known):
     assert {w.cause for w in alert.causes if w.probability > 0.1} >= {Cause.CAMERA_MOUNT, Cause.LASER_MOVED}
     assert sum(w.probability for w in alert.causes) == pytest.approx(1.0, abs=1e-4)
     assert last.motion is not None and not last.motion.complete and len(last.motion.observed) <= 2
-    assert "hardly tell a motion" in last.motion.text
+    assert "hardly show a motion" in last.motion.text
 
 
 def test_several_things_that_moved_at_once_are_not_called_one(known):
@@ -302,7 +303,7 @@ def test_a_single_spot_s_square_has_two_degrees_of_freedom(known):
 @pytest.mark.parametrize(("index", "axis"), [(1, 0), (1, 4), (2, 2)])
 def test_motions_are_noticed_about_as_soon_as_foreseen(known, index, axis):
     """What is foreseen is for pulses right after a calibration: those before the motion only help."""
-    foreseen = foresight(known, SpotWatchSettings(), poses())
+    foreseen = forecast(known, SpotWatchSettings(), poses())
     size, promised = foreseen.sizes[index, axis], foreseen.pulses[index]
     change, count = size * AXES[axis], 5 + 3 * promised
     delays = [first_alarm(known, change, 200 + seed, after=5, count=count)[0] for seed in range(3)]

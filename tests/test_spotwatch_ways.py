@@ -5,14 +5,12 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 import pytest
+from support.laser_scenes import laser_printed
 from support.pulsed_laser import calibration, drawn_world, poses, true_world
 
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer.document import setup_of
-from gripmon.laser.pointer.setup import origin_axes, spots_between, spots_on_plane, spots_on_rays
-from gripmon.laser.watch.single import visible
-from gripmon.laser.watch.ways import INPUTS, disagreements, ways
-from gripmon.laser.watch.world import calibrated, foresee, foresee_moved, larger
+from gripmon.laser.setup import origin_axes, setup_of, spots_on_plane
+from gripmon.laser.world import INPUTS, calibrated, disagreements, larger, predict, predict_moved, triangulate, visible
 from gripmon.model.geometry import invert, perturb
 
 STEP = 1e-6
@@ -33,9 +31,9 @@ def test_derivatives_of_a_foreseen_spot_also_of_a_world_that_has_moved_far(known
     rng = np.random.default_rng(3)
     change = large * rng.normal(size=13) * np.array([0.1] * 3 + [0.5] * 3 + [0.3, 0.3, 0.1, 0.5, 0.5, 0.1, 0.1])
     pose = poses()[0]
-    found = foresee_moved(known, change, pose)
-    by_change = slopes(lambda step: foresee(known.world.moved(change + step), known.camera, pose).uv_px, 13)
-    by_arm = slopes(lambda step: foresee(known.world.moved(change), known.camera, perturb(pose, step)).uv_px, 6)
+    found = predict_moved(known, change, pose)
+    by_change = slopes(lambda step: predict(known.world.moved(change + step), known.camera, pose).uv_px, 13)
+    by_arm = slopes(lambda step: predict(known.world.moved(change), known.camera, perturb(pose, step)).uv_px, 6)
     assert np.abs(found.rows - by_change).max() < 1e-6 * np.abs(by_change).max()
     assert np.abs(found.arm_rows - by_arm).max() < 1e-6 * np.abs(by_arm).max()
 
@@ -45,8 +43,8 @@ def test_derivatives_where_the_beam_has_turned_to_another_axis_of_the_hand(known
     change[9:13] = 0.9, 0.5, 0.01, -0.02
     assert origin_axes(known.world.moved(change).lit.direction_ee) != origin_axes(known.world.lit.direction_ee)
     pose = poses()[0]
-    numeric = slopes(lambda step: foresee(known.world.moved(change + step), known.camera, pose).uv_px, 13)
-    found = foresee_moved(known, change, pose)
+    numeric = slopes(lambda step: predict(known.world.moved(change + step), known.camera, pose).uv_px, 13)
+    found = predict_moved(known, change, pose)
     assert np.isfinite(numeric).all()
     assert np.abs(found.rows - numeric).max() < 1e-6 * np.abs(numeric).max()
 
@@ -57,7 +55,7 @@ def test_the_base_s_parameters_say_the_same_of_a_spot_as_the_file_s(known):
     setup = setup_of(document)
     covariance = np.array(document.covariance).reshape(13, 13)
     for pose in poses()[:5]:
-        here = foresee(known.world, known.camera, pose)
+        here = predict(known.world, known.camera, pose)
         spots, _ = spots_on_plane(setup, pose[None])
         assert np.allclose(here.uv_px, known.camera.project(spots)[0], atol=1e-9)
 
@@ -80,21 +78,23 @@ def _rest(setup):
 
 def test_the_three_ways_are_those_of_the_calibration_with_derivatives(known):
     setup, pose = setup_of(calibration()), poses()[2]
-    uv = foresee(known.world, known.camera, pose).uv_px + np.array([4.0, -3.0])
-    found = ways(known.world, known.camera, pose, uv)
+    uv = predict(known.world, known.camera, pose).uv_px + np.array([4.0, -3.0])
+    found = triangulate(known.world, known.camera, pose, uv)
     xy = known.camera.undistort(uv[None])
     points = [
         spots_on_plane(setup, pose[None])[0],
-        spots_on_rays(setup, xy)[0],
-        spots_between(setup, pose[None], xy)[0],
+        laser_printed.spots_on_rays(setup, xy)[0],
+        laser_printed.spots_between(setup, pose[None], xy)[0],
     ]
     base = known.world.base_T_cam
     expected = np.concatenate(points) @ base[:3, :3].T + base[:3, 3]
     assert np.allclose(found.spots_base_m, expected, atol=1e-12)
-    assert np.linalg.norm(found.gap_m) == pytest.approx(float(spots_between(setup, pose[None], xy)[1][0]), abs=1e-12)
+    assert np.linalg.norm(found.gap_m) == pytest.approx(
+        float(laser_printed.spots_between(setup, pose[None], xy)[1][0]), abs=1e-12
+    )
 
     def again(step):
-        return ways(known.world.moved(step[:13]), known.camera, perturb(pose, step[15:]), uv + step[13:15])
+        return triangulate(known.world.moved(step[:13]), known.camera, perturb(pose, step[15:]), uv + step[13:15])
 
     assert np.allclose(found.slopes, slopes(lambda step: again(step).spots_base_m, INPUTS), atol=1e-7)
     assert np.allclose(found.gap_slopes, slopes(lambda step: again(step).gap_m, INPUTS), atol=1e-7)
@@ -110,8 +110,8 @@ def test_disagreements_are_as_large_as_they_claim(known):
     for k in range(400):
         pose = poses()[k % len(poses())]
         real = perturb(pose, np.sqrt(arm.diagonal()) * rng.normal(size=6))
-        uv = foresee(drawn_world(known, rng), known.camera, real).uv_px + rng.normal(0.0, 0.3, 2)
-        found = disagreements(ways(known.world, known.camera, pose, uv), covariance)
+        uv = predict(drawn_world(known, rng), known.camera, real).uv_px + rng.normal(0.0, 0.3, 2)
+        found = disagreements(triangulate(known.world, known.camera, pose, uv), covariance)
         assert [d.freedom for d in found] == [2, 2, 1, 1]
         squares.append([d.square for d in found])
     mean = np.mean(squares, axis=0)
@@ -126,12 +126,12 @@ def test_what_did_not_move_still_agrees(known):
     plane[8], camera[:3] = 5e-3, 5e-3
     gaps = {}
     for name, change in (("plane", plane), ("camera", camera)):
-        uv = foresee(known.world.moved(change), known.camera, pose).uv_px
-        found = ways(known.world, known.camera, pose, uv)
+        uv = predict(known.world.moved(change), known.camera, pose).uv_px
+        found = triangulate(known.world, known.camera, pose, uv)
         gaps[name] = float(np.linalg.norm(found.gap_m))
         spots = found.spots_base_m
         if name == "plane":
-            moved = foresee(known.world.moved(change), known.camera, pose).spot_base_m
+            moved = predict(known.world.moved(change), known.camera, pose).spot_base_m
             assert np.allclose(spots[2], moved, atol=1e-9), "beam and ray find the spot without the plane"
     assert gaps["plane"] < 1e-9
     assert gaps["camera"] > 1e-3
@@ -147,14 +147,14 @@ def test_beams_along_the_plane_and_spots_behind_the_camera_are_not_foreseen(know
         turn = _turn(lit.direction_ee, beam)
         pose = np.eye(4)
         pose[:3, :3] = turn
-        spot = foresee(known.world, known.camera, poses()[0]).spot_base_m
+        spot = predict(known.world, known.camera, poses()[0]).spot_base_m
         pose[:3, 3] = spot - 0.3 * beam - turn @ lit.point_ee_m
         if why == "runs along the plane":
             pose[:3, 3] += 0.01 * lit.normal_cam
-        assert why in visible(known, foresee(known.world, known.camera, pose), arm)
+        assert why in visible(known, predict(known.world, known.camera, pose), arm)
     beyond = np.zeros(13)
     beyond[:3] = 2.0 * known.world.base_T_cam[:3, 2]
-    behind = foresee(known.world.moved(beyond), known.camera, poses()[0])
+    behind = predict(known.world.moved(beyond), known.camera, poses()[0])
     assert "behind the camera" in visible(known, behind, arm)
 
 
@@ -193,7 +193,7 @@ def test_the_calibration_is_near_its_truth(known):
     """Of the tests' own scene: what is foreseen is where the truth has it, within what is claimed."""
     squares = []
     for pose in poses()[:40]:
-        here, there = foresee(known.world, known.camera, pose), foresee(true_world(), known.camera, pose)
+        here, there = predict(known.world, known.camera, pose), predict(true_world(), known.camera, pose)
         off = there.uv_px - here.uv_px
         squares.append(off @ np.linalg.solve(here.rows @ known.covariance @ here.rows.T, off))
     assert np.mean(squares) < 8.0

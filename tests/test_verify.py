@@ -7,16 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, kstest, ncx2
 
-from gripmon.calibrate.interchange.fitting import fit_brown_conrady
-from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.bundle import GivenCamera, LensModel, parameter_names
+from gripmon.calibrate.interchange import fit_brown_conrady
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.calibrate.verify import (
-    CalibratedCamera,
-    agreeing,
-    compare_cameras,
-    compare_hand_eye,
-    mean_of_one_scene,
-)
+from gripmon.calibrate.verify import agreeing, compare_cameras, compare_hand_eye, mean_of_one_scene
 from gripmon.model.camera import FisheyeLens, PaperLens, make_camera
 from gripmon.model.geometry import perturb
 
@@ -123,9 +117,9 @@ CAMERA_COVARIANCE = covariance(RNG, CAMERA_SIGMAS)
 NAMES = parameter_names("brown_conrady")
 
 
-def camera_draw(rng: np.random.Generator, shift: np.ndarray | float = 0.0) -> CalibratedCamera:
+def camera_draw(rng: np.random.Generator, shift: np.ndarray | float = 0.0) -> GivenCamera:
     errors = np.linalg.cholesky(CAMERA_COVARIANCE) @ rng.standard_normal(8)
-    return CalibratedCamera(BROWN.settings(PARAMETERS + shift + errors), NAMES, CAMERA_COVARIANCE)
+    return GivenCamera(BROWN.settings(PARAMETERS + shift + errors), NAMES, CAMERA_COVARIANCE)
 
 
 def test_equal_cameras_have_evenly_spread_probabilities():
@@ -144,8 +138,8 @@ def test_a_camera_with_another_focal_length_is_found():
 
 
 def test_the_largest_difference_is_where_the_projections_say():
-    a = CalibratedCamera(BROWN.settings(PARAMETERS))
-    b = CalibratedCamera(BROWN.settings(PARAMETERS * [1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
+    a = GivenCamera(BROWN.settings(PARAMETERS))
+    b = GivenCamera(BROWN.settings(PARAMETERS * [1.01, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]))
     found = compare_cameras(a, b)
     # Only u is stretched, about the principal point: most at the image's left edge or its right.
     assert found.largest_px == pytest.approx(0.01 * (639.0 - 318.0), rel=1e-6)
@@ -157,7 +151,7 @@ def test_what_a_turn_of_the_camera_explains_is_told_apart():
     """A principal point that is 1 px off is a camera turned by 1 px over the focal length, all but the corners."""
     lens = PaperLens(width_px=640, height_px=480, fx_px=3000.0, fy_px=3000.0, cx_px=320.0, cy_px=240.0)
     shifted = PaperLens(width_px=640, height_px=480, fx_px=3000.0, fy_px=3000.0, cx_px=321.0, cy_px=240.0)
-    found = compare_cameras(CalibratedCamera(lens), CalibratedCamera(shifted))
+    found = compare_cameras(GivenCamera(lens), GivenCamera(shifted))
     assert found.largest_px == pytest.approx(1.0) and found.largest_turned_px < 0.02
     assert np.allclose(found.turn_rad, [0.0, 1.0 / 3000.0, 0.0], atol=3e-6)
 
@@ -168,7 +162,7 @@ def test_models_may_differ_where_the_images_do_not():
     )
     fitted = fit_brown_conrady(paper, (5,))
     alike = compare_cameras(
-        CalibratedCamera(paper, ("fx_px", "kappa_per_px2"), np.diag([0.04, 1e-16])), CalibratedCamera(fitted.camera)
+        GivenCamera(paper, ("fx_px", "kappa_per_px2"), np.diag([0.04, 1e-16])), GivenCamera(fitted.camera)
     )
     assert alike.largest_px <= 1.01 * fitted.largest_px < 0.01 and alike.p_value > 0.9
 
@@ -176,11 +170,11 @@ def test_models_may_differ_where_the_images_do_not():
 def test_what_was_held_fixed_counts_by_what_it_shows():
     """Focal length alone was estimated: a principal point that differs by 0.1 px is no chance."""
     covariances = np.diag([0.25])
-    a = CalibratedCamera(BROWN.settings(PARAMETERS), ("fx_px",), covariances)
-    b = CalibratedCamera(BROWN.settings(PARAMETERS + np.array([0, 0, 0.1, 0, 0, 0, 0, 0])), ("fx_px",), covariances)
+    a = GivenCamera(BROWN.settings(PARAMETERS), ("fx_px",), covariances)
+    b = GivenCamera(BROWN.settings(PARAMETERS + np.array([0, 0, 0.1, 0, 0, 0, 0, 0])), ("fx_px",), covariances)
     assert compare_cameras(a, b).p_value < 1e-3
     longer = PARAMETERS * np.array([1.001, 1.001, 1, 1, 1, 1, 1, 1])  # with the aspect held both focal lengths
-    c = CalibratedCamera(BROWN.settings(longer), ("fx_px",), covariances)
+    c = GivenCamera(BROWN.settings(longer), ("fx_px",), covariances)
     tied = compare_cameras(a, c)
     assert 0.2 < tied.p_value < 0.6 and tied.largest_sigma_px > 0.1
 
@@ -188,21 +182,21 @@ def test_what_was_held_fixed_counts_by_what_it_shows():
 def test_cameras_that_cannot_be_compared_are_refused():
     small = PaperLens(width_px=320, height_px=240, fx_px=300.0, fy_px=300.0, cx_px=160.0, cy_px=120.0)
     with pytest.raises(CalibrationError, match="640 x 480 px and of 320 x 240 px; one camera in one size"):
-        compare_cameras(CalibratedCamera(BROWN.settings(PARAMETERS)), CalibratedCamera(small))
+        compare_cameras(GivenCamera(BROWN.settings(PARAMETERS)), GivenCamera(small))
     with pytest.raises(CalibrationError, match="kappa_per_px2 is no parameter of this camera"):
         compare_cameras(
-            CalibratedCamera(BROWN.settings(PARAMETERS), ("kappa_per_px2",), np.eye(1)),
-            CalibratedCamera(BROWN.settings(PARAMETERS)),
+            GivenCamera(BROWN.settings(PARAMETERS), ("kappa_per_px2",), np.eye(1)),
+            GivenCamera(BROWN.settings(PARAMETERS)),
         )
     with pytest.raises(CalibrationError, match="negative variances"):
         compare_cameras(
-            CalibratedCamera(BROWN.settings(PARAMETERS), ("fx_px", "cx_px"), np.array([[1.0, 2.0], [2.0, 1.0]])),
-            CalibratedCamera(BROWN.settings(PARAMETERS)),
+            GivenCamera(BROWN.settings(PARAMETERS), ("fx_px", "cx_px"), np.array([[1.0, 2.0], [2.0, 1.0]])),
+            GivenCamera(BROWN.settings(PARAMETERS)),
         )
 
 
 def test_a_fisheye_s_corners_may_see_too_far_to_compare():
     wide = FisheyeLens(width_px=640, height_px=480, fx_px=230.0, fy_px=230.0, cx_px=320.0, cy_px=240.0)
     assert not np.isfinite(make_camera(wide).undistort(np.array([[0.0, 0.0]]))).all()
-    found = compare_cameras(CalibratedCamera(wide), CalibratedCamera(wide))
+    found = compare_cameras(GivenCamera(wide), GivenCamera(wide))
     assert found.largest_px < 1e-6 and 0.5 < found.compared < 1.0

@@ -1,20 +1,24 @@
-"""Camera and plate poses together, from all points of all views: weighted, robust least squares on the manifold.
+"""Cameras with derivatives by their parameters, and one fitted together with plate poses to all points of all views.
 
-The unknowns are the parameters of the lens and, for each view, a perturbation of its pose; the Jacobian is analytic.
-Wrong points are found by their size against the rest (Tukey's biweight on a robust scale) and then left out.
+The camera models' maps are those of :mod:`gripmon.model.camera`, so that what is calibrated is what is later used.  The
+fit is weighted, robust least squares on the manifold: the unknowns are the parameters of the lens and, for each view, a
+perturbation of its pose; the Jacobian is analytic.  Wrong points are found by their size against the rest (Tukey's
+biweight on a robust scale) and then left out.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.calibrate.lens_models import LensModel
 from gripmon.calibrate.sighting import CalibrationError, Sighting
-from gripmon.model.camera import Camera
+from gripmon.model.camera import BrownConradyLens, Camera, FisheyeLens, LensSettings, PaperLens
 from gripmon.model.geometry import perturb, skew
 from gripmon.model.least_squares import (
     TUKEY,
@@ -26,6 +30,7 @@ from gripmon.model.least_squares import (
     tukey_weights,
     whitening,
 )
+from gripmon.model.lenses import BrownMap, FisheyeMap, LensMap, PaperMap
 from gripmon.model.records import Array
 
 LARGEST_ITERATIONS = 200
@@ -144,6 +149,10 @@ class BundleProblem:
             side[own] += view[1]
         return normal, side
 
+    def normal_matrix(self, parameters: Array, cam_T_plate: Array) -> Array:
+        """(p + 6, p + 6) of a single view with all its points: free parameters, then the pose."""
+        return self._equations(parameters, [cam_T_plate], [np.ones(len(self._sightings[0]))])[0]
+
     def _minimise(self, parameters: Array, poses: list[Array], weights: Sequence[Array]) -> tuple[Array, list[Array]]:
         if not np.isfinite(self._cost(parameters, poses, weights)):
             raise CalibrationError("the start is outside of what the lens model maps; more views, or another model")
@@ -229,3 +238,256 @@ def _centroids(polygons: Array) -> Array:
             3.0 * area[:, None]
         )
     return out + origin[:, 0]
+
+
+ModelName = Literal["paper", "brown_conrady", "brown_conrady_5", "fisheye"]
+MODELS: tuple[ModelName, ...] = ("paper", "brown_conrady", "brown_conrady_5", "fisheye")
+PINHOLE = ("fx_px", "fy_px", "cx_px", "cy_px")
+_COEFFICIENTS: dict[str, tuple[str, ...]] = {
+    "paper": ("kappa_per_px2",),
+    "brown_conrady": tuple(f"coefficients.{i}" for i in range(4)),
+    "brown_conrady_5": tuple(f"coefficients.{i}" for i in range(5)),
+    "fisheye": tuple(f"coefficients.{i}" for i in range(4)),
+}
+
+
+def parameter_names(model: ModelName) -> tuple[str, ...]:
+    """Names of all of a model's parameters in the order of its vector: keys of its settings."""
+    return (*PINHOLE, *_COEFFICIENTS[model])
+
+
+@dataclass(frozen=True, slots=True)
+class LensModel:
+    """A model at an image size.  Parameter vectors are (k,): focal lengths, principal point (px), lens (see
+    :func:`parameter_names`; kappa in 1/px², the rest without unit).
+    """
+
+    name: ModelName
+    width_px: int
+    height_px: int
+
+    def settings(self, parameters: Array) -> LensSettings:
+        """The camera with these parameters, as files hold it; nothing is checked."""
+        fx, fy, cx, cy, *lens = parameters.tolist()
+        size = {"width_px": self.width_px, "height_px": self.height_px}
+        if self.name == "paper":
+            return PaperLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, kappa_per_px2=lens[0], **size)
+        if self.name == "fisheye":
+            return FisheyeLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
+        return BrownConradyLens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, coefficients=tuple(lens), **size)
+
+    def camera(self, parameters: Array) -> Camera:
+        """The same, ready to project; unlike :func:`~gripmon.model.camera.make_camera` it refuses nothing: an estimate
+        on its way may pass absurd values.  Points outside the lens's domain project to NaN.
+        """
+        return _camera(self, tuple(parameters.tolist()))
+
+    def without_distortion(self, focal_px: float) -> Array:
+        """Parameters (k,) of a lens with this focal length, axis through the image's centre, nothing bent (the fisheye:
+        equidistant).
+        """
+        parameters = np.zeros(len(parameter_names(self.name)))
+        parameters[:4] = focal_px, focal_px, 0.5 * (self.width_px - 1), 0.5 * (self.height_px - 1)
+        return parameters
+
+    def project(self, parameters: Array, points_cam_m: Array) -> tuple[Array, Array, Array]:
+        """Points (n, 3) in the camera frame -> pixels (n, 2), their derivatives by the parameters (n, 2, k) and by the
+        points (n, 2, 3); NaN outside the lens's domain.
+        """
+        camera = self.camera(parameters)
+        uv_px, by_point = camera.project_with_jacobian(points_cam_m)
+        fx, fy = parameters[:2]
+        q = (uv_px - parameters[2:4]) / parameters[:2]
+        xy = points_cam_m[:, :2] / points_cam_m[:, 2:]
+        by_lens = self._by_lens(parameters, xy, q)
+        by_parameters = np.zeros((len(q), 2, len(parameters)))
+        by_parameters[:, 0, 0], by_parameters[:, 1, 1] = q[:, 0], q[:, 1]
+        by_parameters[:, 0, 2] = by_parameters[:, 1, 3] = 1.0
+        by_parameters[:, 0, 4:] = fx * by_lens[:, 0]
+        by_parameters[:, 1, 4:] = fy * by_lens[:, 1]
+        if self.name == "paper":
+            # kappa is per pixel: in normalised coordinates the lens bends by kappa fx², so fx acts through it, too.
+            by_parameters[:, :, 0] += by_parameters[:, :, 4] * (2.0 * parameters[4] / fx)
+        return uv_px, by_parameters, by_point
+
+    def map_of(self, parameters: Array) -> LensMap:
+        """The lens alone."""
+        lens = tuple(parameters[4:].tolist())
+        if self.name == "paper":
+            return PaperMap(lens[0] * float(parameters[0]) ** 2)
+        return FisheyeMap(lens) if self.name == "fisheye" else BrownMap(lens)
+
+    def _by_lens(self, parameters: Array, xy: Array, q: Array) -> Array:
+        """Derivatives (n, 2, k - 4) of distorted normalised coordinates ``q`` (n, 2) by the lens's parameters."""
+        if self.name == "paper":
+            # xy = q (1 + k |q|²) stays as it is: J dq + q |q|² dk = 0, J the Jacobian of that map.
+            qx, qy = q.T
+            s2 = qx * qx + qy * qy
+            k = parameters[4] * parameters[0] ** 2
+            j00, j01, j11 = 1.0 + k * (s2 + 2.0 * qx * qx), 2.0 * k * qx * qy, 1.0 + k * (s2 + 2.0 * qy * qy)
+            per_det = -s2 * parameters[0] ** 2 / (j00 * j11 - j01 * j01)
+            by_kappa: Array = np.stack([j11 * qx - j01 * qy, j00 * qy - j01 * qx], axis=1) * per_det[:, None]
+            return by_kappa[:, :, None]
+        x, y = xy.T
+        r2 = x * x + y * y
+        if self.name == "fisheye":
+            r = np.sqrt(r2 + 1e-300)
+            theta = np.arctan(r)
+            powers = theta[:, None] ** np.array([3, 5, 7, 9])
+            out: Array = (xy / r[:, None])[:, :, None] * powers[:, None, :]
+            return out
+        columns: Sequence[Array] = [
+            xy * r2[:, None],
+            xy * (r2 * r2)[:, None],
+            np.stack([2.0 * x * y, r2 + 2.0 * y * y], axis=1),
+            np.stack([r2 + 2.0 * x * x, 2.0 * x * y], axis=1),
+            xy * (r2**3)[:, None],
+        ]
+        return np.stack(columns[: len(parameters) - 4], axis=2)
+
+
+@functools.lru_cache(maxsize=16)
+def _camera(model: LensModel, parameters: tuple[float, ...]) -> Camera:
+    """One for all views: a lens's tables take longer to make than to use."""
+    values = np.array(parameters)
+    return Camera(model.settings(values), model.map_of(values))
+
+
+def plate_pose(camera: LensSettings, sighting: Sighting) -> tuple[Array, Array, Bundle]:
+    """``cam_T_plate`` (4, 4) with the covariance (6, 6) of its error (position then rotation, camera axes), the camera
+    being exact; and the fit that it comes from.  Raises :class:`CalibrationError`.
+    """
+    if len(sighting) < 4:
+        raise CalibrationError(f"{len(sighting)} points of the plate; at least 4")
+    lens_model, parameters = LensModel(model_of(camera), camera.width_px, camera.height_px), lens_vector(camera)
+    problem = BundleProblem(lens_model, [sighting], np.zeros((len(parameters), 0)))
+    found: list[Bundle] = []
+    failure: CalibrationError | None = None
+    # Seen from afar a plane has two poses that look nearly the same; each is a minimum of its own.
+    for start in _plate_pose_starts(lens_model, parameters, sighting):
+        try:
+            found.append(problem.solve(parameters, [start]))
+        except CalibrationError as error:
+            failure = failure or error
+    if not found:
+        raise failure or CalibrationError("the plate's pose can't be found")
+    bundle = min(found, key=_typical_px)
+    return bundle.cam_T_plate[0], bundle.covariance, bundle
+
+
+def model_of(camera: LensSettings) -> ModelName:
+    """The calibration's name of a camera's model.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+    tag = camera.__struct_config__.tag
+    if tag == "brown_conrady":
+        count = len(camera.coefficients)  # type: ignore[union-attr]
+        if count > 5:
+            raise CalibrationError(f"a lens with {count} coefficients; with 4 or 5")
+        return "brown_conrady" if count == 4 else "brown_conrady_5"
+    return "paper" if tag == "paper" else "fisheye"
+
+
+def plate_pose_start(lens_model: LensModel, parameters: Array, sighting: Sighting) -> Array:
+    """``cam_T_plate`` (4, 4) in closed form, from ideal coordinates (Collins and Bartoli, "Infinitesimal plane-based
+    pose estimation", 2014).  :class:`CalibrationError` where the lens doesn't map the points or they lie on a line.
+    """
+    return _plate_pose_starts(lens_model, parameters, sighting)[0]
+
+
+def _plate_pose_starts(lens_model: LensModel, parameters: Array, sighting: Sighting) -> list[Array]:
+    """Both poses (4, 4), the better one first."""
+    xy = lens_model.camera(parameters).undistort(sighting.uv_px)
+    good = np.isfinite(xy).all(axis=1)
+    if good.sum() < 4:
+        raise CalibrationError("the start is outside of what the lens model maps")
+    # Centred, as the solver wants it.
+    middle = sighting.plate_m[good].mean(axis=0)
+    points = sighting.plate_m[good] - middle
+    spread = np.linalg.svd(points[:, :2], compute_uv=False)
+    if spread[1] < 1e-3 * spread[0]:
+        raise CalibrationError("all points of the plate lie on a line; points that span an area")
+    found, turns, shifts, _ = cv2.solvePnPGeneric(
+        points, np.ascontiguousarray(xy[good]), np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    if not found:
+        raise CalibrationError("the plate's pose can't be found")
+    out: list[Array] = []
+    for turn, shift in zip(turns, shifts, strict=True):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(turn)[0]
+        pose[:3, 3] = shift.ravel() - pose[:3, :3] @ middle
+        if np.isfinite(pose).all() and ((points @ pose[2, :3] + shift.ravel()[2]) > 0.0).all():
+            out.append(pose)
+    if not out:
+        raise CalibrationError("the plate's pose can't be found")
+    return out
+
+
+def _typical_px(bundle: Bundle) -> float:
+    """Median residual of all points: a wrong pose leaves none out, as all of them are far off alike."""
+    sizes = np.linalg.norm(np.concatenate(bundle.residuals_px), axis=1)
+    return float(np.median(np.where(np.isfinite(sizes), sizes, np.inf)))
+
+
+def merit(bundle: Bundle) -> tuple[float, float]:
+    """The smaller the better: points left out, then how well the rest fits."""
+    used = np.concatenate(bundle.used)
+    return float(np.count_nonzero(~used)), bundle.rms_px
+
+
+def lens_vector(camera: LensSettings) -> Array:
+    """A camera's parameters as :class:`LensModel` has them."""
+    pinhole = [camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px]
+    lens = getattr(camera, "coefficients", None)
+    return np.array([*pinhole, *(lens if lens is not None else (camera.kappa_per_px2,))])  # type: ignore[union-attr]
+
+
+@dataclass(frozen=True, slots=True)
+class GivenCamera:
+    """A camera with the covariance of those of its ``parameters`` that aren't exact, named as in its file."""
+
+    lens: LensSettings
+    parameters: tuple[str, ...] = ()
+    covariance: Array | None = None
+
+    @property
+    def model(self) -> LensModel:
+        """Its lens with derivatives.  :class:`CalibrationError` for lenses that aren't calibrated here."""
+        return LensModel(model_of(self.lens), self.lens.width_px, self.lens.height_px)
+
+    @property
+    def free(self) -> Array:
+        """(k, p): what changes of the p ``parameters`` do to all k; fy follows fx where the aspect was held."""
+        names = parameter_names(model_of(self.lens))
+        unknown = [name for name in self.parameters if name not in names]
+        if unknown:
+            raise CalibrationError(f"{unknown[0]} is no parameter of this camera; one of {', '.join(names)}")
+        out = np.zeros((len(names), len(self.parameters)))
+        out[[names.index(name) for name in self.parameters], np.arange(len(self.parameters))] = 1.0
+        if "fx_px" in self.parameters and "fy_px" not in self.parameters:
+            out[1, self.parameters.index("fx_px")] = self.lens.fy_px / self.lens.fx_px
+        return out
+
+
+def pose_slopes(camera: GivenCamera, sighting: Sighting, cam_T_plate: Array) -> Array:
+    """(6, p): what each of the camera's independent errors, in its standard deviations, does to the plate's pose that
+    the image gives (position then rotation, camera axes), to first order; p = 0 for an exact camera.
+    """
+    if camera.covariance is None or not camera.parameters:
+        return np.zeros((6, 0))
+    problem = BundleProblem(camera.model, [sighting], camera.free)
+    normal = problem.normal_matrix(lens_vector(camera.lens), cam_T_plate)
+    p = len(camera.parameters)
+    out: Array = -np.linalg.solve(normal[p:, p:], normal[p:, :p]) @ independent_errors(camera.covariance).T
+    return out
+
+
+def independent_errors(covariance: Array) -> Array:
+    """(n, n) rows of independent errors, one standard deviation each; by eigenvectors, as corners that share an edge,
+    or parameters that were hardly free, make a covariance nearly singular.
+    """
+    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
+    variances, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
+    if not np.isfinite(variances).all() or variances.min() < -1e-6:
+        raise CalibrationError("a covariance has negative variances; one of errors")
+    roots: Array = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
+    return roots.T

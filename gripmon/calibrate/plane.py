@@ -14,9 +14,13 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.stats import chi2
 
-from gripmon.calibrate.bundle import Bundle
-from gripmon.calibrate.intrinsics import lens_vector, model_of, plate_pose
-from gripmon.calibrate.lens_models import LensModel, parameter_names
+from gripmon.calibrate.bundle import (
+    Bundle,
+    GivenCamera,
+    independent_errors,
+    lens_vector,
+    plate_pose,
+)
 from gripmon.calibrate.plane_equations import FEWEST_CORNERS, INFERRED_FROM, FreePose, Standing, off_plate, stand
 from gripmon.calibrate.sighting import CalibrationError, Sighting
 from gripmon.model.camera import Camera, LensSettings, make_camera
@@ -24,14 +28,14 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array
 
 DOUBTED = 1e-3
-"""Probability below which residuals, or the plane's coincidence, are said to contradict their uncertainty."""
+"""Probability below which residuals, or the plane's coincidence, count as contradicting their uncertainty."""
 IMPOSSIBLE, MISSHAPEN = 1e-6, 0.005
 """An inferred gripper's corners are no rectangle if they are improbable as one and leave it by more than this part of
 their reach: so much less than that fingers may be out of line."""
 LARGEST_RMS_SHARE = 0.005
 """Root mean square residual of the plate's points over the image's width beyond which they aren't explained at all."""
 _STEP = 0.05
-"""Central differences reach so many standard deviations."""
+"""Reach of the central differences, in standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +61,6 @@ class FingerCorners:
         count = len(self.names)
         blocks = self.covariance_px.reshape(count, 2, count, 2)
         return np.ascontiguousarray(np.einsum("ipiq->ipq", blocks))
-
-
-@dataclass(frozen=True, slots=True)
-class GivenCamera:
-    """A camera with the covariance of those of its ``parameters`` that aren't exact, named as in its file."""
-
-    lens: LensSettings
-    parameters: tuple[str, ...] = ()
-    covariance: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,10 +142,23 @@ def calibrate_plane(
     found = solve(given)
     # Residuals beyond what their covariances say are the print's: the same plate brings them into every image.
     print_share = 1.0 - 1.0 / max(bundle.scale, 1.0) ** 2
-    own = [*_plate_directions(given, (1.0 - print_share) * plate_covariance), *_corner_directions(given, corners)]
-    printed = _plate_directions(given, print_share * plate_covariance) if print_share > 0.0 else []
-    common = _camera_directions(given, camera, sighting)
-    slopes = [_slope(solve, direction) for direction in (*own, *printed, *common)]
+
+    def other_plate(change: Array) -> _Given:
+        return replace(given, cam_T_plate=perturb(cam_T_plate, change))
+
+    def other_corners(change: Array) -> _Given:
+        return replace(given, uv_px=given.uv_px + change.reshape(-1, 2))
+
+    def other_camera(change: Array) -> _Given:
+        # The plate's pose follows: with another camera the same image shows the plate elsewhere.
+        lens = camera.model.settings(lens_vector(camera.lens) + camera.free @ change)
+        seen_by = camera.model.camera(lens_vector(lens))
+        return replace(given, camera=seen_by, cam_T_plate=plate_pose(lens, sighting)[0])
+
+    own = _ends(other_plate, (1.0 - print_share) * plate_covariance) + _ends(other_corners, corners.covariance_px)
+    printed = _ends(other_plate, print_share * plate_covariance) if print_share > 0.0 else []
+    common = _ends(other_camera, camera.covariance) if camera.covariance is not None and camera.parameters else []
+    slopes = [_slope(solve(up), solve(down)) for up, down in (*own, *printed, *common)]
     motion, left, apart = (np.stack(columns, axis=1) for columns in zip(*slopes, strict=True))
     size, freedom = _size(found.residuals_m.ravel(), left @ left.T)
     p_value = float(chi2.sf(size, freedom)) if freedom else 1.0
@@ -274,62 +282,15 @@ class _Given:
     uv_px: Array
 
 
-_Direction = Callable[[float], _Given]
-"""What the solution rests on, changed by so many standard deviations of one independent error."""
+def _ends(changed: Callable[[Array], _Given], covariance: Array) -> list[tuple[_Given, _Given]]:
+    """What a solution rests on at both ends of a central difference, for each of a covariance's independent errors."""
+    return [(changed(_STEP * root), changed(-_STEP * root)) for root in independent_errors(covariance)]
 
 
-def _plate_directions(given: _Given, covariance: Array) -> list[_Direction]:
-    def changed(change: Array) -> _Given:
-        return replace(given, cam_T_plate=perturb(given.cam_T_plate, change))
-
-    return [_along(changed, root) for root in _roots(covariance)]
-
-
-def _corner_directions(given: _Given, corners: FingerCorners) -> list[_Direction]:
-    def changed(change: Array) -> _Given:
-        return replace(given, uv_px=given.uv_px + change.reshape(-1, 2))
-
-    return [_along(changed, root) for root in _roots(corners.covariance_px)]
-
-
-def _camera_directions(given: _Given, camera: GivenCamera, sighting: Sighting) -> list[_Direction]:
-    """The plate's pose follows: with another camera the same image shows the plate elsewhere."""
-    if camera.covariance is None or not camera.parameters:
-        return []
-    lens, names = camera.lens, camera.parameters
-    model = LensModel(model_of(lens), lens.width_px, lens.height_px)
-    vector, places = lens_vector(lens), [parameter_names(model.name).index(name) for name in names]
-    tied = "fx_px" in names and "fy_px" not in names
-
-    def changed(change: Array) -> _Given:
-        moved = vector.copy()
-        moved[places] += change
-        if tied:
-            moved[1] *= moved[0] / vector[0]
-        return replace(given, camera=model.camera(moved), cam_T_plate=plate_pose(model.settings(moved), sighting)[0])
-
-    return [_along(changed, root) for root in _roots(camera.covariance)]
-
-
-def _roots(covariance: Array) -> Array:
-    """(n, n) rows of independent errors, one standard deviation each; by eigenvectors, as corners that share an edge,
-    or parameters that were hardly free, make a covariance nearly singular.
-    """
-    scale = np.sqrt(np.maximum(covariance.diagonal(), 1e-300))
-    variances, axes = np.linalg.eigh(covariance / np.outer(scale, scale))
-    roots: Array = scale[:, None] * axes * np.sqrt(np.maximum(variances, 0.0))
-    return roots.T
-
-
-def _along(changed: Callable[[Array], _Given], root: Array) -> _Direction:
-    return lambda sigmas: changed(sigmas * root)
-
-
-def _slope(solve: Callable[[_Given], Standing], direction: _Direction) -> tuple[Array, Array, Array]:
+def _slope(up: Standing, down: Standing) -> tuple[Array, Array, Array]:
     """Derivatives by one independent error, in its standard deviations: of pose and inferred lengths (6 + s,), of the
     residuals (2c,), of what lies apart (3,).
     """
-    up, down = solve(direction(_STEP)), solve(direction(-_STEP))
     per = 1.0 / (2.0 * _STEP)
     motion = perturbation_between(down.cam_T_grip, up.cam_T_grip)
     if up.corners_m is not down.corners_m:

@@ -16,11 +16,11 @@ from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.records import Array
 
 BESIDE_STEPS = 2.0
-"""Steps of the pattern beyond the points that were seen from which a corner is said to be off the plate."""
+"""Steps of the pattern beyond the points that were seen from which a corner counts as off the plate."""
 VAGUE_M = 1.5e-5
-"""Standard deviation of the TCP beyond which one image of an inferred gripper is said to tell little."""
+"""Standard deviation of the TCP beyond which one image of an inferred gripper is reported as vague."""
 OTHER_WAY_RAD = np.pi / 2.0
-"""Nobody's rough calibration is off by as much."""
+"""No rough calibration is off by as much."""
 _ROUNDS = 3
 
 

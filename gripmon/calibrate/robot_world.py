@@ -8,7 +8,10 @@ quaternions, then all at once.  A camera on the hand is the same with ``ee_T_bas
 How inexact the arm is shows in what its poses leave unexplained beside a target's own covariances.  A target's pose
 from one image is known to some hundredths of a millimetre, most arms aren't: weighed by the images alone, the poses
 seen best count for far more than they know.  Two variances, of the arm's positions and rotations, are estimated by
-restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).
+restricted maximum likelihood (Patterson and Thompson, Biometrika 58, 1971).  An arm errs at its hand: with a camera on
+the hand a wrong rotation shifts the target by its distance from the hand, however far the base is.
+
+What a camera's own calibration is off by is the same in all images; it doesn't average out however many there are.
 """
 
 from __future__ import annotations
@@ -124,10 +127,14 @@ def refine(
     covariance: Array | None = None,
     *,
     inexact_arm: bool = False,
+    eye_in_hand: bool = False,
+    common: Array | None = None,
 ) -> RobotWorld:
     """All twelve unknowns at once, robustly.  ``covariance`` (n, 6, 6) of the measured ``cam_T_target`` (position then
     rotation, camera axes), believed up to a common scale; without it positions and rotations are weighed by what their
-    residuals show.  With an ``inexact_arm`` what that adds to the covariances is estimated, too.
+    residuals show.  With an ``inexact_arm`` what that adds to the covariances is estimated, too; ``eye_in_hand``:
+    ``base_T_ee`` are the arm's poses inverted.  ``common`` (n, 6, k): what each of k independent errors that all
+    poses share, in its standard deviations, does to each of them; it comes into the covariance.
     """
     cam_T_base, ee_T_target = start
     count = len(cam_T_target)
@@ -140,7 +147,8 @@ def refine(
     for turn in range(_ROUNDS):
         values = residuals(cam_T_target, base_T_ee, cam_T_base, ee_T_target)
         if covariance is not None and inexact_arm and turn < _ARM_ROUNDS:
-            by_arm, rows = arm_slopes(base_T_ee, cam_T_base, ee_T_target), slopes(base_T_ee, cam_T_base, ee_T_target)
+            by_arm = arm_slopes(base_T_ee, cam_T_base, ee_T_target, eye_in_hand=eye_in_hand)
+            rows = slopes(base_T_ee, cam_T_base, ee_T_target)
             sigmas = arm_sigmas(covariance, by_arm, rows, values, weights, sigmas)
             whiten = whitening(with_arm(covariance, by_arm, sigmas))
         root = whiten if whiten is not None else _weights_of(values[used])
@@ -164,7 +172,7 @@ def refine(
     if used.sum() < FEWEST_POSES:
         raise CalibrationError(f"{int(used.sum())} of {count} poses agree with each other; at least {FEWEST_POSES}")
     cam_T_base, ee_T_target = _minimise(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used.astype(float))
-    return _conclude(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used)
+    return _conclude(cam_T_target, base_T_ee, (cam_T_base, ee_T_target), root, used, common)
 
 
 def residuals(cam_T_target: Array, base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
@@ -203,13 +211,13 @@ def _minimise(
     return minimise(start, cost, equations, moved, tolerance=1e-12, damping=1e-9).state
 
 
-def arm_slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array) -> Array:
+def arm_slopes(base_T_ee: Array, cam_T_base: Array, ee_T_target: Array, *, eye_in_hand: bool = False) -> Array:
     """(n, 6, 6): what errors of the arm's poses (position, then rotation about the hand's origin, camera axes) do to
-    the predicted ``cam_T_target``.
+    the predicted ``cam_T_target``, up to a sign; ``eye_in_hand`` as in :func:`refine`.
     """
-    cam_R_ee = cam_T_base[:3, :3] @ base_T_ee[:, :3, :3]
+    hand = cam_T_base @ (np.eye(4) if eye_in_hand else base_T_ee)
     out = np.tile(np.eye(6), (len(base_T_ee), 1, 1))
-    out[:, :3, 3:] = -skew(cam_R_ee @ ee_T_target[:3, 3])
+    out[:, :3, 3:] = -skew((cam_T_base @ base_T_ee @ ee_T_target - hand)[:, :3, 3])
     return out
 
 
@@ -246,18 +254,28 @@ def with_arm(covariance: Array, by_arm: Array, sigmas: Array) -> Array:
 
 
 def _conclude(
-    cam_T_target: Array, base_T_ee: Array, at: tuple[Array, Array], whiten: Array, used: NDArray[np.bool_]
+    cam_T_target: Array,
+    base_T_ee: Array,
+    at: tuple[Array, Array],
+    whiten: Array,
+    used: NDArray[np.bool_],
+    common: Array | None,
 ) -> RobotWorld:
     values = residuals(cam_T_target, base_T_ee, *at)
     freedom = 6 * int(used.sum()) - 12
     variance = max(float(np.square(_sizes(whiten, values)[used]).sum()) / freedom, 1e-18)
-    normal, _ = normal_equations((whiten @ slopes(base_T_ee, *at))[used], values[used])
+    rows = whiten @ slopes(base_T_ee, *at)
+    normal, _ = normal_equations(rows[used], values[used])
     try:
-        covariance = covariance_of(normal, variance)
+        unscaled = covariance_of(normal)
     except np.linalg.LinAlgError:
         raise CalibrationError(
             "the poses leave a direction undetermined; poses turned about at least two axes, and shifted"
         ) from None
+    covariance = variance * unscaled
+    if common is not None:
+        by_common = unscaled @ np.einsum("nij,nik->jk", rows[used], (whiten @ common)[used])
+        covariance = covariance + by_common @ by_common.T
     return RobotWorld(at[0], at[1], covariance, values, used, freedom)
 
 

@@ -1,4 +1,6 @@
-"""Tables with a row for each pose of an arm: CSV, YAML or JSON, and the ways in which a pose may be written."""
+"""Tables with a row for each pose of an arm (CSV, YAML or JSON), the ways in which a pose may be written, and the poses
+of a target that a camera saw at each of them, as columns or from the images that they name.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +8,23 @@ import csv
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gripmon.calibrate.interchange.fault import read_mapping
+from gripmon.calibrate.bundle import GivenCamera, plate_pose, pose_slopes
+from gripmon.calibrate.detection import detect, upright
+from gripmon.calibrate.formats import as_number, read_mapping
+from gripmon.calibrate.robot_world import check_target_scale
+from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.errors import InputError
 from gripmon.model.geometry import exp_rotation, make_transform, rotation_from_xyzw
-from gripmon.model.records import Array
+from gripmon.model.images import check_size, image_in
+from gripmon.model.progress import Progress, quiet
+from gripmon.model.records import Array, Image
+from gripmon.model.targets import Chequerboard, Target, TargetError, name_of, tells_its_turn
 
 Row = Mapping[str, Any]
 
@@ -34,28 +44,30 @@ _TABLE = "a table of samples"
 _SAMPLES = "samples: [{u_px, v_px, base_T_ee}, ...]"
 
 
-def rows_of(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """A table's rows, and where each stands.  :class:`~gripmon.model.errors.InputError` for what is none."""
+def rows_of(path: Path, right: str = _TABLE) -> tuple[list[dict[str, Any]], list[str]]:
+    """A table's rows, and where each stands; ``right``: what kind of table it should be, for messages.
+    :class:`~gripmon.model.errors.InputError` for what is none.
+    """
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".yaml", ".yml", ".json"):
         raise InputError(f"{path}: is no table; a .csv, .yaml or .json file")
     if suffix == ".csv":
-        return _csv_rows(path)
+        return _csv_rows(path, right)
     if suffix == ".json":
         try:
-            values = json.loads(_text(path))
+            values = json.loads(_text(path, right))
         except (ValueError, RecursionError) as error:
             raise InputError(f"{path}: not JSON: {error}; a JSON file") from None
     else:
-        values = read_mapping(str(path), _text(path).encode(), _SAMPLES)
+        values = read_mapping(str(path), _text(path, right).encode(), _SAMPLES)
     samples = values.get("samples") if isinstance(values, dict) else values
     if not isinstance(samples, list) or not all(isinstance(sample, dict) for sample in samples):
         raise InputError(f"{path}: samples is no list of samples; {_SAMPLES}")
     return samples, [f"sample {k + 1}" for k in range(len(samples))]
 
 
-def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    reader = csv.DictReader(_text(path).splitlines(), skipinitialspace=True)
+def _csv_rows(path: Path, right: str) -> tuple[list[dict[str, Any]], list[str]]:
+    reader = csv.DictReader(_text(path, right).splitlines(), skipinitialspace=True)
     rows: list[dict[str, Any]] = []
     places = []
     try:
@@ -72,21 +84,21 @@ def _csv_rows(path: Path) -> tuple[list[dict[str, Any]], list[str]]:
             rows.append({str(key).strip(): value.strip() for key, value in row.items()})
             places.append(f"line {reader.line_num}")
     except csv.Error as error:
-        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {_TABLE}") from None
+        raise InputError(f"{path}: line {reader.line_num}: {error} (an open quote?); {right}") from None
     if not rows:
-        raise InputError(f"{path}: holds no sample; a header line, then a line for each spot")
+        raise InputError(f"{path}: holds no row; a header line, then a line for each")
     return rows, places
 
 
-def _text(path: Path) -> str:
+def _text(path: Path, right: str) -> str:
     try:
         return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; {_TABLE}") from None
+        raise InputError(f"{path}: there is no such file; {right}") from None
     except UnicodeDecodeError:
-        raise InputError(f"{path}: is not text; {_TABLE}") from None
+        raise InputError(f"{path}: is not text; {right}") from None
     except OSError as error:
-        raise InputError(f"{path}: can't be read ({error.strerror}); {_TABLE}") from None
+        raise InputError(f"{path}: can't be read ({error.strerror}); {right}") from None
 
 
 def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:
@@ -96,11 +108,7 @@ def numbers_of(row: Row, keys: Sequence[str], place: str) -> list[float]:
         value = row.get(key)
         if value in (None, ""):
             raise ValueError(f"{place}: has no {key}; a number")
-        try:
-            number = float(value) if not isinstance(value, bool) else math.nan
-        except (TypeError, ValueError):
-            number = math.nan
-        if not math.isfinite(number):
+        if (number := as_number(value)) is None:
             raise ValueError(f"{place}: {key} is {value!r}; a number")
         out.append(number)
     return out
@@ -143,10 +151,11 @@ def _nested(value: Any, place: str) -> Array:
 
 
 def _list(value: Any, count: int, what: str) -> list[float]:
-    good = isinstance(value, list) and len(value) == count
-    if not good or not all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value):
+    numbers = [as_number(v) for v in value] if isinstance(value, list) else []
+    found = [number for number in numbers if number is not None]
+    if len(numbers) != count or len(found) != count:
         raise ValueError(f"{what} is {value!r}; {count} numbers")
-    return [float(v) for v in value]
+    return found
 
 
 def _from_quaternion(quaternion: Sequence[float], place: str) -> Array:
@@ -198,3 +207,120 @@ def check_scale(base_T_ee: Array) -> None:
 
 def _shown(values: Any) -> str:
     return " ".join(f"{float(v):.4g}" for v in values)
+
+
+@dataclass(frozen=True, slots=True)
+class ArmPoses:
+    """``base_T_ee`` and ``cam_T_target`` (n, 4, 4) with ``names``; where the targets were seen in ``images``, the
+    ``covariance`` (n, 6, 6) of their poses and what the camera's own errors do to them, ``common`` (n, 6, k);
+    ``unseen``: where the target wasn't found, and why.
+    """
+
+    names: tuple[str, ...]
+    base_T_ee: Array
+    cam_T_target: Array
+    covariance: Array | None = None
+    common: Array | None = None
+    images: tuple[Path, ...] = ()
+    unseen: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Found:
+    names: list[str] = field(default_factory=list)
+    arm: list[Array] = field(default_factory=list)
+    target: list[Array] = field(default_factory=list)
+    covariances: list[Array] = field(default_factory=list)
+    common: list[Array] = field(default_factory=list)
+    images: list[Path] = field(default_factory=list)
+    unseen: list[str] = field(default_factory=list)
+
+
+def read_arm_poses(
+    tables: Sequence[Path], camera: GivenCamera | None = None, target: Target | None = None, progress: Progress = quiet
+) -> ArmPoses:
+    """All rows of all tables; for rows that name images the ``camera`` that took them and the ``target``.
+
+    :class:`~gripmon.model.errors.InputError` for wrong tables, :class:`CalibrationError` where no image shows the
+    target.
+    """
+    found = _Found()
+    for path in tables:
+        rows, places = rows_of(path)
+        with progress(len(rows), "pose") as step:
+            for row, place in zip(rows, places, strict=True):
+                step()
+                try:
+                    _take(found, path, row, place, camera, target)
+                except InputError:
+                    raise
+                except ValueError as error:
+                    raise InputError(f"{path}: {error}") from None
+    if not found.arm:
+        raise CalibrationError(f"none of {len(found.unseen)} images shows the target", found.unseen)
+    if found.covariances and len(found.covariances) < len(found.arm):
+        raise InputError(f"{tables[0]}: some rows have cam_ columns, others images; one or the other")
+    arm, targets = np.stack(found.arm), np.stack(found.target)
+    try:
+        check_scale(arm)
+        check_target_scale(targets)
+        _check_once(arm, targets, found.names)
+    except ValueError as error:
+        raise InputError(f"{tables[0]}: {error}") from None
+    covariance, common = (np.stack(each) if each else None for each in (found.covariances, found.common))
+    return ArmPoses(tuple(found.names), arm, targets, covariance, common, tuple(found.images), tuple(found.unseen))
+
+
+def _take(found: _Found, table: Path, row: Row, place: str, camera: GivenCamera | None, target: Target | None) -> None:
+    hand = pose_of(row, place)
+    own = {key.removeprefix("cam_"): value for key, value in row.items() if key.startswith("cam_")}
+    if own:
+        found.target.append(pose_of(own, f"{place}, cam_"))
+    else:
+        if not row.get("image"):
+            raise ValueError(f"{place}: has neither cam_tx_m … nor image; the target's pose, or an image of it")
+        if camera is None or target is None:
+            raise InputError("images need --camera and --target; both of them")
+        path = table.parent / str(row["image"])
+        found.images.append(path)
+        image = image_in(path)
+        check_size(str(path), image, camera.lens.width_px, camera.lens.height_px)
+        try:
+            pose, covariance, common = target_pose(image, camera, target, str(path))
+        except CalibrationError as error:
+            found.unseen.append(f"{path}: {error}")
+            return
+        found.target.append(pose)
+        found.covariances.append(covariance)
+        found.common.append(common)
+    found.arm.append(hand)
+    found.names.append(f"{table.name}, {place}")
+
+
+def target_pose(image: Image, camera: GivenCamera, target: Target, name: str = "") -> tuple[Array, Array, Array]:
+    """``cam_T_target`` (4, 4), its covariance (6, 6) with an exact camera, and what the camera's own independent errors
+    do to it (6, k), of a target that tells which way up it is (else :class:`~gripmon.model.targets.TargetError`).
+    :class:`CalibrationError` for an image that doesn't show it.
+    """
+    if not tells_its_turn(target):
+        raise TargetError(
+            f"{name_of(target)}: an image of it doesn't tell which way up it is, so any pose may be turned by half; a "
+            "charuco board, or a chequerboard with one even, one odd number of corners"
+        )
+    sight = detect(image, target, name)
+    if isinstance(sight, Sighting) and isinstance(target, Chequerboard):
+        sight = upright(image, sight, target)
+    if isinstance(sight, NotFound):
+        raise CalibrationError(sight.reason)
+    pose, covariance, _ = plate_pose(camera.lens, sight)
+    return pose, covariance, pose_slopes(camera, sight, pose)
+
+
+def _check_once(arm: Array, target: Array, names: Sequence[str]) -> None:
+    """The same pose twice would make every uncertainty too small."""
+    seen: dict[tuple[float, ...], str] = {}
+    for hand, plate, name in zip(arm, target, names, strict=True):
+        key = tuple(np.round(np.concatenate([hand.ravel(), plate.ravel()]), 9).tolist())
+        first = seen.setdefault(key, name)
+        if first is not name:
+            raise ValueError(f"{name}: is the same pose as {first}; each pose once")

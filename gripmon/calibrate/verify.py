@@ -7,16 +7,15 @@ the sum of their covariances, so that differences then look less significant tha
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from gripmon.calibrate.bundle import GivenCamera, independent_errors, lens_vector
 from gripmon.calibrate.documents import CalibratedGripper
-from gripmon.calibrate.intrinsics import lens_vector, model_of
-from gripmon.calibrate.lens_models import LensModel, parameter_names
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.errors import InputError
@@ -240,7 +239,7 @@ def _cameras(first: Calibrated, second: Calibrated, level: float, tolerance_px: 
     for one in (first, second):
         assert one.lens is not None
         count = len(one.parameters)
-        calibrated.append(CalibratedCamera(one.lens, one.parameters, np.reshape(one.lens_covariance, (count, count))))
+        calibrated.append(GivenCamera(one.lens, one.parameters, np.reshape(one.lens_covariance, (count, count))))
     found = compare_cameras(*calibrated)
     within = found.largest_px <= max(tolerance_px or 0.0, NEGLIGIBLE_PX)
     if found.p_value is None and tolerance_px is None and not within:
@@ -249,15 +248,6 @@ def _cameras(first: Calibrated, second: Calibrated, level: float, tolerance_px: 
             "is; --tolerance-px PX for a difference that doesn't matter"
         )
     return Verdict(within or (found.p_value is not None and found.p_value >= level), within, level, found)
-
-
-@dataclass(frozen=True, slots=True)
-class CalibratedCamera:
-    """A camera with the ``covariance`` (p, p) of those of its ``parameters`` that were estimated; p = 0: not known."""
-
-    camera: LensSettings
-    parameters: tuple[str, ...] = ()
-    covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,20 +271,20 @@ class CameraDifference:
     compared: float
 
 
-def compare_cameras(a: CalibratedCamera, b: CalibratedCamera) -> CameraDifference:
+def compare_cameras(a: GivenCamera, b: GivenCamera) -> CameraDifference:
     """Models may be different ones; image sizes must not (:class:`CalibrationError`).
 
     At pixel u of a grid the difference is ``d = pi_b(pi_a⁻¹(u)) - u``, with covariance ``J_a A J_aᵀ + J_b B J_bᵀ`` to
     first order (J: derivative of the pixel by the parameters).  The statistic is the largest ``dᵀ cov⁻¹ d`` of the
     grid; its distribution under no difference comes from drawn parameter errors, always the same ones.
     """
-    size = (a.camera.width_px, a.camera.height_px)
-    if size != (b.camera.width_px, b.camera.height_px):
+    size = (a.lens.width_px, a.lens.height_px)
+    if size != (b.lens.width_px, b.lens.height_px):
         raise CalibrationError(
-            f"images of {size[0]} x {size[1]} px and of {b.camera.width_px} x {b.camera.height_px} px; one camera in "
+            f"images of {size[0]} x {size[1]} px and of {b.lens.width_px} x {b.lens.height_px} px; one camera in "
             "one size"
         )
-    camera_a, camera_b = make_camera(a.camera), make_camera(b.camera)
+    camera_a, camera_b = make_camera(a.lens), make_camera(b.lens)
     grid_px = _grid(size)
     xy = camera_a.undistort(grid_px)
     shown = np.isfinite(xy).all(axis=1)
@@ -328,31 +318,13 @@ def _grid(size: tuple[int, int]) -> Array:
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
-def _root(calibrated: CalibratedCamera, xy: Array) -> Array:
+def _root(calibrated: GivenCamera, xy: Array) -> Array:
     """(n, 2, p): what independent errors of unit size in the parameters do to each pixel."""
-    if not calibrated.parameters:
+    if calibrated.covariance is None or not calibrated.parameters:
         return np.zeros((len(xy), 2, 0))
-    camera = calibrated.camera
-    model = LensModel(model_of(camera), camera.width_px, camera.height_px)
-    names = parameter_names(model.name)
-    unknown = [name for name in calibrated.parameters if name not in names]
-    if unknown:
-        raise CalibrationError(f"{unknown[0]} is no parameter of this camera; one of {', '.join(names)}")
     points = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
-    _, by_parameters, _ = model.project(lens_vector(camera), points)
-    chosen = np.zeros((len(names), len(calibrated.parameters)))
-    for column, name in enumerate(calibrated.parameters):
-        chosen[names.index(name), column] = 1.0
-    # With the aspect held one focal length stands for both.
-    if "fx_px" in calibrated.parameters and "fy_px" not in calibrated.parameters:
-        chosen[1, calibrated.parameters.index("fx_px")] = camera.fy_px / camera.fx_px
-    sigma = np.sqrt(np.maximum(calibrated.covariance.diagonal(), 0.0))
-    scale = np.where(sigma > 0.0, sigma, 1.0)
-    # Scaled: pixels beside kappa's 1/px² would lose the latter to rounding.
-    values, vectors = np.linalg.eigh(calibrated.covariance / np.outer(scale, scale))
-    if not np.isfinite(values).all() or values.min() < -1e-6:
-        raise CalibrationError("a camera's covariance has negative variances; one of errors")
-    out: Array = by_parameters @ chosen @ (scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
+    _, by_parameters, _ = calibrated.model.project(lens_vector(calibrated.lens), points)
+    out: Array = by_parameters @ calibrated.free @ independent_errors(calibrated.covariance).T
     return out
 
 

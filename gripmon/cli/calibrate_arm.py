@@ -25,8 +25,8 @@ from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     from gripmon.calibrate.documents import RobotWorldCalibration
-    from gripmon.laser.pointer.document import LaserCalibration
-    from gripmon.laser.pointer.planning import Plan
+    from gripmon.laser.planning import Plan
+    from gripmon.laser.setup import LaserCalibration
 
 LONGEST_ARM_M = 20.0
 _LASER = """\
@@ -104,7 +104,7 @@ def laser(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate laser``."""
     from gripmon.daemon.config.calibrated import read_camera
     from gripmon.laser.api import SEED, PoseNoise, calibrate_laser
-    from gripmon.laser.pointer.samples import plan_table
+    from gripmon.laser.samples import plan_table
     from gripmon.model.provenance import provenance_of
     from gripmon.record.spots import write_calibration
 
@@ -174,19 +174,23 @@ _TILTS = ("plane.tilt_a", "plane.tilt_b", "laser.turn_a", "laser.turn_b")
 def robot_world(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate robot-world``."""
     from gripmon.calibrate.api import calibrate_robot_world
-    from gripmon.calibrate.arm_poses import read_arm_poses
     from gripmon.calibrate.documents import robot_world_document
+    from gripmon.calibrate.tables import read_arm_poses
     from gripmon.daemon.calibrations import read_given_camera, target_of
     from gripmon.model.provenance import provenance_of
 
     check_outputs(arguments, "out")
     target = None if arguments.target is None else target_of(arguments.target)
-    camera = None if arguments.camera is None else read_given_camera(arguments.camera).lens
+    camera = None if arguments.camera is None else read_given_camera(arguments.camera)
     poses = read_arm_poses(arguments.data, camera, target, progress_bar)
     for line in poses.unseen:
         print(line, file=sys.stderr)
     found = calibrate_robot_world(
-        poses.base_T_ee, poses.cam_T_target, poses.covariance, eye_in_hand=arguments.eye_in_hand
+        poses.base_T_ee,
+        poses.cam_T_target,
+        poses.covariance,
+        common=poses.common,
+        eye_in_hand=arguments.eye_in_hand,
     )
     inputs = [*arguments.data, *([arguments.camera, *poses.images] if poses.images else [])]
     provenance = provenance_of(command_line(arguments), inputs)

@@ -99,12 +99,11 @@ def _name(text: str) -> str:
 )  # fmt: skip
 def import_(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate import``."""
-    from gripmon.calibrate.interchange.cameras import ReadOptions
     from gripmon.daemon.calibrations import import_camera
 
     check_outputs(arguments, "out")
-    options = ReadOptions(arguments.camera, arguments.size, arguments.fisheye)
-    kind, found = import_camera(arguments.file, arguments.format, options, command_line(arguments))
+    said = arguments.camera, arguments.size, arguments.fisheye
+    kind, found = import_camera(arguments.file, arguments.format, *said, command_line(arguments))
     write_document(found, arguments.out)
     camera = found.camera
     lens = camera.__struct_config__.tag
@@ -139,7 +138,7 @@ def export(arguments: argparse.Namespace) -> None:
 
 
 def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.calibrate.interchange.cameras import write_camera
+    from gripmon.calibrate.interchange import write_camera
 
     if source.lens is None:
         right = "a camera calibration, a hand/eye calibration or a configuration"
@@ -155,7 +154,7 @@ def _camera(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Name
 
 
 def _hand_eye(source: Calibrated, notes: tuple[str, ...], arguments: argparse.Namespace) -> bytes:
-    from gripmon.calibrate.interchange.hand_eye import HandEye, write_hand_eye
+    from gripmon.calibrate.interchange import HandEye, write_hand_eye
 
     if source.cam_T_grip is None:
         right = "a hand/eye calibration, a configuration, a monitor's state or its estimates"

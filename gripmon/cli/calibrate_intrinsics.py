@@ -64,8 +64,7 @@ def intrinsics(arguments: argparse.Namespace) -> None:
     """Handle ``gripmon calibrate intrinsics``."""
     import cv2
 
-    from gripmon.calibrate.api import calibrate_intrinsics
-    from gripmon.calibrate.picture import draw_maps
+    from gripmon.calibrate.api import calibrate_intrinsics, draw_maps
     from gripmon.daemon.calibrations import target_of
     from gripmon.model.images import image_paths
     from gripmon.model.provenance import provenance_of

@@ -13,7 +13,7 @@ from gripmon.model.errors import InputError
 from gripmon.model.stopping import EXIT_DONE, EXIT_FAILED
 
 if TYPE_CHECKING:
-    from gripmon.laser.watch import SpotWatchSettings
+    from gripmon.laser.judgement import SpotWatchSettings
 
 _DESCRIPTION = """\
 Validate a configuration, its gripper file and its source, and say of each thing that matters whether
@@ -125,7 +125,7 @@ def _check_laser(arguments: argparse.Namespace) -> int:
 
 
 def _watch_settings(arguments: argparse.Namespace) -> SpotWatchSettings:
-    from gripmon.laser.watch import SpotWatchSettings
+    from gripmon.laser.judgement import SpotWatchSettings
 
     given: dict[str, Any] = {}
     if arguments.arm_noise is not None:

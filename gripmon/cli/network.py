@@ -92,7 +92,7 @@ def feed(arguments: argparse.Namespace) -> int:
     from gripmon.io.publish.feeding import Feeder
     from gripmon.io.sources import SourceError, open_source, settings_for_text
     from gripmon.io.wire import Keys, Link, PublishSettings
-    from gripmon.io.wire.settings import check_key
+    from gripmon.io.wire.session import check_key
 
     joined = network_of(arguments)
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.WARNING)

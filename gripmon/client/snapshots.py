@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 from gripmon.io.sources import SourceError
-from gripmon.io.sources.folder import COLUMNS, TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import COLUMNS, TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import CommandReply, to_json

@@ -12,9 +12,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.documents import CameraCalibration
-from gripmon.calibrate.interchange import cameras
-from gripmon.calibrate.plane import GivenCamera
+from gripmon.calibrate.interchange import format_of
+from gripmon.calibrate.interchange import read_camera as read_foreign_camera
 from gripmon.calibrate.sighting import CalibrationError
 from gripmon.calibrate.verify import Calibrated
 from gripmon.daemon.config import Config, load_config, read_gripper
@@ -249,15 +250,20 @@ def write_document(document: msgspec.Struct | dict[str, Any], path: Path) -> Non
 
 
 def import_camera(
-    path: Path, kind: str | None, options: cameras.ReadOptions, command: str
+    path: Path,
+    kind: str | None,
+    which: str | None,
+    size_px: tuple[int, int] | None,
+    fisheye: bool | None,
+    command: str,
 ) -> tuple[str, CameraCalibration]:
     """The format of another program's file (None: recognised by its content), and the camera that it holds.
     ``command`` goes into the provenance.  :class:`~gripmon.model.errors.InputError`.
     """
     data = read_bytes(path)
-    kind = kind or cameras.format_of(data, str(path))
+    kind = kind or format_of(data, str(path))
     return kind, CameraCalibration(
-        camera=cameras.read_camera(data, str(path), kind, options),
+        camera=read_foreign_camera(data, str(path), kind, which, size_px, fisheye),
         parameters=(),
         covariance=(),
         warnings=(f"imported from {kind}: how certain it is isn't known",),

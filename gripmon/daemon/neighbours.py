@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from gripmon.laser.pulses.told import Told
+from gripmon.laser.matching import ReportedPulse
 from gripmon.model.records import (
     Command,
     CommandError,
@@ -55,7 +55,7 @@ class CommandFeed(Protocol):
 class PulseFeed(Protocol):
     """Where a laser's pulses come from, e.g. :class:`gripmon.io.publish.ZenohPulses`; ``poll`` doesn't wait."""
 
-    def poll(self) -> Told | None: ...
+    def poll(self) -> ReportedPulse | None: ...
 
 
 class JawFeed(Protocol):

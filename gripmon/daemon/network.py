@@ -17,28 +17,17 @@ from gripmon.io.publish import (
     Publisher,
     Publishers,
     SpotPublisher,
-    SpotPublishers,
     ZenohCommands,
     ZenohJaw,
     ZenohPublisher,
     ZenohPulses,
     ZenohSpotPublisher,
 )
-from gripmon.io.publish.jaw import opening_of_joints
+from gripmon.io.publish.inputs import opening_of_joints
 from gripmon.io.publish.presence import in_words
-from gripmon.io.ros2 import (
-    COMPRESSED_IMAGE,
-    IMAGE,
-    JOINT_STATE,
-    HeardTopic,
-    Listeners,
-    NodeName,
-    Ros2Publisher,
-    as_token,
-    layout_of,
-    network_of,
-    subscription_key,
-)
+from gripmon.io.ros2.names import NodeName, as_token, layout_of, network_of, subscription_key
+from gripmon.io.ros2.node import COMPRESSED_IMAGE, IMAGE, JOINT_STATE, HeardTopic, Listeners
+from gripmon.io.ros2.publisher import Ros2Publisher
 from gripmon.io.sources import NetworkCamera, NetworkSettings, Source
 from gripmon.io.wire import Keys, Link, PublishError
 from gripmon.model.errors import NoResultError
@@ -81,7 +70,7 @@ def open_network(config: Config, *, take_over: bool = False) -> Network[Publishe
 def open_second_network(config: SecondConfig, *, take_over: bool = False) -> Network[SpotPublisher]:
     """The same for a second camera."""
     network = _joined(config, lambda link, who: _second_on_link(config, link, who), take_over=take_over)
-    return _with_metrics(config, network or Network(None, NullPublisher()), SpotPublishers)
+    return _with_metrics(config, network or Network(None, NullPublisher()), Publishers)
 
 
 def _joined(

@@ -20,7 +20,7 @@ from gripmon.daemon.forecast import limits_warning
 from gripmon.daemon.recorded_run import RecordedRun, one_recording
 from gripmon.io.sources import Source, SourceError, settings_for_path
 from gripmon.io.sources import open_source as start
-from gripmon.io.sources.folder import IMAGE_SUFFIXES, TIMESTAMPS_NAME
+from gripmon.io.sources.files import IMAGE_SUFFIXES, TIMESTAMPS_NAME
 from gripmon.model.errors import InputError, in_short
 from gripmon.model.records import (
     Command,

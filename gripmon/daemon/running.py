@@ -25,8 +25,8 @@ from gripmon.daemon.snapshots import Snapshots
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.publish import Publisher, SpotPublisher, StatePublisher
 from gripmon.io.sources import Source
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import PulsedWatch
+from gripmon.laser.matching import ReportedPulse
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.records import Alert
 from gripmon.model.stopping import StopRequest, signals_request
 from gripmon.record.write import EventRecorder, Recorder, SpotRecorder
@@ -87,7 +87,7 @@ def run_second(
     robot: str,
     camera: str,
     lines: Path | None = None,
-    table: Sequence[Told] = (),
+    table: Sequence[ReportedPulse] = (),
     feed: PulseFeed | None = None,
     no_spot_alert_after_s: float | None = None,
     commands: CommandFeed | None = None,

@@ -17,9 +17,8 @@ from gripmon.daemon.watch import DaemonSettings, Judged
 from gripmon.io.publish import SpotPublisher
 from gripmon.io.sources import Source
 from gripmon.judge.policy import AlertBook
-from gripmon.laser.pulses.matching import Shown
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import Outcome, PulsedWatch
+from gripmon.laser.matching import ReportedPulse, Shown
+from gripmon.laser.watching import Outcome, PulsedWatch
 from gripmon.model.errors import in_short
 from gripmon.model.records import (
     Alert,
@@ -65,7 +64,7 @@ class SecondCamera(Loop):
         robot: str,
         camera: str,
         lines: EstimatesFile,
-        table: Sequence[Told] = (),
+        table: Sequence[ReportedPulse] = (),
         feed: PulseFeed | None = None,
         no_spot_alert_after_s: float | None = None,
         commands: CommandFeed | None = None,
@@ -98,7 +97,7 @@ class SecondCamera(Loop):
         return self._pulsed.reference_id, 0
 
     def _begin(self) -> None:
-        self._pulsed.load(self._table)
+        self._pulsed.matcher.load(self._table)
 
     def _between(self) -> None:
         now_s = time.monotonic()
@@ -106,8 +105,8 @@ class SecondCamera(Loop):
             told = None if self._feed is None else self._feed.poll()
             if told is None:
                 break
-            self._judge(self._pulsed.tell(told, now_s))
-        self._judge(self._pulsed.tick(now_s))
+            self._judge(self._pulsed.matcher.pulse(told, now_s))
+        self._judge(self._pulsed.matcher.tick(now_s))
         self._look_for_silence(now_s)
         self._gather_alerts()
 
@@ -205,7 +204,7 @@ class SecondCamera(Loop):
         if silence_s < self._no_spot_s:
             self._tell(self._alerts.absent(_NO_SPOT, "spots are seen again", now_s), self._pulsed.state)
             return
-        text = f"no spot that could be judged for {silence_s:.0f} s: {self._unused or 'no pulse was told'}"
+        text = f"no spot that could be judged for {silence_s:.0f} s: {self._unused or 'no pulse was reported'}"
         alert = Alert(AlertKind.STREAM, Cause.UNKNOWN, Severity.WARNING, text)
         self._tell(self._alerts.present(_NO_SPOT, alert, now_s, time.time_ns()), self._pulsed.state)
 
@@ -244,7 +243,7 @@ class SecondCamera(Loop):
         )  # fmt: skip
 
     def _finish(self) -> None:
-        self._judge(self._pulsed.finish())
+        self._judge(self._pulsed.matcher.finish())
         self._gather_alerts()
 
     def _keep_house(self) -> None:
@@ -254,7 +253,7 @@ class SecondCamera(Loop):
     def _code_at_the_end(self) -> int:
         code = super()._code_at_the_end()
         if code == EXIT_DONE:
-            self._judge(self._pulsed.finish())
+            self._judge(self._pulsed.matcher.finish())
             if self._pulses and not self._pulsed.usable:
                 _log.error("no pulse showed its spot: %s", self._unused)
                 return EXIT_FAILED

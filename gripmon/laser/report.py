@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from gripmon.laser.api import LaserCheck
-from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.laser.watch import CameraMotion, SpotJudgement, SpotWatchSettings
-from gripmon.laser.watch.foresight import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, Foresight, assumed_poses, foresight
-from gripmon.laser.watch.world import calibrated
+from gripmon.laser.judgement import CameraMotion, SpotJudgement, SpotWatchSettings
+from gripmon.laser.planning import ASSUMED_DISTANCE_M, ASSUMED_TILT_RAD, Forecast, assumed_poses, forecast
+from gripmon.laser.setup import LaserCalibration
+from gripmon.laser.world import calibrated
 from gripmon.model.errors import NoResultError
 from gripmon.model.records import Array
 
@@ -20,7 +20,7 @@ def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSet
     """What fresh spots would tell: metres, radians, px."""
     known = calibrated(calibration)
     try:
-        found = foresight(known, settings, assumed_poses(known))
+        found = forecast(known, settings, assumed_poses(known))
     except NoResultError as error:
         raise NoResultError(f"{name}: {error}") from None
     return {
@@ -28,7 +28,7 @@ def expectation(name: str, calibration: LaserCalibration, settings: SpotWatchSet
         "assumed": {
             "spots": len(found.sigma_px), "tilt_rad": ASSUMED_TILT_RAD, "distance_m": ASSUMED_DISTANCE_M,
         },
-        **_foresight_values(found),
+        **_forecast_values(found),
     }  # fmt: skip
 
 
@@ -63,7 +63,7 @@ def _header(name: str, calibration: LaserCalibration, settings: SpotWatchSetting
     }
 
 
-def _foresight_values(found: Foresight) -> dict[str, Any]:
+def _forecast_values(found: Forecast) -> dict[str, Any]:
     return {
         "spot_sigma": {
             "px": [float(found.sigma_px.min()), float(found.sigma_px.max())],
@@ -88,7 +88,7 @@ def _row(name: str, judged: SpotJudgement) -> dict[str, Any]:
         "fault": None if judged.fault is None else str(judged.fault),
         "reason": judged.reason,
         "uv_px": _values(judged.uv_px),
-        "foreseen_px": _values(judged.foreseen_px),
+        "foreseen_px": _values(judged.predicted_px),
         "off_px": _values(judged.off_px),
         "sigmas": None if judged.square is None else math.sqrt(judged.square),
         "spots_base_m": _values(judged.spots_base_m),

@@ -119,7 +119,7 @@ def name_of(target: Target) -> str:
 
 def tells_its_turn(target: Target) -> bool:
     """Whether an image of it tells which way up it is: by marks, or by the colours of a board whose numbers of corners
-    are one even, one odd (:mod:`gripmon.calibrate.detection.boards`).
+    are one even, one odd (:mod:`gripmon.calibrate.detection`).
     """
     if isinstance(target, Chequerboard):
         return (target.columns + target.rows) % 2 == 1

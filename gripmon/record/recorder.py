@@ -17,7 +17,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from gripmon import __version__
-from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera, LensSettings
 from gripmon.model.gripper import Gripper, GripperModel
 from gripmon.model.records import (

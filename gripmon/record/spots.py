@@ -26,9 +26,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from gripmon.laser.pointer.document import LaserCalibration, setup_of
-from gripmon.laser.pointer.refinement import Refined
-from gripmon.laser.pointer.setup import laser_lines, spots_on_plane
+from gripmon.laser.refinement import Refined
+from gripmon.laser.setup import LaserCalibration, laser_lines, setup_of, spots_on_plane
 from gripmon.model.camera import LensSettings
 from gripmon.model.geometry import invert, make_transform, rotation_from_xyzw
 from gripmon.model.records import Array, SpotRecord, to_json

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from gripmon.laser.pointer.document import LaserCalibration
+from gripmon.laser.setup import LaserCalibration
 from gripmon.model.camera import Camera
 from gripmon.model.gripper import Gripper
 from gripmon.model.records import (

@@ -17,7 +17,7 @@ import yaml
 
 from gripmon import __version__
 from gripmon.io.sources import SourceError
-from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_image, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, read_image, read_table
 from gripmon.judge.inspection import inspect
 from gripmon.model.camera import Camera
 from gripmon.model.errors import InputError, NoResultError

@@ -15,10 +15,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from gripmon.calibrate.bundle import GivenCamera, plate_pose
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.documents import CalibratedGripper, CameraCalibration, HandEyeCalibration, HandEyeResiduals
-from gripmon.calibrate.intrinsics import plate_pose
-from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners
+from gripmon.calibrate.plane import Coincidence, KnownCorners
 from gripmon.calibrate.plane import calibrate_plane as calibrate_image
 from gripmon.calibrate.plane_average import PlaneCalibration, against, average
 from gripmon.calibrate.sighting import CalibrationError, Sighting

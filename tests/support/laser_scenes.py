@@ -12,12 +12,14 @@ from gripmon.model.geometry import invert
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tools"))
 
+from benchmarks import laser_printed
 from benchmarks.laser_scenes import PAPER_LENS, LaserData, paper_setup, sampled
 
 __all__ = [
     "PAPER_LENS",
     "LaserData",
     "assert_same",
+    "laser_printed",
     "numeric",
     "paper_setup",
     "sampled",

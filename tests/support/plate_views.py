@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.calibrate.plane import Coincidence, FingerCorners, GivenCamera, KnownCorners, calibrate_plane
+from gripmon.calibrate.bundle import GivenCamera
+from gripmon.calibrate.plane import Coincidence, FingerCorners, KnownCorners, calibrate_plane
 from gripmon.calibrate.sighting import Sighting
 from gripmon.model.camera import PaperLens
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gripmon.laser.pointer.calibrating import Spots, calibrate
-from gripmon.laser.pointer.document import LaserCalibration, document
-from gripmon.laser.pointer.setup import LaserSetup
-from gripmon.laser.watch import SpotSeen, plain_spot
-from gripmon.laser.watch.world import Calibrated, World, calibrated, foresee
+from gripmon.laser.calibrating import Spots, calibrate, document
+from gripmon.laser.judgement import SpotSeen
+from gripmon.laser.setup import LaserCalibration, LaserSetup
+from gripmon.laser.spots import plain_spot
+from gripmon.laser.world import Calibrated, World, calibrated, predict
 from gripmon.model.geometry import invert, perturb
 from gripmon.model.provenance import provenance_of
 from support.laser_scenes import paper_setup, sampled
@@ -74,7 +74,7 @@ def pulses(
     real = [perturb(pose, error) for pose, error in zip(where, off, strict=True)]
     for k in range(count):
         there = world if moved is None or k < after else moved
-        uv_px = foresee(there, camera, real[k % len(where)]).uv_px + rng.normal(0.0, NOISE_PX, 2)
+        uv_px = predict(there, camera, real[k % len(where)]).uv_px + rng.normal(0.0, NOISE_PX, 2)
         if rng.uniform() < wrong:
             uv_px = rng.uniform([0.0, 0.0], [639.0, 479.0])
         yield SpotSeen(2_000_000_000 * k, where[k % len(where)], [plain_spot(uv_px)])

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from gripmon.calibrate.documents import CameraCalibration, CameraResiduals
 from gripmon.cli import main
 from gripmon.daemon.config.yaml_file import as_yaml
-from gripmon.laser.pointer.setup import LaserSetup, spots_on_plane
+from gripmon.laser.setup import LaserSetup, spots_on_plane
 from gripmon.model.geometry import perturb
 from gripmon.model.provenance import provenance_of
 from gripmon.model.records import Array, Image

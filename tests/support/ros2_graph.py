@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zenoh
 
-from gripmon.io.ros2 import Layout, Ros2Settings, layout_of
+from gripmon.io.ros2.names import Layout, Ros2Settings, layout_of
 
 ON = Ros2Settings(enabled=True)
 

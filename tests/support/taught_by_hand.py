@@ -12,7 +12,7 @@ import yaml
 
 from gripmon.cli import main
 from gripmon.daemon.config import builtin_config
-from gripmon.io.sources.folder import read_image
+from gripmon.io.sources.files import read_image
 from gripmon.model.camera import Camera, LensSettings, make_camera
 from gripmon.model.geometry import to_record
 from gripmon.model.gripper import Gripper, load_gripper

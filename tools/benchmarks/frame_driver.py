@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import zenoh
 
-from gripmon.io.publish.frames import FramePublisher
+from gripmon.io.publish.feeding import FramePublisher
 
 _WAIT_S = 20.0
 

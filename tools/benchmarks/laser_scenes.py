@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gripmon.laser.pointer.setup import LaserSetup
+from gripmon.laser.setup import LaserSetup
 from gripmon.model.camera import BrownConradyLens, Camera, make_camera
 from gripmon.model.geometry import invert, make_transform
 from gripmon.model.records import Array

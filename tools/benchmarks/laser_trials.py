@@ -11,14 +11,13 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as fisher_f
 
+from benchmarks import laser_printed
 from benchmarks.laser_scenes import PAPER_LENS, REAL_LENS, LaserData, paper_setup, real_setup, sampled
 from gripmon.calibrate import robot_world
 from gripmon.calibrate.sighting import CalibrationError
-from gripmon.laser.pointer import closed_form, common_plane
-from gripmon.laser.pointer.document import pose_jacobian
-from gripmon.laser.pointer.refinement import refine
-from gripmon.laser.pointer.setup import LaserSetup
-from gripmon.laser.pointer.spot_problem import SpotProblem
+from gripmon.laser import closed_form
+from gripmon.laser.refinement import SpotProblem, refine
+from gripmon.laser.setup import LaserSetup, pose_jacobian
 from gripmon.model.geometry import invert, make_transform, perturbation_between
 
 Array = NDArray[np.float64]
@@ -96,12 +95,12 @@ def _laser(
     xy = data.camera.undistort(uv_px)
     errors: dict[str, tuple[float, float] | None] = {}
     if printed:
-        errors["printed"] = _tried(lambda: closed_form.solve(xy, data.base_T_ee).cam_T_base, truth)
-        errors["common plane"] = _tried(lambda: common_plane.solve(xy, data.base_T_ee, robust=False).cam_T_base, truth)
+        errors["printed"] = _tried(lambda: laser_printed.solve(xy, data.base_T_ee).cam_T_base, truth)
+        errors["common plane"] = _tried(lambda: closed_form.solve(xy, data.base_T_ee, robust=False).cam_T_base, truth)
     clock, begun = time.perf_counter(), time.process_time()
     problem = SpotProblem(data.camera, data.base_T_ee, uv_px, np.tile(noise_shape, (len(uv_px), 1, 1)))
     try:
-        start = common_plane.solve(data.camera.undistort(uv_px), data.base_T_ee)
+        start = closed_form.solve(data.camera.undistort(uv_px), data.base_T_ee)
         half = time.process_time()
         found = refine(problem, start)
     except CalibrationError:

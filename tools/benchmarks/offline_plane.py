@@ -11,9 +11,10 @@ import numpy as np
 from scipy.stats import chi2, ncx2
 
 from benchmarks.offline_images import DISCS, OPENING_M, PAPER_LENS, Setting, gripper
+from gripmon.calibrate.bundle import GivenCamera
 from gripmon.calibrate.detection import detect
 from gripmon.calibrate.intrinsics import calibrate_single_view
-from gripmon.calibrate.plane import Coincidence, GivenCamera, KnownCorners, calibrate_plane
+from gripmon.calibrate.plane import Coincidence, KnownCorners, calibrate_plane
 from gripmon.calibrate.plane_average import average
 from gripmon.calibrate.sighting import CalibrationError, NotFound, Sighting
 from gripmon.model.camera import make_camera

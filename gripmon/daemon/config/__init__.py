@@ -31,7 +31,7 @@ from gripmon.daemon.config.second import SECTION, SecondConfig, is_second, load_
 from gripmon.daemon.config.settings import Settings
 from gripmon.daemon.config.typed import ConfigError, Fault, SettingsError, to_settings
 from gripmon.daemon.config.yaml_file import read_settings, read_yaml
-from gripmon.io.ros2 import fault_of as ros2_fault
+from gripmon.io.ros2.names import fault_of as ros2_fault
 from gripmon.io.sources import LiveSettings, NetworkSettings, SimulatedScene, SimulatedSettings
 from gripmon.io.wire import Joining
 from gripmon.judge.statefile import AUTO, Owner, calibration_of, default_path

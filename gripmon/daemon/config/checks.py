@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gripmon.daemon.config.settings import JawSettings, ReferenceSettings, SecondSettings, Settings
 from gripmon.daemon.config.typed import Fault, SettingsError
 from gripmon.io.metrics import package_fault
-from gripmon.io.ros2 import JOINT_STATE, Ros2Missing, RosNameError, network_of, subscription_key
-from gripmon.io.ros2.types import typestore
+from gripmon.io.ros2.names import RosNameError, network_of, subscription_key
+from gripmon.io.ros2.node import JOINT_STATE, Ros2Missing, typestore
 from gripmon.io.sources import (
     FolderSettings,
     LiveSettings,

@@ -11,14 +11,13 @@ from gripmon.daemon.config.checks import network_fault, source_fault
 from gripmon.daemon.config.settings import SecondSettings
 from gripmon.daemon.config.typed import ConfigError, Fault
 from gripmon.daemon.config.yaml_file import read_document, read_settings, read_yaml
-from gripmon.io.sources import FolderSettings, SimulatedSettings, SourceError, VideoSettings
-from gripmon.io.sources.pulses import read_pulses
-from gripmon.laser.pointer.document import LaserCalibration
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.pulses.told import Told
-from gripmon.laser.pulses.watching import PulsedWatch
-from gripmon.laser.watch import SpotWatchSettings
+from gripmon.io.sources import FolderSettings, SimulatedSettings, VideoSettings
+from gripmon.laser.judgement import SpotWatchSettings
+from gripmon.laser.matching import PulseSettings, ReportedPulse, read_pulses
+from gripmon.laser.setup import LaserCalibration
+from gripmon.laser.watching import PulsedWatch
 from gripmon.model.camera import Camera, make_camera
+from gripmon.model.errors import InputError
 
 SECTION = "laser"
 _OF_A_WRIST = ("gripper", "reference", "taught", "jaw", "monitor", "ros2", "state")
@@ -33,7 +32,7 @@ class SecondConfig:
     calibration_path: Path
     calibration: LaserCalibration
     camera: Camera
-    pulses: tuple[Told, ...] = ()
+    pulses: tuple[ReportedPulse, ...] = ()
 
     @property
     def directory(self) -> Path:
@@ -92,10 +91,10 @@ def read_laser(path: Path, calibration_path: Path) -> LaserCalibration:
     return calibration
 
 
-def _pulses(path: Path, name: str) -> tuple[Told, ...]:
+def _pulses(path: Path, name: str) -> tuple[ReportedPulse, ...]:
     try:
         return tuple(read_pulses(path.parent / name))
-    except SourceError as error:
+    except InputError as error:
         wrong, _, right = str(error).rpartition("; ")
         raise ConfigError(path, "laser.pulses", wrong, right) from None
 

@@ -9,12 +9,13 @@ from msgspec import Meta
 
 from gripmon.daemon.watch import DaemonSettings
 from gripmon.io.metrics import MetricsSettings
-from gripmon.io.ros2 import JointOpening, Ros2Settings
+from gripmon.io.ros2.names import Ros2Settings
+from gripmon.io.ros2.node import JointOpening
 from gripmon.io.sources import SourceSettings
 from gripmon.io.wire import PublishSettings
 from gripmon.judge.statefile import StateSettings
-from gripmon.laser.pulses.settings import PulseSettings
-from gripmon.laser.watch import SpotWatchSettings
+from gripmon.laser.judgement import SpotWatchSettings
+from gripmon.laser.matching import PulseSettings
 from gripmon.model.camera import LensSettings
 from gripmon.monitor import MonitorSettings
 from gripmon.record.write import RecordingSettings, ViewSettings

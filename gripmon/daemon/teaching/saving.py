@@ -14,8 +14,8 @@ import numpy as np
 import yaml
 
 from gripmon import __version__
-from gripmon.calibrate.detection.pictures import sharpest_blur_px, to_grey
-from gripmon.calibrate.detection.target import BLURRED_PX
+from gripmon.calibrate.detection import BLURRED_PX
+from gripmon.calibrate.lattice import sharpest_blur_px, to_grey
 from gripmon.daemon.config import ConfigError, load_config
 from gripmon.daemon.config.yaml_file import as_yaml, read_yaml, yaml_value
 from gripmon.daemon.teaching.inputs import Inputs, live_settings, read_rough

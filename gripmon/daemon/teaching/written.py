@@ -17,7 +17,7 @@ from gripmon.daemon.config import Config, Settings, load_config
 from gripmon.daemon.config.yaml_file import lines_of, yaml_value
 from gripmon.daemon.teaching.inputs import Inputs
 from gripmon.io.sources import FolderSettings, SourceError
-from gripmon.io.sources.folder import TIMESTAMPS_NAME, read_table
+from gripmon.io.sources.files import TIMESTAMPS_NAME, read_table
 from gripmon.model.atomic import write_atomically
 from gripmon.model.errors import InputError
 from gripmon.model.records import ReferenceRecord

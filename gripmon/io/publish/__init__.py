@@ -20,18 +20,17 @@ and an advanced subscriber with history (``zenoh.ext``).
 from __future__ import annotations
 
 from gripmon.io.publish.commands import PendingCommand, ZenohCommands
-from gripmon.io.publish.jaw import ZenohJaw
+from gripmon.io.publish.inputs import ZenohJaw, ZenohPulses
 from gripmon.io.publish.presence import Presence
 from gripmon.io.publish.publisher import (
     NullPublisher,
     Publisher,
+    Publishers,
     SpotPublisher,
     StatePublisher,
     ZenohPublisher,
     ZenohSpotPublisher,
 )
-from gripmon.io.publish.pulse import ZenohPulses
-from gripmon.io.publish.several import Publishers, SpotPublishers
 
 __all__ = [
     "NullPublisher",
@@ -40,7 +39,6 @@ __all__ = [
     "Publisher",
     "Publishers",
     "SpotPublisher",
-    "SpotPublishers",
     "StatePublisher",
     "ZenohCommands",
     "ZenohJaw",

@@ -10,10 +10,9 @@ from collections.abc import Callable
 import msgspec
 import zenoh
 
-from gripmon.io.publish.answers import Answers, send_now
-from gripmon.io.publish.presence import Presence, in_words
+from gripmon.io.publish.presence import Answers, Presence, in_words, send_now
 from gripmon.io.wire import Keys, Link
-from gripmon.io.wire.malformed import Malformed
+from gripmon.io.wire.link import Malformed
 from gripmon.model.records import (
     Command,
     CommandError,
@@ -30,12 +29,12 @@ from gripmon.model.records import (
 _log = logging.getLogger(__name__)
 
 TIMEOUT_S = 2.0
-"""So long the loop has for a command; then the asker is told that it has not answered."""
+"""Time that the loop has for a command; then the asker learns that it has not answered."""
 
 _WAITING_MOST = 16
 _REMEMBERED_MOST = 256
 _QUESTIONS = (CommandName.STATE, CommandName.SNAPSHOT)
-"""They change nothing, and their answers are large: asked again they are answered anew, not from memory."""
+"""They change nothing, and their answers are large: asked again they are answered afresh, not from memory."""
 
 _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command is not carried out")
 
@@ -43,7 +42,7 @@ _STOPPING = CommandError(CommandFault.STOPPING, "the monitor stops; the command 
 class PendingCommand:
     """A command, and all who wait for its answer: whoever sent it, perhaps several times under the same id.
 
-    It is carried out once at most.  Each asker is told once: the answer, or that the time is over.
+    It is carried out once at most.  Each asker gets one reply: the answer, or that the time is over.
     """
 
     def __init__(self, command: Command, timeout_s: float, answers: Answers, monitor_id: str = "") -> None:
@@ -139,7 +138,7 @@ class ZenohCommands:
 
     def close(self) -> None:
         """Tell those who still wait that the monitor stops."""
-        with self._lock:  # what is being taken in just now is told below, too
+        with self._lock:  # what is being taken in just now is answered below, too
             self._closed = True
         while (pending := self.poll()) is not None:
             pending.answer(_STOPPING)

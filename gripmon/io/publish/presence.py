@@ -1,4 +1,4 @@
-"""Which start of a monitor this is, and who else speaks under its name."""
+"""Which start of a monitor this is, who else speaks under its name, and the threads that answer queries."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import secrets
 import socket
 import threading
 import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import zenoh
 
@@ -45,7 +47,7 @@ class Presence:
         self._others: frozenset[str] = frozenset()
         self._lock = threading.Lock()  # guards it against Zenoh's other threads
         self._session: zenoh.Session | None = None
-        self._declared: object = None  # Zenoh undeclares what nobody refers to
+        self._declared: object = None  # Zenoh undeclares what has no reference left
         link.attach(self._attach, self._leave)
 
     def others(self) -> tuple[str, ...]:
@@ -53,10 +55,10 @@ class Presence:
         return tuple(sorted(self._others)) if self._others else ()
 
     def wait_alone(self, timeout_s: float = VANISHES_WITHIN_S) -> tuple[str, ...]:
-        """Before the own token is shown: who has the name and keeps it for ``timeout_s``; mostly nobody, at once.
+        """Before the own token is shown: who has the name and keeps it for ``timeout_s``; mostly no one, at once.
 
         A predecessor that was killed vanishes meanwhile.  An empty id is that of a version of gripmon without ids.
-        Nobody is found while there is no connection: then :meth:`others` says it later.
+        Without a connection no one is found: :meth:`others` shows them later.
         """
         if not self._connected():
             return ()
@@ -121,3 +123,70 @@ def in_words(others: tuple[str, ...]) -> str:
 def _id_in(key: object) -> str:
     """The id in a token's key; empty for the token without one."""
     return str(key).partition("/alive")[2].lstrip("/")
+
+
+_AT_ONCE = 2
+_WAITING_MOST = 64
+_REFUSED_MOST = 4096
+"""Queries beyond the waiting ones that get the answer that too many wait: seconds of a flood, at some bytes each."""
+_CLOSE_WITHIN_S = 1.0
+
+
+class Answers:
+    """A few threads that send replies.
+
+    How long a reply waits for a congested link is the asker's choice in Zenoh.  By default it waits until the link is
+    given up: an asker that was stopped costs 5 to 10 s, which neither the loop nor Zenoh's own threads have.
+    """
+
+    def __init__(self, name: str, busy: Callable[[zenoh.Query], None] | None = None) -> None:
+        """``busy`` tells an asker that too many wait; without it such a query ends unanswered."""
+        # Its threads end with the process, also if it is never closed, but none in the middle of a call into Zenoh.
+        self._pool = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix=f"gripmon-{name}")
+        self._busy = busy
+        self._refusals = ThreadPoolExecutor(1, thread_name_prefix=f"gripmon-{name}-busy")
+        self._refused: set[Future[None]] = set()
+        self._lock = threading.Lock()
+        self._under_way: set[Future[None]] = set()
+        self._closed = False
+
+    def send(self, query: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
+        """Let ``reply`` answer the query, soon; where too many wait, it answers that instead.  Once closed: at once."""
+        future: Future[None] | None = None
+        with self._lock:
+            closed = self._closed
+            if not closed and len(self._under_way) < _WAITING_MOST:
+                future = self._pool.submit(send_now, query, reply)
+                self._under_way.add(future)
+            elif not closed and self._busy is not None and len(self._refused) < _REFUSED_MOST:
+                future = self._refusals.submit(send_now, query, self._busy)
+                self._refused.add(future)
+        if future is not None:
+            future.add_done_callback(self._done)
+        elif closed:
+            send_now(query, reply)
+        else:
+            query.drop()
+
+    def close(self) -> None:
+        """Give what is under way a second."""
+        with self._lock:
+            self._closed, under_way = True, set(self._under_way)
+        wait(under_way, _CLOSE_WITHIN_S)
+        self._pool.shutdown(wait=False)
+        self._refusals.shutdown(wait=False)
+
+    def _done(self, future: Future[None]) -> None:
+        with self._lock:
+            self._under_way.discard(future)
+            self._refused.discard(future)
+
+
+def send_now(query: zenoh.Query, reply: Callable[[zenoh.Query], None]) -> None:
+    """Let ``reply`` answer the query in this thread, however long it takes."""
+    try:
+        reply(query)
+    except Exception as error:  # noqa: BLE001  mostly the asker, or the session, is gone
+        _log.debug("no answer on %s", query.key_expr, exc_info=error)
+    finally:
+        query.drop()

@@ -1,18 +1,18 @@
-"""What a monitor says on the network."""
+"""What a monitor says on the network, and several publishers in place of one."""
 
 from __future__ import annotations
 
+import logging
 import threading
 import uuid
 from collections import deque
-from collections.abc import Callable
-from typing import Protocol, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, TypeVar
 
 import msgspec
 import zenoh
 
-from gripmon.io.publish.answers import Answers
-from gripmon.io.publish.presence import Presence
+from gripmon.io.publish.presence import Answers, Presence
 from gripmon.io.wire import CLOCK_PARAMETER, Keys, Link, check_name, steady_ns
 from gripmon.model.records import (
     AlertRecord,
@@ -23,6 +23,8 @@ from gripmon.model.records import (
     StateRecord,
     to_json,
 )
+
+_log = logging.getLogger(__name__)
 
 _T = TypeVar("_T", FrameRecord, StateRecord, AlertRecord, SpotRecord)
 _JSON = zenoh.Encoding.APPLICATION_JSON
@@ -66,7 +68,7 @@ class _ZenohStates:
     """What all publishers on a link share: states, alerts, and the records that wait for the link to open."""
 
     def __init__(self, link: Link, robot: str, camera: str, presence: Presence | None = None) -> None:
-        """``presence``: whose id stands in everything that is said.  Raises ValueError for a name that can't be part of
+        """``presence``: whose id stands in every message.  Raises ValueError for a name that can't be part of
         a key.
         """
         self.keys = Keys(check_name("robot", robot), check_name("camera", camera))
@@ -256,7 +258,6 @@ class _Wire:
         self._answers = Answers("latest", _too_many_ask)
         alerts = _keeping_publisher(session, keys["alert"], zenoh.Priority.INTERACTIVE_HIGH, kept=_ALERTS_KEPT)
         self.puts: dict[str, Callable[[bytes], None]] = {"alert": alerts.put}
-        self.values: dict[str, _LastValue] = {}
         self.declare_kept("state")
         self._alive: list[zenoh.LivelinessToken] = []
 
@@ -269,27 +270,78 @@ class _Wire:
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
-        self._add(leaf, publisher, _TimedStream)
+        self.puts[leaf] = _TimedStream(self._session, self._keys[leaf], publisher, self._answers).put
 
     def declare_kept(self, leaf: str, kept: int = 1) -> None:
         """A key whose last ``kept`` messages are there for who comes late."""
         publisher = _keeping_publisher(self._session, self._keys[leaf], zenoh.Priority.DATA_HIGH, kept)
-        self._add(leaf, publisher)
+        self.puts[leaf] = _LastValue(self._session, self._keys[leaf], publisher, self._answers).put
 
     def appear(self) -> None:
         """Show the liveliness tokens, when all is declared: the one that every monitor has, and that of this start."""
         self._alive = [self._session.liveliness().declare_token(key) for key in self._tokens]
 
-    def _add(
-        self,
-        leaf: str,
-        publisher: zenoh.Publisher | zenoh.ext.AdvancedPublisher,
-        kind: type[_LastValue] = _LastValue,
-    ) -> None:
-        self.values[leaf] = kind(self._session, self._keys[leaf], publisher, self._answers)
-        self.puts[leaf] = self.values[leaf].put
-
     def close(self) -> None:
         for token in reversed(self._alive):
             token.undeclare()
         self._answers.close()
+
+
+class Publishers:
+    """Hands each record to the first publisher and then to those of the others that take such records.
+
+    What the first raises is raised, after the others had the record.  What another one raises never reaches the caller:
+    it is logged once, until it changes, and :meth:`fault` says it.
+    """
+
+    def __init__(self, first: Any, others: Mapping[str, StatePublisher]) -> None:
+        """``first``: a :class:`Publisher` or a :class:`SpotPublisher`; ``others`` by their names in messages."""
+        self._first, self._others = first, others
+        self._faults: dict[tuple[str, str], str] = {}  # by publisher and method, of which one may work and one not
+
+    def transform(self, record: FrameRecord) -> None:
+        self._hand("transform", record)
+
+    def reference(self, record: ReferenceRecord) -> None:
+        self._hand("reference", record)
+
+    def spot(self, record: SpotRecord) -> None:
+        self._hand("spot", record)
+
+    def state(self, record: StateRecord) -> None:
+        self._hand("state", record)
+
+    def alert(self, record: AlertRecord) -> None:
+        self._hand("alert", record)
+
+    def close(self) -> None:
+        """Close all, the first last."""
+        for name in self._others:
+            self._hand_other(name, "close")
+        self._first.close()
+
+    def fault(self) -> str:
+        """What is wrong with the others, in a few words for a person; empty if nothing is."""
+        return "; ".join(dict.fromkeys(self._faults.values()))
+
+    def _hand(self, what: str, record: object) -> None:
+        try:
+            getattr(self._first, what)(record)
+        finally:
+            for name in self._others:
+                self._hand_other(name, what, record)
+
+    def _hand_other(self, name: str, what: str, *values: object) -> None:
+        put = getattr(self._others[name], what, None)
+        if put is None:
+            return
+        try:
+            put(*values)
+        except Exception as error:  # noqa: BLE001  said here and in the state
+            text = f"{name} fails: {' '.join(str(error).split()) or type(error).__name__}"
+            if self._faults.get((name, what)) != text:
+                _log.error("%s", text)
+                _log.debug("%s", name, exc_info=error)
+            self._faults[name, what] = text
+        else:
+            self._faults.pop((name, what), None)

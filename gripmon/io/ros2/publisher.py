@@ -1,32 +1,187 @@
-"""The monitor as a ROS 2 node."""
+"""The monitor as a ROS 2 node: its records as messages."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from gripmon.io.ros2.messages import Messages, inverse
-from gripmon.io.ros2.names import Qos
-from gripmon.io.ros2.node import Node, TopicPublisher
-from gripmon.io.ros2.settings import Layout, Ros2Settings
-from gripmon.io.ros2.types import DIAGNOSTICS, POSE, TF
+import numpy as np
+
+from gripmon.io.ros2.names import Layout, Qos, Ros2Settings
+from gripmon.io.ros2.node import DIAGNOSTICS, POSE, TF, Node, TopicPublisher, prepare, typestore
 from gripmon.io.wire import Link
+from gripmon.model.geometry import from_record, invert, skew, to_record
 from gripmon.model.records import (
     AlertEvent,
     AlertRecord,
+    Array,
     FrameRecord,
+    Protection,
     ReferenceRecord,
+    Severity,
     StandingAlert,
+    State,
     StateRecord,
     Transform,
+    Verdict,
 )
 
 if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
+
+OK, WARN, ERROR, STALE = range(4)
+"""Levels of ``diagnostic_msgs/DiagnosticStatus``."""
+
+_NS = 1_000_000_000
+_OF_VERDICT = {Verdict.VALID: OK, Verdict.SUSPECT: WARN, Verdict.UNKNOWN: ERROR}
+_OF_SEVERITY = {Severity.INFO: OK, Severity.WARNING: WARN, Severity.ERROR: ERROR}
+
+
+def inverse(cam_T_grip: Transform, covariance: Iterable[float]) -> tuple[Transform, Array]:
+    """``grip_T_cam`` and its covariance (36,), of the camera's position in gripper axes (m²), then of the rotation
+    error vector in gripper axes (rad²).
+
+    From ``t_true = t + rho`` and ``R_true = exp(omega) R`` follows to first order, for the inverse, ``rho' = -R^T rho -
+    R^T [t]x omega`` and ``omega' = -R^T omega``.
+    """
+    transform = from_record(cam_T_grip)
+    rotation = transform[:3, :3].T
+    jacobian = np.zeros((6, 6))
+    jacobian[:3, :3] = jacobian[3:, 3:] = -rotation
+    jacobian[:3, 3:] = -rotation @ skew(transform[:3, 3])
+    matrix = np.fromiter(covariance, float, 36).reshape(6, 6)
+    return to_record(invert(transform)), (jacobian @ matrix @ jacobian.T).ravel()
+
+
+class Messages:
+    """Makes the messages of one camera; ``transform`` stands for ``parent_T_child``."""
+
+    def __init__(self, parent_frame: str, child_frame: str) -> None:
+        """Raises :class:`gripmon.io.ros2.node.Ros2Missing`."""
+        self._parent, self._child = parent_frame, child_frame
+        prepare(TF, POSE, DIAGNOSTICS)
+        types = typestore().types
+        self._time = types["builtin_interfaces/msg/Time"]
+        self._header = types["std_msgs/msg/Header"]
+        self._vector, self._quaternion = types["geometry_msgs/msg/Vector3"], types["geometry_msgs/msg/Quaternion"]
+        self._transform, self._stamped = (
+            types["geometry_msgs/msg/Transform"],
+            types["geometry_msgs/msg/TransformStamped"],
+        )
+        self._tf = types["tf2_msgs/msg/TFMessage"]
+        self._point, self._pose = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Pose"]
+        self._with_covariance = types["geometry_msgs/msg/PoseWithCovariance"]
+        self._pose_stamped = types["geometry_msgs/msg/PoseWithCovarianceStamped"]
+        self._key_value = types["diagnostic_msgs/msg/KeyValue"]
+        self._status = types["diagnostic_msgs/msg/DiagnosticStatus"]
+        self._diagnostics = types["diagnostic_msgs/msg/DiagnosticArray"]
+
+    def header(self, stamp_ns: int, frame: str | None = None) -> Any:
+        """``std_msgs/Header`` in the parent frame, or another."""
+        return self._header(self._time(*divmod(stamp_ns, _NS)), self._parent if frame is None else frame)
+
+    def tf(self, header: Any, transform: Transform) -> Any:
+        """``tf2_msgs/TFMessage``: the child's pose in the parent."""
+        placed = self._transform(self._vector(*transform.translation_m), self._quaternion(*transform.rotation_xyzw))
+        return self._tf([self._stamped(header, self._child, placed)])
+
+    def pose(self, header: Any, transform: Transform, covariance: Iterable[float]) -> Any:
+        """``geometry_msgs/PoseWithCovarianceStamped``.
+
+        ROS means by its covariance what ours is: x, y, z, then rotations about x, y, z, all in the axes of the header's
+        frame, row by row.
+        """
+        pose = self._pose(self._point(*transform.translation_m), self._quaternion(*transform.rotation_xyzw))
+        return self._pose_stamped(header, self._with_covariance(pose, np.fromiter(covariance, np.float64, 36)))
+
+    def diagnostics(
+        self, name: str, state: StateRecord, frame: FrameRecord | None, alerts: Sequence[StandingAlert], broadcast: str
+    ) -> Any:
+        """``diagnostic_msgs/DiagnosticArray`` with one status.
+
+        ``frame`` is the newest, ``alerts`` are those that are open, ``broadcast`` says whether tf has the transform.
+        """
+        status = self._status(
+            level_of(state, alerts),
+            name,
+            summary_of(state, alerts),
+            f"{state.robot}/{state.camera}",
+            [self._key_value(key, value) for key, value in values_of(state, frame, alerts, broadcast)],
+        )
+        return self._diagnostics(self.header(state.stamp_ns, frame=""), [status])
+
+
+def level_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> int:
+    """Stale without frames; else the worst of the verdict, what the state complains of, and the open alerts that nobody
+    has acknowledged.
+    """
+    if state.state is State.STALE:
+        return STALE
+    levels = [_OF_SEVERITY[alert.severity] for alert in alerts if not alert.acknowledged]
+    return max(_OF_VERDICT[state.verdict], WARN if state.message else OK, *levels, OK)
+
+
+def summary_of(state: StateRecord, alerts: Iterable[StandingAlert]) -> str:
+    """One line for a person."""
+    said = [f"{state.state}, transform {state.verdict}", state.message, *(alert.text for alert in alerts)]
+    return "; ".join(part for part in said if part)
+
+
+def values_of(
+    state: StateRecord, frame: FrameRecord | None, alerts: Iterable[StandingAlert], broadcast: str
+) -> list[tuple[str, str]]:
+    """The keys and values of the status."""
+    values = [
+        ("state", str(state.state)),
+        ("verdict", str(state.verdict)),
+        ("broadcast", broadcast),
+        ("reference", state.reference_id),
+        ("revision", str(state.revision)),
+    ]
+    if frame is not None:
+        values.append(("frame age (s)", f"{1e-9 * (state.stamp_ns - frame.stamp_ns):.3f}"))
+        values.append(("reason", frame.reason or ""))
+    if state.tcp_shift_m is not None:
+        shift_mm = [1e3 * m for m in state.tcp_shift_m]
+        values.append(("tcp shift (mm)", f"{math.hypot(*shift_mm):.4f}"))
+        values.append(("tcp shift x y z in the camera frame (mm)", " ".join(f"{mm:.4f}" for mm in shift_mm)))
+    if frame is not None and frame.drift is not None:
+        values.append(("rotation (deg)", f"{math.degrees(frame.drift.rotation_rad):.4f}"))
+    if state.sigma_m is not None:
+        values.append(("position sigma (mm)", f"{1e3 * state.sigma_m:.4f}"))
+    values += _bounds_of(state, None if frame is None else frame.protection)
+    values += [
+        ("alerts", ", ".join(f"{alert.kind} ({alert.severity})" for alert in alerts)),
+        ("camera connected", str(state.camera_connected).lower()),
+        ("frames per s", f"{state.frames_per_s:.2f}"),
+        ("frames", str(state.frames)),
+        ("frames refused", str(state.frames_refused)),
+        ("frames dropped", str(state.frames_dropped)),
+        ("uptime (s)", f"{state.uptime_s:.0f}"),
+        ("version", state.version),
+    ]
+    return values
+
+
+def _bounds_of(state: StateRecord, protection: Protection | None) -> list[tuple[str, str]]:
+    """How far off the newest transform may be, at which risk, and how far off it is allowed to be."""
+    values = []
+    if protection is not None:
+        values = [
+            ("protection level (mm)", f"{1e3 * protection.position_m:.4f}"),
+            ("rotation protection level (deg)", f"{math.degrees(protection.rotation_rad):.4f}"),
+            ("integrity risk per frame", f"{protection.risk:g}"),
+            ("hypothesis", protection.hypothesis),
+        ]
+    if state.alert_limit_m is not None:
+        values.append(("alert limit (mm)", f"{1e3 * state.alert_limit_m:g}"))
+    return values
+
 
 _TF_QOS = Qos(depth=100)
 """That of ``tf2_ros``' broadcasters: reliable, volatile, keep last 100."""
@@ -52,11 +207,11 @@ class Ros2Publisher:
     Transforms with one of the verdicts that the settings name go to tf and to the pose topic, stamped with the frame's
     capture time; one that waited in the monitor does not.  Diagnostics go out with every state record (once a second
     and on every change) and every alert.  While the link isn't open, nothing is kept: what comes late to tf is old, and
-    diagnostics are said again.
+    diagnostics are sent again.
     """
 
     def __init__(self, link: Link, settings: Ros2Settings, layout: Layout) -> None:
-        """Raises :class:`gripmon.io.ros2.Ros2Missing` without ``rosbags``."""
+        """Raises :class:`gripmon.io.ros2.node.Ros2Missing` without ``rosbags``."""
         self._layout = layout
         self._verdicts = frozenset(settings.verdicts)
         self._smoothed = settings.transform == "smoothed"
@@ -144,7 +299,7 @@ class Ros2Publisher:
         return self._topics
 
     def _adopt(self, session: zenoh.Session) -> None:
-        """Enter the graph.  Others wait for the session, too: what goes wrong here is said later."""
+        """Enter the graph.  Others wait for the session, too: what goes wrong here is reported later."""
         import zenoh
 
         layout = self._layout

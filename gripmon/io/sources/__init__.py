@@ -10,12 +10,10 @@ from pathlib import Path
 import msgspec
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, FullScale, OpenedSource, Source, SourceError, Waiting
-from gripmon.io.sources.folder import FolderSettings, FolderSource
-from gripmon.io.sources.live import LiveCamera, LiveSettings
+from gripmon.io.sources.files import FolderSettings, FolderSource, VideoSettings, VideoSource
+from gripmon.io.sources.live import LiveCamera, LiveSettings, NewestFrame
 from gripmon.io.sources.network import NetworkCamera, NetworkSettings, network_key
-from gripmon.io.sources.newest import NewestFrame
 from gripmon.io.sources.simulated import SimulatedScene, SimulatedSettings, make_simulator, open_simulated
-from gripmon.io.sources.video import VideoSettings, VideoSource
 from gripmon.io.wire import Keys, Link
 
 SourceSettings = SimulatedSettings | FolderSettings | VideoSettings | LiveSettings | NetworkSettings

@@ -1,4 +1,4 @@
-"""A camera on the network: frames that its driver puts on a Zenoh key, or on a ROS 2 topic."""
+"""A camera on the network: frames that its driver puts on a Zenoh key, or on a ROS 2 topic, and how late they are."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 import msgspec
 
 from gripmon.io.sources.base import READ_TIMEOUT_S, SourceError, Waiting
-from gripmon.io.sources.lateness import MOST_LATE_S, Lateness
 from gripmon.io.sources.payload import (
     JPEG,
     PNG,
@@ -22,8 +21,8 @@ from gripmon.io.sources.payload import (
     read_note,
 )
 from gripmon.io.wire import Link
-from gripmon.io.wire.malformed import Malformed
-from gripmon.io.wire.settings import KEY_PATTERN
+from gripmon.io.wire.link import Malformed
+from gripmon.io.wire.session import KEY_PATTERN
 from gripmon.model.records import Frame, FrameNote, Image, Refusal, largest_bytes
 
 if TYPE_CHECKING:
@@ -72,7 +71,7 @@ class NetworkSettings(
 
 
 class Content(NamedTuple):
-    """What is in a payload; ``stamp_ns`` None where nobody says when it was captured."""
+    """What is in a payload; ``stamp_ns`` None where it is not known when it was captured."""
 
     image: Image
     stamp_ns: int | None
@@ -87,7 +86,7 @@ class PayloadDecoder:
         self._format, self._size_px = frame_format, size_px
         self.largest_bytes = _MOST_PIXEL_BYTES * size_px[0] * size_px[1] + _PADDING_BYTES
         if frame_format in ROS_FORMATS:
-            from gripmon.io.ros2.types import Ros2Missing, typestore
+            from gripmon.io.ros2.node import Ros2Missing, typestore
 
             try:
                 typestore()  # now, not with the first frame: it takes a while
@@ -123,7 +122,7 @@ class PayloadDecoder:
         return "raw"
 
     def _of_ros(self, payload: bytes) -> Content:
-        from gripmon.io import ros2
+        from gripmon.io.ros2 import node as ros2
 
         try:
             if self._format == "ros2_image":
@@ -331,10 +330,42 @@ def network_key(settings: NetworkSettings, image_key: str) -> str:
         raise SourceError("topic: has no effect beside key; one of them")
     if not ros:
         raise SourceError(f"format: {settings.format} doesn't come on a ROS 2 topic; {' or '.join(ROS_FORMATS)}")
-    from gripmon.io import ros2
+    from gripmon.io.ros2 import names, node
 
-    message = ros2.IMAGE if settings.format == "ros2_image" else ros2.COMPRESSED_IMAGE
+    message = node.IMAGE if settings.format == "ros2_image" else node.COMPRESSED_IMAGE
     try:
-        return ros2.subscription_key(settings.domain_id, settings.topic, message)
-    except ros2.RosNameError as error:
+        return names.subscription_key(settings.domain_id, settings.topic, message)
+    except names.RosNameError as error:
         raise SourceError(f"topic: {error}") from None
+
+
+MOST_LATE_S = 3.0
+"""Stamps further off than this, at best, are of another time or clock: what they say of now is no use."""
+
+WINDOW_S = 60.0
+"""The fastest frame of the last one to two windows is what others are held against.  Long enough to have one that did
+not wait; a driver's clock that was set is lived with after two of them."""
+
+_FAR_NS = 2**63
+
+
+class Lateness:
+    """Holds each frame's (arrival - stamp) against the smallest of late.
+
+    What it is over that, the frame has waited for certain.  It may be more: the fastest one may have waited, too.
+    """
+
+    def __init__(self) -> None:
+        self._smallest_ns = self._before_ns = _FAR_NS  # of this window and of the one before
+        self._window_ends_ns: int | None = None
+
+    def waited_ns(self, stamp_ns: int, arrived_ns: int, unix_ns: int) -> int:
+        """``arrived_ns`` by the monotonic clock, ``unix_ns`` the same by this machine's clock."""
+        late_ns = arrived_ns - stamp_ns
+        if self._window_ends_ns is None or arrived_ns >= self._window_ends_ns:
+            self._before_ns, self._smallest_ns = self._smallest_ns, _FAR_NS
+            self._window_ends_ns = arrived_ns + round(1e9 * WINDOW_S)
+        self._smallest_ns = min(self._smallest_ns, late_ns)
+        waited_ns = late_ns - min(self._smallest_ns, self._before_ns)
+        fastest_ns = unix_ns - stamp_ns - waited_ns
+        return waited_ns if abs(fastest_ns) < 1e9 * MOST_LATE_S else 0

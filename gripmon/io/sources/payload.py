@@ -82,7 +82,7 @@ def file_image(payload: bytes, expected_px: tuple[int, int]) -> Image:
             _check_png(payload)
             with _open_file(payload) as checked:
                 check_size(checked.size, expected_px)
-                checked.verify()  # the check sums; the file has to be opened anew after it
+                checked.verify()  # the check sums; the file has to be opened again after it
         elif payload.count(b"\xff\xda") > MOST_SCANS:
             raise PayloadError(f"a JPEG of more than {MOST_SCANS} scans; a usual one")
         with _open_file(payload) as file:
@@ -108,7 +108,7 @@ def _pillow() -> tuple[type[ImageFile], type[ImageFile]]:
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile
 
-    # Damaged metadata, which nobody reads here, would be a line on stderr for every frame.
+    # Damaged metadata, which is not read here, would be a line on stderr for every frame.
     warnings.filterwarnings("ignore", module=r"PIL\.")
     return JpegImageFile, PngImageFile
 

@@ -290,7 +290,7 @@ def _deliver(
     while schedule.end is None or index < schedule.end:
         if _sleep_until(start_s + index / schedule.fps, commands):
             return
-        # A full pipe: nobody has read for long.  This frame counts as dropped, like the older ones that it overwrote.
+        # A full pipe: it was not read for long.  This frame counts as dropped, like the older ones that it overwrote.
         with contextlib.suppress(BlockingIOError):
             announce.send(_Announcement(index, start_ns + round(index * _NS / schedule.fps), opening_m))
         index = schedule.following(index, time.monotonic() - start_s)

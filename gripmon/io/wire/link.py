@@ -1,20 +1,27 @@
-"""A session that may open later, and those who wait for it."""
+"""A session that may open later, with those who wait for it; a router in this process; messages that were malformed."""
 
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
-from gripmon.io.wire.endpoints import endpoints
-from gripmon.io.wire.files import said
-from gripmon.io.wire.reach import missing
-from gripmon.io.wire.session import open_session, zenoh_config
-from gripmon.io.wire.settings import PublishSettings
-from gripmon.io.wire.zenoh_errors import in_short
+from gripmon.io.wire.session import (
+    PublishSettings,
+    ZenohFileError,
+    endpoints,
+    endpoints_fault,
+    in_short,
+    load_file,
+    open_session,
+    said,
+    zenoh_config,
+)
 
 if TYPE_CHECKING:
     import zenoh
@@ -153,3 +160,177 @@ class Link:
             else:
                 session.close()
             return
+
+
+_LOCATOR = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
+_PORT = re.compile(r"(?P<host>.*):(?P<port>\d+)")
+_NUMERIC = re.compile(r"[\d.]+|\[[0-9a-fA-F:.%]+\]")
+
+
+def missing(session: zenoh.Session, endpoints: Iterable[str], *, one_is_enough: bool) -> str:
+    """Whom of these the session has no link to, in words; empty if that is as it should be.
+
+    Takes some microseconds: the session only looks at what it knows.
+    """
+    far_ends = [link.dst for link in session.info.links()]
+    if one_is_enough:
+        return "" if far_ends else " or ".join(endpoints) or "a router"
+    return ", ".join(endpoint for endpoint in endpoints if not any(is_at(far_end, endpoint) for far_end in far_ends))
+
+
+def is_at(locator: str, endpoint: str) -> bool:
+    """Can a link's far end be what this endpoint names?  A host's name isn't looked up: its port is enough."""
+    far, named = _LOCATOR.match(locator), _LOCATOR.match(endpoint)
+    if far is None or named is None or far["protocol"] != named["protocol"]:
+        return False
+    far_place, named_place = _PORT.fullmatch(far["address"]), _PORT.fullmatch(named["address"])
+    if far_place is None or named_place is None:
+        return far["address"] == named["address"]
+    if far_place["port"] != named_place["port"]:
+        return False
+    return far_place["host"] == named_place["host"] or not _NUMERIC.fullmatch(named_place["host"])
+
+
+class Router:
+    """Routes from construction to :meth:`close`."""
+
+    def __init__(self, path: Path) -> None:
+        """``path``: a json5 or yaml file of Zenoh's.  Raises :class:`ZenohFileError`."""
+        import zenoh
+
+        config = load_file(path, default_mode="router")
+        if (mode := said(config, "mode")) != "router":
+            raise ZenohFileError(f"{path}: mode: {mode} doesn't route; router")
+        self.listens_on = _endpoints(said(config, "listen/endpoints"))
+        if not self.listens_on:
+            raise ZenohFileError(f'{path}: listen.endpoints: there is none; e.g. ["tcp/127.0.0.1:7447"]')
+        if fault := endpoints_fault(config):
+            raise ZenohFileError(f"{path}: {fault[0]}.endpoints: {fault[1]}")
+        self._connects_to = endpoints(config, "connect")
+        config.insert_json5("listen/exit_on_failure", "true")
+        try:
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            if taken := re.search(r"bound to (\S+?): .*Address already in use", str(error)):
+                remedy = "stop the program that has it, or choose another port"
+                raise ZenohFileError(f"{path}: listen.endpoints: {taken[1]} is already in use; {remedy}") from error
+            raise ZenohFileError(f"{path}: can't route: {in_short(error)}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def fault(self) -> str:
+        """Whom it should be connected to and isn't, in a few words for a person; empty if all is well."""
+        places = missing(self._session, self._connects_to, one_is_enough=False)
+        return f"no connection to {places}, trying again" if places else ""
+
+    def close(self) -> None:
+        """Leave the network and free the port."""
+        self._session.close()
+
+
+def _endpoints(listed: object) -> tuple[str, ...]:
+    if isinstance(listed, dict):
+        listed = listed.get("router")
+    return tuple(map(str, listed)) if isinstance(listed, list) else ()
+
+
+REMEMBERED_S = 60.0
+"""So long after the last one it is still said; one that comes later is a new occasion."""
+
+CALM_S = 3.0
+"""Good ones for so long, and nothing else: it is no longer said."""
+
+_LONGEST_REASON = 200
+_MOST_KINDS = 8  # of reasons; a stranger may make up any number
+_OTHERS = "any other"
+_FIGURES = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
+
+
+class Malformed:
+    """Counts the payloads on a key that could not be used.
+
+    An occasion ends when none has come for :data:`REMEMBERED_S`; :meth:`fault` is silent sooner, when good ones have
+    come for :data:`CALM_S`, and what comes after such a calm counts from one.  The log gets one line an occasion for
+    each of the first few kinds of reasons, and the words of :meth:`fault`, with the most frequent reason, change only
+    when the count passes a power of ten, so that no one can fill a log, or keep the network busy, by sending rubbish.
+    Any thread may call.
+    """
+
+    def __init__(self, what: str, key: str) -> None:
+        """``what`` has been sent, in the singular: ``frame``."""
+        self._what, self._key = what, key
+        self._lock = threading.Lock()
+        self._count = self._here = 0
+        self._reason = ""
+        self._kinds: Counter[str] = Counter()  # since the last calm: of reasons without their figures
+        self._examples: dict[str, str] = {}
+        self._logged: set[str] = set()  # kinds, of this occasion
+        self._last_s = self._good_s = 0.0
+
+    @property
+    def count(self) -> int:
+        """All of them."""
+        return self._count
+
+    def add(self, reason: str) -> None:
+        """One more; ``reason`` may hold what a stranger sent."""
+        now_s = time.monotonic()
+        with self._lock:
+            if now_s - self._last_s > REMEMBERED_S:
+                self._logged.clear()
+                self._examples.clear()
+            if self._is_over(now_s):
+                self._here, self._kinds = 0, Counter()
+            kind = self._kind(reason)
+            before = _roughly(self._here)
+            self._count += 1
+            self._here += 1
+            self._kinds[kind] += 1
+            self._last_s = now_s
+            if _roughly(self._here) != before:
+                self._reason = self._examples[self._kinds.most_common(1)[0][0]]
+            is_new = kind not in self._logged
+            self._logged.add(kind)
+            said = f"malformed {self._what} on {self._key}: {_for_people(reason)}"
+        if is_new:
+            _log.warning("%s (said once)", said)
+
+    def _kind(self, reason: str) -> str:
+        """What is counted together: the reason without figures; the rest, where there are too many."""
+        text = _for_people(reason)
+        kind = _FIGURES.sub("", text)
+        if kind not in self._examples and len(self._examples) >= _MOST_KINDS:
+            kind = _OTHERS
+        self._examples.setdefault(kind, text)
+        return kind
+
+    def _is_over(self, now_s: float) -> bool:
+        return now_s - self._last_s > REMEMBERED_S or self._good_s - self._last_s > CALM_S
+
+    def good(self) -> None:
+        """One came that could be used."""
+        self._good_s = time.monotonic()
+
+    def fault(self) -> str:
+        """How many since the last calm, roughly, and the most frequent reason, for a person; empty if it is over."""
+        with self._lock:
+            if self._here == 0 or self._is_over(time.monotonic()):
+                return ""
+            several = "s" * (self._here > 1)
+            return f"{_roughly(self._here)} malformed {self._what}{several} on {self._key}: {self._reason}"
+
+
+def _roughly(count: int) -> str:
+    if count < 10:
+        return "1" if count == 1 else "some"
+    return f"over {10 ** (len(str(count)) - 1):,}"
+
+
+def _for_people(reason: str) -> str:
+    """One line of a bounded length that can't play tricks on a terminal."""
+    line = " ".join(reason[: 2 * _LONGEST_REASON].split())
+    return "".join(c if c.isprintable() else "?" for c in line[:_LONGEST_REASON])

@@ -1,18 +1,19 @@
-"""From settings to an open Zenoh session, with errors that name the key."""
+"""From settings to an open Zenoh session, with errors that name the key; the keys' names, and a clock that readers may
+compare with.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+import time
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import msgspec
 
-from gripmon.io.wire.endpoints import endpoints, endpoints_fault
-from gripmon.io.wire.files import ZenohFileError, load_file, said
-from gripmon.io.wire.settings import PublishError, PublishSettings, form_fault
-from gripmon.io.wire.zenoh_errors import in_short
+from gripmon.model.errors import InputError
 
 if TYPE_CHECKING:
     import zenoh
@@ -115,3 +116,284 @@ def open_session(config: zenoh.Config, settings: PublishSettings) -> zenoh.Sessi
             raise PublishError(keys[0], f"{taken[1]} is already in use; {remedy}") from error
         text = f"can't open a Zenoh session: {in_short(error)}"
         raise PublishError(" or publish.".join(keys), text) from error
+
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+_ENDPOINT_PATTERN = r"^(tcp|udp|tls|quic|ws|serial|unixsock-stream|unixpipe|vsock)/\S+$"
+_NAME = re.compile(r"[^/*$#?@\s][^/*$#?\s]*")
+KEY_PATTERN = r"^[^/*$#?\s]+(/[^/*$#?\s]+)*(?![\s\S])"
+"""A key as one may put on it: no wildcards, no blanks."""
+
+Endpoint = Annotated[
+    str, msgspec.Meta(pattern=_ENDPOINT_PATTERN, description="a Zenoh endpoint, e.g. tcp/127.0.0.1:7447")
+]
+
+
+class PublishError(InputError):
+    """The session can't be opened as configured; the text is ``key: what is wrong; what would be right``.
+
+    ``key`` is the one of the section ``publish``; ``text`` what follows it, for those who call it by another name.
+    """
+
+    def __init__(self, key: str, text: str, name: str = "") -> None:
+        super().__init__(f"{name or f'publish.{key}'}: {text}")
+        self.key, self.text = key, text
+
+
+class PublishSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How to join the network.  The default is a peer that listens on loopback only and does not look for others."""
+
+    enabled: Annotated[bool, msgspec.Meta(description="false: nothing is published")] = True
+    mode: Annotated[
+        Literal["peer", "client"],
+        msgspec.Meta(description="peer: listens and connects; client: connects to a router, and waits for it"),
+    ] = "peer"
+    listen: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="where a peer listens; empty: nowhere")] = (
+        DEFAULT_ENDPOINT,
+    )
+    connect: Annotated[tuple[Endpoint, ...], msgspec.Meta(description="peers or routers to connect to")] = ()
+    commands: Annotated[
+        bool, msgspec.Meta(description="true: whoever reaches the network may send commands (gripmon send)")
+    ] = True
+    multicast_scouting: Annotated[bool, msgspec.Meta(description="look for others by UDP multicast")] = False
+    zenoh_config: Annotated[
+        str | None, msgspec.Meta(description="path of a file of Zenoh's (json5, yaml) instead of the keys above")
+    ] = None
+    retry_first_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="whom to connect to isn't there, or is gone: first pause (s)")
+    ] = 0.1
+    retry_longest_s: Annotated[float, msgspec.Meta(gt=0.0, description="longest such pause; they double (s)")] = 1.0
+    jaw_max_age_s: Annotated[
+        float, msgspec.Meta(gt=0.0, description="a jaw opening received longer ago than this is not used (s)")
+    ] = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """The keys of one monitor: ``Keys("arm", "wrist")["state"]``.  For readers a name may be ``*``: any."""
+
+    robot: str
+    camera: str
+
+    def __post_init__(self) -> None:
+        for role, name in (("robot", self.robot), ("camera", self.camera)):
+            if name != "*":
+                check_name(role, name)
+
+    def __getitem__(self, leaf: str) -> str:
+        return f"gripmon/{self.robot}/{self.camera}/{leaf}"
+
+
+def form_fault(endpoint: object) -> str:
+    """What is wrong with an endpoint's form, and what would be right; empty if it can be one."""
+    if not isinstance(endpoint, str) or not re.fullmatch(_ENDPOINT_PATTERN.rstrip("$"), endpoint):
+        return f"{endpoint!r} is no endpoint; protocol/address, e.g. {DEFAULT_ENDPOINT}"
+    return ""
+
+
+def check_name(role: str, name: str) -> str:
+    """The name; raises ValueError unless it can be one chunk of a Zenoh key."""
+    if not _NAME.fullmatch(name):
+        raise ValueError(
+            f"{role} name {name!r} can't be part of a Zenoh key; give at least one character, none of them a space or "
+            "one of / * $ # ?, and no @ in front"
+        )
+    return name
+
+
+def check_key(key: str) -> str:
+    """The key; raises ValueError unless it is one that can be put on: a pattern might be many monitors' keys."""
+    if not re.match(KEY_PATTERN, key):
+        raise ValueError(f"key {key!r} is none; names with / between them, none empty, without * $ # ? or blanks")
+    return key
+
+
+MOST_DRIFT = 1e-3
+"""Two such clocks differ by at most this share of the time that passes: 500 ppm each.  An oscillator that is further
+off is beyond what NTP can correct (``MAXFREQ`` of Linux), so that machine could not keep any time.  Quartz has some 50.
+"""
+
+CLOCK_PARAMETER = "clock"
+"""A query for ``…/transform?clock`` asks what such a clock of the monitor shows."""
+
+_CLOCK = getattr(time, "CLOCK_MONOTONIC_RAW", time.CLOCK_MONOTONIC)  # NTP and PTP let the other one gain or lose
+
+
+def steady_ns() -> int:
+    """Nanoseconds since some moment, the same one for all processes of a machine until it is started again."""
+    return time.clock_gettime_ns(_CLOCK)
+
+
+_TLS = "transport/link/tls"
+_TLS_FILES = (
+    "root_ca_certificate",
+    "listen_private_key",
+    "listen_certificate",
+    "connect_private_key",
+    "connect_certificate",
+)
+_SECRETS = ("listen_private_key", "connect_private_key")
+
+
+class ZenohFileError(InputError):
+    """The file can't be used; the text is one line, ``file: key: what is wrong; what would be right``."""
+
+
+def load_file(path: Path, default_mode: str = "peer") -> zenoh.Config:
+    """The configuration in a json5 or yaml file.
+
+    The files that it names for TLS count from its folder.  Where it is silent, Zenoh would listen on all interfaces and
+    look for others by multicast; with gripmon it doesn't.  Raises :class:`ZenohFileError`.
+    """
+    import zenoh
+
+    if not path.is_file():
+        raise ZenohFileError(f"no file {path}; give a json5 or yaml file of Zenoh's")
+    try:
+        config = zenoh.Config.from_file(path)
+    except zenoh.ZError as error:
+        if _is_gripmons(path):
+            right = "one of Zenoh's, as those in configs/zenoh are"
+            raise ZenohFileError(f"{path}: this is gripmon's configuration, not Zenoh's; {right}") from error
+        raise ZenohFileError(f"{path}: {in_short(error)}") from error
+    if said(config, "mode") is None:
+        config.insert_json5("mode", _json(default_mode))
+    if said(config, "listen/endpoints") == said(zenoh.Config(), "listen/endpoints"):
+        config.insert_json5("listen/endpoints", "[]")
+    if said(config, "scouting/multicast/enabled") is None:
+        config.insert_json5("scouting/multicast/enabled", "false")
+    _find_tls_files(config, path)
+    return config
+
+
+def said(config: zenoh.Config, key: str) -> object:
+    """The value of a key, as plain Python values."""
+    return msgspec.json.decode(config.get_json(key))
+
+
+def _is_gripmons(path: Path) -> bool:
+    """Is it a configuration of ours, given in place of one of Zenoh's?  Only asked when Zenoh can't read it."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return len(set(re.findall(r"^(robot|camera|gripper|reference|monitor)\s*:", text, re.MULTILINE))) > 1
+
+
+def _find_tls_files(config: zenoh.Config, path: Path) -> None:
+    for name in _TLS_FILES:
+        key = f"{_TLS}/{name}"
+        value = said(config, key)
+        if not isinstance(value, str):
+            continue
+        file = path.parent / value
+        if not file.is_file():
+            raise ZenohFileError(f"{path}: {key}: no file {file}; {_remedy(name, file)}")
+        if name in _SECRETS and file.stat().st_mode & 0o077:
+            raise ZenohFileError(f"{path}: {key}: others may read {file}; chmod 600 {file}")
+        config.insert_json5(key, _json(str(file.resolve())))
+
+
+def _remedy(name: str, file: Path) -> str:
+    """Where a missing certificate or key is to come from: a second authority would not help."""
+    if name != "root_ca_certificate" and (file.parent / "ca-key.pem").is_file():
+        host = " --host ADDRESS" if name.startswith("listen") else ""
+        return f"gripmon certificates {file.stem.removesuffix('-key')} --out {file.parent}{host} makes it"
+    return "copy it from where the certificates were made (by gripmon certificates, once for all machines)"
+
+
+def _json(value: str) -> str:
+    return msgspec.json.encode(value).decode()
+
+
+_SOURCE_PLACE = re.compile(r"\s+at \S+\.rs:\d+\.?")
+_PARSER = re.compile(r"\s*--> (?P<line>\d+):(?P<column>\d+)\n.*\n\s*= (?P<text>.*)", re.DOTALL)
+_MESSAGE = re.compile(
+    r'.*?(?:Message \{ msg: |Error\()"(?P<text>(?:[^"\\]|\\.)*)"'
+    r"(?:.*?line: (?P<line>\d+), column: (?P<column>\d+))?.*",
+    re.DOTALL,
+)
+_SCANNER = re.compile(
+    r'.*Error \{.* problem: "(?P<text>(?:[^"\\]|\\.)*)".*problem_mark: Mark \{ line: (?P<line>\d+), '
+    r"column: (?P<column>\d+) \}.*",
+    re.DOTALL,
+)
+_UNREACHED = re.compile(r"Unable to connect to any of \[(?P<ends>.*)\]")
+_ENCRYPTED = ("tls/", "quic/")
+
+
+def in_short(error: zenoh.ZError) -> str:
+    """Zenoh's message on one line: ``line 3, column 5: what is wrong`` for a file, without its own data structures and
+    the places in its source files.
+    """
+    text = _SOURCE_PLACE.sub("", str(error))
+    for form in (_PARSER, _SCANNER, _MESSAGE):
+        if found := form.fullmatch(text):
+            place = f"line {found['line']}, column {found['column']}: " if found["line"] else ""
+            said = re.sub(r"expected struct \w+", "a mapping was expected", found["text"].replace('\\"', '"'))
+            return place + " ".join(said.split())
+    if found := _UNREACHED.search(text):
+        return _unreached(found["ends"])
+    return " ".join(text.split())
+
+
+def _unreached(ends: str) -> str:
+    """Whom there is no connection to, and what may be the reason: Zenoh says the same of all of them."""
+    endpoints = re.findall(r"Single\((.*?)\)(?=, |$)", ends) or [ends]
+    reason = "no program listens there"
+    if any(endpoint.startswith(_ENCRYPTED) for endpoint in endpoints):
+        reason += (
+            ", or the certificates don't fit: of another authority, expired, or the router's is not for this address"
+        )
+    return f"no connection to {' or '.join(endpoints)} ({reason})"
+
+
+_ADDRESS = re.compile(r"(?P<protocol>[^/]+)/(?P<address>[^?#]*)")
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
+_WITH_CERTIFICATE = ("tls", "quic")
+_LARGEST_PORT = 65535
+
+
+def endpoints(config: zenoh.Config, which: str) -> tuple[str, ...]:
+    """The endpoints that a session of this configuration has, of ``listen`` or ``connect``."""
+    listed = said(config, f"{which}/endpoints")
+    if isinstance(listed, dict):  # a list for each mode
+        listed = listed.get(said(config, "mode") or "peer")
+    # Zenoh allows an object in place of a text: {"endpoints": [...], "policy": ...}; what it means, only Zenoh knows.
+    return tuple(each for each in listed if isinstance(each, str)) if isinstance(listed, list) else ()
+
+
+def endpoint_fault(endpoint: str, *, listens: bool = False) -> str:
+    """What is wrong with an endpoint by itself, ``what is wrong; what would be right``; empty if nothing is.
+
+    A host's name isn't looked up, and other protocols than those of IP aren't judged.
+    """
+    parts = _ADDRESS.match(endpoint)
+    if parts is None or parts["protocol"] not in _WITH_PORT:
+        return ""
+    host, colon, port = parts["address"].rpartition(":")
+    if not host or (host.startswith("[") and not host.endswith("]")):
+        missing = "host" if colon and not host else "port"
+        return f"{endpoint} has no {missing}; host and port, e.g. {parts['protocol']}/127.0.0.1:7447"
+    first = 0 if listens else 1  # 0: any that is free
+    if not re.fullmatch(r"[0-9]+", port) or not first <= int(port[:9]) <= _LARGEST_PORT:
+        return f"{endpoint}: {port or 'nothing'} can't be a port; a whole number, {first} to {_LARGEST_PORT}"
+    return ""
+
+
+def endpoints_fault(config: zenoh.Config) -> tuple[str, str] | None:
+    """``listen`` or ``connect``, and what is wrong with one of these endpoints; None if nothing is."""
+    for which in ("listen", "connect"):
+        for endpoint in endpoints(config, which):
+            if fault := endpoint_fault(endpoint, listens=which == "listen"):
+                return which, fault
+    for endpoint in endpoints(config, "listen"):
+        if endpoint.partition("/")[0] in _WITH_CERTIFICATE and not _has_certificate(config):
+            right = (
+                f"listen_certificate and listen_private_key of {_TLS} in a file of Zenoh's (see gripmon certificates)"
+            )
+            return "listen", f"{endpoint} needs a certificate; {right}"
+    return None
+
+
+def _has_certificate(config: zenoh.Config) -> bool:
+    names = ("listen_private_key", "listen_certificate")
+    # The last two forms hold the thing itself instead of a file's name.
+    return all(any(said(config, f"{_TLS}/{name}{form}") for form in ("", "_base64")) for name in names)

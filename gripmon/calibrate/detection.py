@@ -1,0 +1,360 @@
+"""Calibration targets in images, whole or in part: fingers may stand on them.  Points to hundredths of a pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from gripmon.calibrate import chequers
+from gripmon.calibrate.chequers import bends
+from gripmon.calibrate.lattice import (
+    Grey,
+    Index,
+    edge_blur_px,
+    find_discs,
+    noise_of,
+    refined,
+    sharpest_blur_px,
+    to_bytes,
+    to_grey,
+)
+from gripmon.calibrate.sighting import NotFound, Sighting
+from gripmon.model.records import Array, Image
+from gripmon.model.targets import FEWEST, Charuco, Chequerboard, CircleGrid, Target, TargetError
+
+_CHARUCO = cv2.aruco.CharucoParameters()
+_CHARUCO.minMarkers = 1  # of the two beside a corner: fingers cover many, and the corner itself is measured here
+_Marked = tuple[cv2.aruco.CharucoBoard, Array, NDArray[np.intp], int]
+WINDOW = 0.42
+"""Radius of what is looked at about a corner, in squares."""
+TOO_BLURRED = 0.16
+"""Standard deviation of the edges' blur from which an image isn't measured in: in squares; with discs in gaps or radii,
+half as wide.
+"""
+BLURRED_PX = 3.0
+"""Standard deviation of the edges' blur from which it is reported."""
+
+
+def detect(image: Image, target: Target, name: str = "") -> Sighting | NotFound:
+    """Points of the target in an image (any that a camera delivers), or why there are none.
+
+    On a chequerboard or a lattice of discs any point may be the origin: nothing marks one.  :class:`TargetError` if
+    the target itself can't be (a dictionary that isn't there).
+    """
+    grey = to_grey(image)
+    if isinstance(target, Charuco):
+        return _charuco(grey, target, name)
+    return _discs(grey, target, name) if isinstance(target, CircleGrid) else _chequerboard(grey, target, name)
+
+
+def _charuco(grey: Grey, target: Charuco, name: str) -> Sighting | NotFound:
+    shown = to_bytes(grey)
+    board, corners, ids, marks = _marked_corners(shown, target)
+    if 2 * len(ids) < (target.columns - 1) * (target.rows - 1):
+        # In a mirrored board some marks look like others of the dictionary.
+        if len(_marked_corners(np.ascontiguousarray(shown[:, ::-1]), target)[2]) > max(len(ids), FEWEST["charuco"] - 1):
+            return NotFound("the board is mirrored; an image that isn't flipped")
+        if len(ids) < FEWEST["charuco"]:
+            said = f"{marks} marks and {len(ids)} corners of the board; at least {FEWEST['charuco']}"
+            return NotFound(_blurred(grey) or said)
+    plate = np.asarray(board.getChessboardCorners(), np.float64)
+    # Marks stand in the white squares, and must not stand in the windows.
+    margin = 0.5 * (1.0 - target.marker_m / target.square_m)
+    steps = _steps(plate[ids, :2] / target.square_m, corners)
+    window = np.minimum(WINDOW, 1.3 * margin) * steps - (1.0 if 1.3 * margin < WINDOW else 0.0)
+    uv_px, covariance, good = _sharp(grey, corners, window, plate[ids, :2] / target.square_m)
+    note = _note(int(good.sum()), len(plate))
+    return _sighting(grey, uv_px, plate[ids], covariance, ids, good, 0.0, name, note, FEWEST["charuco"])
+
+
+def _marked_corners(shown: NDArray[np.uint8], target: Charuco) -> _Marked:
+    """The board, corners (n, 2), their numbers (n,) and how many marks are seen, by the pattern that shows more:
+    before version 4.6 of OpenCV boards with an even number of rows began with the other colour.
+    """
+    if not hasattr(cv2.aruco, target.dictionary) or not target.dictionary.startswith("DICT_"):
+        raise TargetError(f"there is no dictionary {target.dictionary}; one of OpenCV's, e.g. DICT_4X4_250")
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, target.dictionary))
+    found: list[_Marked] = []
+    for legacy in (False, True) if target.rows % 2 == 0 else (False,):
+        board = cv2.aruco.CharucoBoard((target.columns, target.rows), target.square_m, target.marker_m, dictionary)
+        board.setLegacyPattern(legacy)
+        corners, ids, _, marks = cv2.aruco.CharucoDetector(board, _CHARUCO).detectBoard(shown)
+        numbers = np.zeros(0, np.intp) if ids is None else np.asarray(ids, np.intp).ravel()
+        places = np.asarray(corners if len(numbers) else [], np.float64).reshape(-1, 2)
+        agreeing = _agreeing(np.asarray(board.getChessboardCorners())[numbers], places)
+        found.append((board, places[agreeing], numbers[agreeing], 0 if marks is None else len(marks)))
+        if 2 * len(found[-1][2]) > (target.columns - 1) * (target.rows - 1):
+            break
+    return max(found, key=lambda one: len(one[2]))
+
+
+def _agreeing(plate: Array, places: Array) -> NDArray[np.bool_]:
+    """(n,) which corners lie about where one plane has them: what looks like a mark need not be one."""
+    if len(places) < 5:
+        return np.ones(len(places), bool)
+    tolerance_px = 0.6 * float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+    plane, mask = cv2.findHomography(
+        plate[:, :2].astype(np.float64), places, cv2.RANSAC, tolerance_px, maxIters=500, confidence=0.999
+    )
+    if plane is None or _mirrors(np.asarray(plane, np.float64), plate[mask.ravel() > 0]):
+        return np.zeros(len(places), bool)
+    out: NDArray[np.bool_] = mask.ravel() > 0
+    return out
+
+
+def _mirrors(plane: Array, plate: Array) -> bool:
+    """Whether a homography turns the plate over where these points (n, 3) are: elsewhere its sign says nothing."""
+    depth = plate[:, :2] @ plane[2, :2] + plane[2, 2]
+    return bool(np.linalg.det(plane) * np.median(depth) < 0.0)
+
+
+def _chequerboard(grey: Grey, target: Chequerboard, name: str) -> Sighting | NotFound:
+    found = chequers.find_corners(grey, target.columns, target.rows)
+    if not found:
+        return NotFound(_blurred(grey) or "no chequerboard in the image; one that is evenly lit and not too small")
+    cells, rough = _arrays(found[0])
+    fewer = len(cells) < target.columns * target.rows and ends_all_round(grey, cells, rough, squares=True)
+    if fewer or not chequers.fits(found[0], target.columns, target.rows):
+        return _wrong_count(cells, target.columns, target.rows, "inner corners")
+    steps = _steps(cells, rough)
+    starts, ends = _across_squares(cells, rough)
+    blur_px = edge_blur_px(grey, starts, ends)
+    if blur_px > TOO_BLURRED * float(np.median(steps)):
+        return NotFound(_too_coarse(blur_px, steps))
+    cells = _turned(cells, target.columns, target.rows)
+    uv_px, covariance, good = _sharp(grey, rough, WINDOW * steps, cells)
+    plate = np.concatenate([cells * target.square_m, np.zeros((len(cells), 1))], axis=1)
+    note = _note(int(good.sum()), target.columns * target.rows, blur_px)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, 0.0, name, note, FEWEST["chequerboard"])
+
+
+def _discs(grey: Grey, target: CircleGrid, name: str) -> Sighting | NotFound:
+    columns, rows = target.columns, target.rows
+    found = find_discs(grey, columns, rows, target.spacing_m / target.diameter_m)
+    if not found:
+        return NotFound(_blurred(grey) or "no lattice of discs in the image; one that is evenly lit and not too small")
+    cells, rough = _arrays({cell: tuple(disc.centre_px.tolist()) for cell, disc in found[0].items()})
+    seen = cells.max(axis=0) + 1
+    fewer = len(cells) < columns * rows and ends_all_round(grey, cells, rough, squares=False)
+    if fewer or max(seen) > max(columns, rows) or min(seen) > min(columns, rows):
+        return _wrong_count(cells, columns, rows, "discs")
+    where = {(int(c), int(r)): k for k, (c, r) in enumerate(cells.tolist())}
+    pairs = [(k, where[c + 1, r]) for (c, r), k in where.items() if (c + 1, r) in where]
+    starts = rough[[a for a, _ in pairs]]
+    blur_px = edge_blur_px(grey, starts, 0.5 * (starts + rough[[b for _, b in pairs]]))
+    share = target.diameter_m / target.spacing_m
+    steps = _steps(cells, rough)
+    if blur_px > 2.0 * TOO_BLURRED * min(1.0 - share, 0.5 * share) * float(np.median(steps)):
+        return NotFound(_too_coarse(blur_px, steps))
+    noise = noise_of(grey)
+    first = {(c - min(x for x, _ in found[0]), r - min(y for _, y in found[0])): d for (c, r), d in found[0].items()}
+    centres = [refined(grey, first[int(c), int(r)], noise) for c, r in cells.tolist()]
+    good = np.array([centre is not None for centre in centres])
+    uv_px = np.array([(np.nan, np.nan) if centre is None else centre[0] for centre in centres])
+    covariance = np.array([np.eye(2) if centre is None else centre[1] for centre in centres])
+    cells = _turned(cells, columns, rows)
+    plate = np.concatenate([cells * target.spacing_m, np.zeros((len(cells), 1))], axis=1)
+    radius_m, note = 0.5 * target.diameter_m, _note(int(good.sum()), columns * rows, blur_px)
+    return _sighting(grey, uv_px, plate, covariance, _numbers(cells), good, radius_m, name, note, FEWEST["circles"])
+
+
+def _sighting(
+    grey: Grey,
+    uv_px: Array,
+    plate_m: Array,
+    covariance: Array,
+    ids: NDArray[np.intp],
+    good: NDArray[np.bool_],
+    radius_m: float,
+    name: str,
+    note: str,
+    fewest: int,
+) -> Sighting | NotFound:
+    if good.sum() < fewest:
+        return NotFound(f"{int(good.sum())} points of the target are sharp and free; at least {fewest}")
+    size = (grey.shape[1], grey.shape[0])
+    return Sighting(uv_px[good], plate_m[good], covariance[good], ids[good], size, radius_m, name, note)
+
+
+def _arrays(lattice: Mapping[Index, tuple[float, ...]]) -> tuple[NDArray[np.intp], Array]:
+    """Cells (n, 2), from 0 on, by rows, and where they are in the image (n, 2)."""
+    order = sorted(lattice, key=lambda cell: (cell[1], cell[0]))
+    cells = np.array(order, np.intp)
+    return cells - cells.min(axis=0), np.array([lattice[cell] for cell in order])
+
+
+def _turned(cells: NDArray[np.intp], columns: int, rows: int) -> NDArray[np.intp]:
+    """By a quarter if that makes the target's columns run along x, as far as what is seen tells."""
+    seen_columns, seen_rows = cells.max(axis=0) + 1
+    if seen_columns <= columns and seen_rows <= rows and (seen_columns, seen_rows) != (rows, columns):
+        return cells
+    out: NDArray[np.intp] = np.stack([cells[:, 1], cells[:, 0].max() - cells[:, 0]], axis=1)
+    return out
+
+
+def _numbers(cells: NDArray[np.intp]) -> NDArray[np.intp]:
+    out: NDArray[np.intp] = cells[:, 1] * (cells[:, 0].max(initial=0) + 1) + cells[:, 0]
+    return out
+
+
+def _wrong_count(cells: NDArray[np.intp], columns: int, rows: int, what: str) -> NotFound:
+    # The longer side first, as the target's.
+    seen = sorted((cells.max(axis=0) + 1).tolist(), reverse=columns >= rows)
+    larger = max(seen) > max(columns, rows) or min(seen) > min(columns, rows)
+    return NotFound(f"the target shows {seen[0]} x {seen[1]} {what}; it should have {columns} x {rows}", larger)
+
+
+def _steps(cells: NDArray[np.intp] | Array, points: Array) -> Array:
+    """(n,) distance in px of each point to its nearest neighbour on the lattice, a step being 1 there."""
+    where, index = cKDTree(points).query(points, 2)
+    away = np.linalg.norm(cells[index[:, 1]] - cells, axis=1)
+    out: Array = where[:, 1] / np.maximum(away, 1.0)
+    return out
+
+
+def _across_squares(cells: NDArray[np.intp], points: Array) -> tuple[Array, Array]:
+    """Ends (n, 2) of lines across edges: between two neighbouring corners, from square to square."""
+    where = {(int(c), int(r)): k for k, (c, r) in enumerate(cells.tolist())}
+    lines = []
+    for (c, r), k in where.items():
+        right, below = where.get((c + 1, r)), where.get((c, r + 1))
+        if right is not None and below is not None:
+            middle, half = 0.5 * (points[k] + points[right]), 0.4 * (points[below] - points[k])
+            lines.append((middle - half, middle + half))
+    ends = np.array(lines).reshape(-1, 2, 2)
+    return ends[:, 0], ends[:, 1]
+
+
+def _sharp(
+    grey: Grey, rough: Array, radius_px: Array, cells: Array | NDArray[np.intp]
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Corners (n, 2) to sub-pixel, covariances (n, 2, 2), and which of them are what they should be; ``cells`` (n, 2)
+    are their places on the lattice.
+    """
+    noise = noise_of(grey)
+    found = chequers.centres_of_symmetry(grey, rough, radius_px, noise)
+    good = _corners(grey, *found, radius_px)
+    # How the lattice bends is known once its corners are.
+    bend = np.zeros((len(rough), 3, 2))
+    size = (grey.shape[1], grey.shape[0])
+    bend[good] = bends(np.asarray(cells[good], np.float64), found[0][good], size)
+    found = chequers.centres_of_symmetry(grey, np.where(good[:, None], found[0], rough), radius_px, noise, bend)
+    return found[0], found[1], _corners(grey, *found, radius_px)
+
+
+def _corners(grey: Grey, uv_px: Array, covariance: Array, asymmetry: Array, radius_px: Array) -> NDArray[np.bool_]:
+    """(n,) which are free, and a corner."""
+    radius = np.clip(radius_px, chequers.SMALLEST_RADIUS_PX, chequers.LARGEST_RADIUS_PX)
+    size = np.array(grey.shape[::-1])
+    edge = np.minimum(uv_px, size - 1 - uv_px).min(axis=1)
+    crosses, _ = chequers.crossing(grey, np.nan_to_num(uv_px, nan=-1e3), 0.8 * radius)
+    good: NDArray[np.bool_] = (asymmetry < chequers.ASYMMETRIC) & (edge > radius) & crosses
+    return good
+
+
+def _note(count: int, total: int, blur_px: float = 0.0) -> str:
+    notes = [] if count == total else [f"{count} of {total} points"]
+    if blur_px > BLURRED_PX:
+        notes.append(f"blurred (edges {blur_px:.1f} px)")
+    return ", ".join(notes)
+
+
+def _blurred(grey: Grey) -> str:
+    """The reason for an image without target that isn't sharp anywhere."""
+    blur_px = sharpest_blur_px(grey)
+    return _too_blurred(blur_px) if blur_px > BLURRED_PX else ""
+
+
+def _too_coarse(blur_px: float, steps: Array) -> str:
+    """The reason for a target whose edges are too wide for it: blurred, or too small in a sharp image."""
+    if blur_px > BLURRED_PX:
+        return _too_blurred(blur_px)
+    return (
+        f"the target is too small for its edges: its points lie {float(np.median(steps)):.0f} px apart, and edges have "
+        f"a standard deviation of {blur_px:.1f} px; nearer to it, or sharper"
+    )
+
+
+def _too_blurred(blur_px: float) -> str:
+    return (
+        f"blurred: its sharpest edges have a standard deviation of {blur_px:.1f} px; an image in focus, without motion"
+    )
+
+
+LEAST_CONTRAST = 0.2
+"""Between dark and light squares, over the range of the squares' grey levels: what is less may be light and shadow."""
+BARE = 0.3
+"""Of the contrast: so much what lies beyond may differ from the plate's own ground."""
+_ALL = 0.9
+
+
+def ends_all_round(grey: Grey, cells: NDArray[np.intp], at: Array, squares: bool) -> bool:
+    """True where a lattice (cells (n, 2) from 0 on, at (n, 2) px) has no gaps and the plate beyond all its four sides
+    is in view and bare.  False says nothing: a finger, the image's border, or something else may hide the rest.
+
+    ``squares``: the points are corners of squares, else centres of discs.
+    """
+    columns, rows = (cells.max(axis=0) + 1).tolist()
+    if len(cells) < columns * rows or min(columns, rows) < 3:
+        return False
+    grid = np.empty((rows, columns, 2))
+    grid[cells[:, 1], cells[:, 0]] = at
+    middles = 0.25 * (grid[1:, 1:] + grid[1:, :-1] + grid[:-1, 1:] + grid[:-1, :-1])
+    if squares:
+        ink, ground = np.percentile(_levels(grey, middles), [15.0, 85.0]).tolist()
+    else:
+        ink, ground = float(np.median(_levels(grey, grid))), float(np.median(_levels(grey, middles)))
+    for turn in range(4):
+        turned = np.rot90(grid, turn)
+        edge, step = turned[0], turned[0] - turned[1]
+        if squares:  # the middles of the squares that would follow those which end the pattern
+            edge, step = 0.5 * (edge[1:] + edge[:-1]), 0.75 * (step[1:] + step[:-1])
+        beyond = edge + step
+        if ((beyond < 1.0) | (beyond > np.array(grey.shape[::-1]) - 2.0)).any():
+            return False
+        # Beyond squares of two colours may be either, but the same all along.
+        shown, near = _levels(grey, beyond), BARE * abs(ground - ink)
+        if max(np.mean(np.abs(shown - level) < near) for level in ((ground, ink) if squares else (ground,))) < _ALL:
+            return False
+    return True
+
+
+def _levels(grey: Grey, where: Array) -> Array:
+    at = where.reshape(1, -1, 2).astype(np.float32)
+    out = cv2.remap(cv2.GaussianBlur(grey, (0, 0), 1.0), at[:, :, 0], at[:, :, 1], cv2.INTER_LINEAR)
+    return np.asarray(out[0], np.float64)
+
+
+def upright(image: Image, sighting: Sighting, board: Chequerboard) -> Sighting | NotFound:
+    """``sighting`` of a whole board whose numbers of corners are one even, one odd, turned such that the square between
+    its first corners along both axes is dark.  :class:`NotFound` where a part of the board is hidden (the lattice's
+    origin is unknown then), or the colours don't tell.
+    """
+    count = board.columns * board.rows
+    if len(sighting) != count:
+        return NotFound(f"{len(sighting)} of the board's {count} corners; all of them, to tell which way up it is")
+    cells = np.rint(sighting.plate_m[:, :2] / board.square_m).astype(int)
+    cells -= cells.min(axis=0)
+    if tuple(cells.max(axis=0) + 1) == (board.rows, board.columns):  # x along the columns
+        cells = np.stack([cells[:, 1], board.rows - 1 - cells[:, 0]], axis=1)
+    if tuple(cells.max(axis=0) + 1) != (board.columns, board.rows):
+        return NotFound("the corners aren't the whole board; all of them, to tell which way up it is")
+    places = np.empty((board.columns, board.rows, 2))
+    places[cells[:, 0], cells[:, 1]] = sighting.uv_px
+    # A square's middle by its four corners: perspective and lens hardly bend one square.
+    middles = 0.25 * (places[:-1, :-1] + places[1:, :-1] + places[:-1, 1:] + places[1:, 1:])
+    grey = to_grey(image)
+    levels = grey[tuple(np.rint(middles[..., k]).astype(int) for k in (1, 0))].astype(np.float64)
+    even = np.indices(levels.shape).sum(axis=0) % 2 == 0
+    difference = float(np.median(levels[even]) - np.median(levels[~even]))
+    if abs(difference) <= LEAST_CONTRAST * float(np.ptp(levels)):
+        return NotFound("dark and light squares don't tell which way up the board is; a board in even light")
+    if difference > 0.0:
+        cells = [board.columns - 1, board.rows - 1] - cells
+    plate_m = np.concatenate([cells * board.square_m, np.zeros((count, 1))], axis=1)
+    return replace(sighting, plate_m=plate_m)

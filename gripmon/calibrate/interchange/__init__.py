@@ -1,1 +1,0 @@
-"""Formats of others: cameras and hand/eye transforms of ROS, Kalibr, OpenCV, mrcal, URDF and easy_handeye2."""

@@ -1,0 +1,284 @@
+"""What the robot reports on the network: its jaw opening, and the pulses of a laser."""
+
+from __future__ import annotations
+
+import bisect
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+import zenoh
+
+from gripmon.io.ros2.node import JointOpening, MessageError, decode_joint_state
+from gripmon.io.wire import Link
+from gripmon.io.wire.link import Malformed
+from gripmon.laser.matching import ReportedPulse, of_message
+from gripmon.model.records import JawReading, LaserPulse, MessageRefused, from_json, largest_bytes
+
+_log = logging.getLogger(__name__)
+
+LARGEST_OPENING_M = 0.5
+"""No gripper file allows more."""
+
+BEYOND_TRAVEL_M = 1e-3
+"""So far beyond its travel a gripper may report to be; the monitor refuses frames with more."""
+
+LONGEST_STEP_S = 0.1
+"""Between reports farther apart the jaw stood still, and moved only so long before the later one: a robot may report
+only while the jaws move.
+"""
+
+MOST_REPORTS = 2048
+"""Reports kept for images that are older than the newest one: two seconds at 1 kHz."""
+
+
+class Reported(NamedTuple):
+    """An opening, and when the robot measured it (Unix ns); 0 if that isn't known."""
+
+    stamp_ns: int
+    opening_m: float
+
+
+DecodeOpening = Callable[[bytes], Reported | None]
+"""An opening from a payload; None if the message is about something else.  Raises :class:`JawError`."""
+
+
+class JawError(ValueError):
+    """A payload that tells no jaw opening; the text says why, in one line."""
+
+
+class StampedOpenings:
+    """Reports with stamps, by their stamps: what the opening was at a time between them."""
+
+    def __init__(self) -> None:
+        self._reports: list[tuple[Reported, float]] = []
+
+    def __len__(self) -> int:
+        return len(self._reports)
+
+    def add(self, report: Reported, arrival_s: float, max_age_s: float) -> None:
+        """Keep a report; forget those that arrived too long before it (monotonic, s), and all from before the robot's
+        clock was set back.
+        """
+        reports = self._reports
+        if reports and 1e-9 * (reports[-1][0].stamp_ns - report.stamp_ns) > max_age_s:
+            reports.clear()
+        while reports and (len(reports) >= MOST_REPORTS or arrival_s - reports[0][1] > max_age_s):
+            del reports[0]
+        bisect.insort(reports, (report, arrival_s), key=lambda kept: kept[0].stamp_ns)
+
+    def clear(self) -> None:
+        self._reports.clear()
+
+    def apart_s(self, stamp_ns: int) -> float:
+        """How much later the newest report's stamp is, s."""
+        return 1e-9 * (self._reports[-1][0].stamp_ns - stamp_ns)
+
+    def at(self, stamp_ns: int) -> float:
+        """Linear between the reports before and after (m); beyond the first and the last one nothing is made up: as
+        they say.
+        """
+        after = bisect.bisect_left(self._reports, stamp_ns, key=lambda kept: kept[0].stamp_ns)
+        if after in (0, len(self._reports)):
+            return self._reports[min(after, len(self._reports) - 1)][0].opening_m
+        (first, _), (last, _) = self._reports[after - 1 : after + 1]
+        left_ns = last.stamp_ns - stamp_ns
+        share = min(left_ns / min(last.stamp_ns - first.stamp_ns, 1e9 * LONGEST_STEP_S), 1.0)
+        return last.opening_m + share * (first.opening_m - last.opening_m)
+
+
+class _Input:
+    """Messages on a key: Zenoh's thread stores what arrives; any thread may ask.  What is malformed is counted."""
+
+    def __init__(self, link: Link, key: str, what: str) -> None:
+        self._malformed = Malformed(what, key)
+        self._key = key
+        self._subscriber: zenoh.Subscriber[None] | None = None
+        link.attach(self._attach)
+
+    @property
+    def malformed(self) -> int:
+        """Messages so far that were none."""
+        return self._malformed.count
+
+    def _attach(self, session: zenoh.Session) -> None:
+        # In Zenoh's own thread: one of Python's would keep a process that forgot close() from ending.
+        self._subscriber = session.declare_subscriber(self._key, zenoh.handlers.Callback(self._arrived, indirect=False))
+
+    def _arrived(self, sample: zenoh.Sample) -> None:
+        if sample.kind != zenoh.SampleKind.PUT:
+            return
+        try:
+            if self._take(sample.payload):
+                self._malformed.good()
+        except (MessageRefused, ValueError) as error:
+            self._malformed.add(str(error))
+        except Exception as error:  # noqa: BLE001  Zenoh would swallow it, and it would stay unknown
+            self._malformed.add(f"{type(error).__name__}: {error}")
+            _log.debug("message on %s", self._key, exc_info=error)
+
+    def _take(self, payload: zenoh.ZBytes) -> bool:
+        """Store a message, False if it is about something else.  ValueError for one that is malformed."""
+        raise NotImplementedError
+
+
+class ZenohJaw(_Input):
+    """The jaw opening that the robot sent: at an image's stamp where the reports have stamps of the same clock, else
+    the newest.
+
+    Age counts from arrival, so that the robot's clock need not agree with ours.  Zenoh's thread stores what arrives;
+    any thread may ask.  What is malformed, or no opening that this gripper can have, is counted and said; the one
+    before it stays in force until it is too old.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        key: str,
+        decode: DecodeOpening | None = None,
+        *,
+        travel_m: tuple[float, float] = (0.0, LARGEST_OPENING_M),
+    ) -> None:
+        """Reads ``key``, by default :func:`opening_of_json`; ``travel_m``: smallest and largest opening of the gripper.
+
+        A reading older than the link's ``jaw_max_age_s`` is not used.
+        """
+        self._decode = decode or opening_of_json
+        self._travel_m = travel_m
+        self._max_age_s = link.settings.jaw_max_age_s
+        self._lock = threading.Lock()  # guards what follows against Zenoh's thread
+        self._newest_m: float | None = None
+        self._arrival_s = 0.0
+        self._stamped = StampedOpenings()
+        self._apart_s: float | None = None  # reports' stamps from the images', where they are of different clocks
+        super().__init__(link, key, "jaw message")
+
+    def opening_m(self, stamp_ns: int | None = None) -> float | None:
+        """The opening at an image's stamp, or the newest (m); None if none came, or none for ``jaw_max_age_s``.
+
+        Stamps farther apart than that are of different clocks: then it is the newest, and :meth:`fault` says so.
+        """
+        with self._lock:
+            if self._newest_m is None or self._is_old():
+                return None
+            self._apart_s = None
+            if stamp_ns is None or not len(self._stamped):
+                return self._newest_m
+            apart_s = self._stamped.apart_s(stamp_ns)
+            if abs(apart_s) > self._max_age_s:
+                self._apart_s = apart_s
+                return self._newest_m
+            return self._stamped.at(stamp_ns)
+
+    def fault(self) -> str:
+        """What is wrong with the readings, in a few words for a person; empty if nothing is."""
+        missing = ""
+        with self._lock:
+            if self._newest_m is None:
+                missing = "no jaw opening received"
+            elif self._is_old():
+                missing = f"no jaw opening for {self._max_age_s:g} s or longer"
+            elif self._apart_s is not None:
+                when = "later" if self._apart_s > 0.0 else "earlier"
+                missing = (
+                    f"jaw openings have stamps {abs(self._apart_s):.3g} s {when} than the images: the newest is taken"
+                )
+        return ", ".join(fault for fault in (missing, self._malformed.fault()) if fault)
+
+    def _is_old(self) -> bool:
+        return time.monotonic() - self._arrival_s > self._max_age_s
+
+    def _take(self, payload: zenoh.ZBytes) -> bool:
+        arrival_s = time.monotonic()
+        reported = self._decode(_bounded(payload))
+        if reported is None:
+            return False
+        self._check(reported.opening_m)
+        with self._lock:
+            self._newest_m, self._arrival_s = reported.opening_m, arrival_s
+            if reported.stamp_ns > 0:
+                self._stamped.add(reported, arrival_s, self._max_age_s)
+            else:
+                self._stamped.clear()  # of one robot all reports have stamps, or none
+        return True
+
+    def _check(self, opening_m: float) -> None:
+        low_m, high_m = self._travel_m
+        # Written so that NaN fails, too.
+        if not low_m - BEYOND_TRAVEL_M <= opening_m <= high_m + BEYOND_TRAVEL_M:
+            raise JawError(f"opening {opening_m:g} m; {low_m:g} to {high_m:g} m as the gripper file says")
+
+
+LARGEST_BYTES = 1 << 18
+"""A JointState of some thousand joints."""
+
+
+def _bounded(payload: zenoh.ZBytes) -> bytes:
+    if len(payload) > LARGEST_BYTES:
+        raise JawError(f"{len(payload)} bytes; at most {LARGEST_BYTES}")
+    return payload.to_bytes()
+
+
+def opening_of_json(payload: bytes) -> Reported:
+    """A report from ``{"stamp_ns": …, "opening_m": …}``, or from a number alone (m).  Raises :class:`JawError`."""
+    try:
+        if payload[:64].lstrip()[:1] == b"{":
+            reading = from_json(payload, JawReading)
+            return Reported(reading.stamp_ns, reading.opening_m)
+        if len(payload) > largest_bytes(JawReading):
+            raise JawError(f"{len(payload)} bytes; a number, or at most {largest_bytes(JawReading)} bytes of JSON")
+        return Reported(0, _decode_number(payload))
+    except MessageRefused as error:
+        raise JawError(str(error)) from None
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise JawError(f'{error}; a number of metres, or {{"stamp_ns": …, "opening_m": …}}') from None
+
+
+def opening_of_joints(joints: JointOpening) -> DecodeOpening:
+    """A decoder of ``sensor_msgs/JointState`` (CDR); messages about other joints only are passed over."""
+
+    def decode(payload: bytes) -> Reported | None:
+        try:
+            stamp_ns, positions = decode_joint_state(payload)
+            opening_m = joints.opening_m(positions)
+            return None if opening_m is None else Reported(stamp_ns, opening_m)
+        except MessageError as error:
+            raise JawError(str(error)) from None
+
+    return decode
+
+
+_decode_number = msgspec.json.Decoder(float).decode
+
+
+_WAITING_MOST = 64
+
+
+class ZenohPulses(_Input):
+    """Pulses in the order in which they came.
+
+    Zenoh's thread stores what arrives; any thread may ask.  What is malformed, or no pulse that can be, is counted and
+    said.  Pulses that are not asked for, more than 64 of them, give way to newer ones.
+    """
+
+    def __init__(self, link: Link, key: str) -> None:
+        self._waiting: deque[ReportedPulse] = deque(maxlen=_WAITING_MOST)
+        super().__init__(link, key, "pulse message")
+
+    def poll(self) -> ReportedPulse | None:
+        """The next pulse, at once; None if there is none."""
+        return self._waiting.popleft() if self._waiting else None
+
+    def fault(self) -> str:
+        """What is wrong with what came, in a few words for a person; empty if nothing is."""
+        return self._malformed.fault()
+
+    def _take(self, payload: zenoh.ZBytes) -> bool:
+        if len(payload) > (most := largest_bytes(LaserPulse)):  # before a copy of it is made
+            raise MessageRefused(f"{len(payload)} bytes; at most {most}")
+        self._waiting.append(of_message(from_json(payload.to_bytes(), LaserPulse)))
+        return True

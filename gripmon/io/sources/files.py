@@ -1,0 +1,254 @@
+"""Recorded frames: a folder of images, in the natural order of their names, or a video file."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import logging
+import math
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+
+from gripmon.io.sources.base import SourceError
+from gripmon.model.images import IMAGE_SUFFIXES as IMAGE_SUFFIXES
+from gripmon.model.images import natural_key as natural_key
+from gripmon.model.images import read_image as read_image
+from gripmon.model.images import regular_bytes
+from gripmon.model.records import Frame
+
+if TYPE_CHECKING:
+    from _csv import Reader as _Lines
+
+_log = logging.getLogger(__name__)
+
+TIMESTAMPS_NAME = "timestamps.csv"
+COLUMNS = ("file", "stamp_ns", "jaw_opening_m")
+_NS = 1_000_000_000
+
+
+class FolderSettings(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="folder"
+):
+    """Images in a folder; a file ``timestamps.csv`` with ``file,stamp_ns[,jaw_opening_m]`` may lie beside them."""
+
+    path: Annotated[str, msgspec.Meta(min_length=1, description="folder with the images")]
+    fps: Annotated[
+        float, msgspec.Meta(gt=0, le=10000, description="frames a second where there are no time stamps (1/s)")
+    ] = 25.0
+    timestamps: Annotated[
+        str | None,
+        msgspec.Meta(description="file with time stamps; absent: timestamps.csv in the folder, if there is one"),
+    ] = None
+
+
+@dataclass(frozen=True, slots=True)
+class TableRow:
+    """What a table of time stamps says of an image."""
+
+    stamp_ns: int
+    jaw_opening_m: float | None
+
+
+class FolderSource:
+    """Every image of a folder, in order: ``frame10.png`` comes after ``frame9.png``.
+
+    With a table of time stamps it decides which frames there are: a file that it names and that is missing becomes a
+    frame with a fault, an image that it doesn't name is refused at the start.  Grey files stay grey, colour becomes
+    BGR, an alpha channel is left out, 16 bits and float stay what they are.  Truncated or foreign files become frames
+    with a fault.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, settings: FolderSettings, relative_to: Path) -> None:
+        self._folder = relative_to / settings.path
+        if not self._folder.is_dir():
+            raise SourceError(f"path: there is no folder {self._folder}; a folder with images")
+        names = sorted(
+            (p.name for p in self._folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()),
+            key=natural_key,
+        )
+        table = self._folder / TIMESTAMPS_NAME if settings.timestamps is None else relative_to / settings.timestamps
+        if settings.timestamps is not None or table.exists():
+            rows = read_table(table)
+            unnamed = sorted(set(names) - rows.keys(), key=natural_key)
+            if unnamed:
+                raise SourceError(f"{table}: no row for {unnamed[0]}; a row for each image ({len(unnamed)} have none)")
+            names = sorted(rows, key=natural_key)
+            _check_order(table, names, rows)
+        else:
+            rows = {name: TableRow(round(i * _NS / settings.fps), None) for i, name in enumerate(names)}
+        if not names:
+            raise SourceError(f"path: no image in {self._folder}; files such as *.png, *.jpg, *.tif, *.pgm")
+        self._names, self._rows = names, rows
+        self._seq = 0
+
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def read(self) -> Frame | None:
+        if self._seq >= len(self._names):
+            return None
+        name = self._names[self._seq]
+        row = self._rows[name]
+        image, fault = read_image(self._folder / name)
+        frame = Frame(self._seq, row.stamp_ns, image, row.jaw_opening_m, name, fault)
+        self._seq += 1
+        return frame
+
+    def close(self) -> None:
+        self._seq = len(self._names)
+
+
+def read_table(path: Path) -> dict[str, TableRow]:
+    """A table ``file,stamp_ns[,jaw_opening_m]`` by file name.  Raises :class:`SourceError`."""
+    try:
+        text = regular_bytes(path).decode("utf-8-sig")
+    except FileNotFoundError:
+        raise SourceError(f"timestamps: there is no file {path}; a table {','.join(COLUMNS[:2])}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SourceError(f"{path}: can't be read ({getattr(error, 'strerror', error)}); a table in UTF-8") from None
+    lines = csv.reader(text.splitlines())
+    try:
+        return _rows(path, lines)
+    except csv.Error as error:
+        raise SourceError(f"{path}: line {lines.line_num}: {error} (an open quote?); {','.join(COLUMNS)}") from None
+
+
+def _rows(path: Path, lines: _Lines) -> dict[str, TableRow]:
+    header = tuple(cell.strip() for cell in next(lines, []))
+    if header not in (COLUMNS[:2], COLUMNS):
+        raise SourceError(f"{path}: line 1 is '{','.join(header)}'; file,stamp_ns or file,stamp_ns,jaw_opening_m")
+    rows: dict[str, TableRow] = {}
+    for cells in lines:
+        if not cells:
+            continue
+        where = f"{path}: line {lines.line_num}"
+        if len(cells) != len(header):
+            raise SourceError(f"{where} has {len(cells)} values; {len(header)}: {','.join(header)}")
+        name = cells[0].strip()
+        if not name or Path(name).name != name:
+            raise SourceError(f"{where}: '{name}' is no file name; the plain name of a file in the folder")
+        if name in rows:
+            raise SourceError(f"{where}: {name} is there twice; one row for each file")
+        rows[name] = TableRow(_stamp(cells[1], where), _opening(cells[2], where) if len(cells) == 3 else None)
+    return rows
+
+
+def _stamp(cell: str, where: str) -> int:
+    try:
+        stamp_ns = int(cell)
+    except ValueError:
+        raise SourceError(f"{where}: stamp_ns is '{cell.strip()}'; a whole number of nanoseconds") from None
+    if not 0 <= stamp_ns < 2**63:
+        raise SourceError(f"{where}: stamp_ns is {stamp_ns}; 0 or more, below 2^63")
+    return stamp_ns
+
+
+def _opening(cell: str, where: str) -> float | None:
+    if not cell.strip():
+        return None
+    try:
+        opening_m = float(cell)
+    except ValueError:
+        opening_m = math.nan
+    if not 0.0 <= opening_m <= 1.0:
+        raise SourceError(
+            f"{where}: jaw_opening_m is '{cell.strip()}'; metres, 0 to 1, or nothing where it isn't known"
+        )
+    return opening_m
+
+
+def _check_order(path: Path, names: list[str], rows: dict[str, TableRow]) -> None:
+    for earlier, later in itertools.pairwise(names):
+        if rows[later].stamp_ns <= rows[earlier].stamp_ns:
+            raise SourceError(
+                f"{path}: stamp_ns doesn't rise from {earlier} to {later}; stamps that rise in the files' order"
+            )
+
+
+class VideoSettings(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind", tag="video"
+):
+    """A video file that FFmpeg reads."""
+
+    path: Annotated[str, msgspec.Meta(min_length=1, description="the video file")]
+    fps: (
+        Annotated[
+            float, msgspec.Meta(gt=0, le=10000, description="replaces the container's time stamps by frame / fps (1/s)")
+        ]
+        | None
+    ) = None
+
+
+class VideoSource:
+    """Frames with the container's time stamps, counted from its beginning, as a container knows no Unix time.
+
+    Containers round (Matroska to 1 ms).  A frame whose stamp doesn't rise becomes a frame with a fault: give ``fps``
+    for files without usable stamps.  Images are BGR, also of grey videos.
+    """
+
+    live = False
+    connected = True
+    dropped = 0
+
+    def __init__(self, settings: VideoSettings, relative_to: Path) -> None:
+        import cv2
+
+        self._path = relative_to / settings.path
+        if not self._path.is_file():
+            raise SourceError(f"path: there is no file {self._path}; a video file")
+        self._capture = cv2.VideoCapture(str(self._path), cv2.CAP_FFMPEG)
+        if not self._capture.isOpened():
+            raise SourceError(f"path: {self._path} can't be opened as a video; a complete file in a format of FFmpeg's")
+        self._stamp_property = cv2.CAP_PROP_POS_MSEC
+        self._announced = round(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))  # an estimate in some containers
+        self._fps = settings.fps
+        self._seq = 0
+        self._last_stamp_ns = -1
+        self._open = True
+        self._lock = threading.Lock()  # a capture that is released while it reads would crash
+
+    def read(self) -> Frame | None:
+        with self._lock:
+            return self._next_frame()
+
+    def close(self) -> None:
+        with self._lock:
+            self._end()
+
+    def _next_frame(self) -> Frame | None:
+        if not self._open:
+            return None
+        if not self._capture.grab():
+            if self._seq < self._announced - 1:
+                _log.warning("%s ends after %d of %d frames; is it truncated?", self._path, self._seq, self._announced)
+            self._end()
+            return None
+        stamp_ns, fault = self._stamp()
+        decoded, image = self._capture.retrieve()
+        if not decoded:
+            fault = "the video frame can't be decoded"
+        frame = Frame(self._seq, stamp_ns, image if fault is None else None, None, self._path.name, fault)
+        self._seq += 1
+        self._last_stamp_ns = stamp_ns
+        return frame
+
+    def _end(self) -> None:
+        self._open = False
+        self._capture.release()
+
+    def _stamp(self) -> tuple[int, str | None]:
+        if self._fps is not None:
+            return round(self._seq * _NS / self._fps), None
+        stamp_ms = self._capture.get(self._stamp_property)
+        stamp_ns = round(stamp_ms * 1e6) if math.isfinite(stamp_ms) else -1
+        if stamp_ns <= self._last_stamp_ns:
+            return max(self._last_stamp_ns, 0), "the container's time stamp does not rise; give source.fps"
+        return stamp_ns, None

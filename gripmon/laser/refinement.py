@@ -1,0 +1,352 @@
+"""All parameters of a laser set-up at once: the least distance between measured and predicted spots in the image.
+
+Equation (35) of the laser-pointer method, with an analytic Jacobian.  Wrong spots (speckle, reflections) get no weight
+where they contradict the rest: Tukey's biweight on a robust scale that shrinks with the residuals; at the end those
+beyond what noise explains are left out, and the rest counts in full.  (The print keeps the 50 nearest of 90, however
+many are wrong.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+from scipy.stats import f as fisher_f
+
+from gripmon.calibrate.bundle import GivenCamera, lens_vector
+from gripmon.calibrate.sighting import CalibrationError
+from gripmon.laser.setup import PARAMETERS, LaserSetup, pose_slopes, spots_on_plane
+from gripmon.model.camera import Camera, LensSettings
+from gripmon.model.least_squares import (
+    TUKEY,
+    Equations,
+    covariance_of,
+    minimise,
+    normal_equations,
+    robust_scale,
+    tukey_cost,
+    tukey_weights,
+    whitening,
+)
+from gripmon.model.records import Array
+
+FALSE_OUTLIERS = 0.02
+"""How many good spots of a whole data set may be left out, on average.  At 0.1 the smaller scale of what is left takes
+up to 3 % of the coverage of the 95 % region away; wrong spots are farther off than either limit.
+"""
+_ITERATIONS = 100
+_ITERATIONS_A_ROUND = 6
+_ROUNDS = 40
+_SELECTIONS = 10
+_LEAST_TESTED = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """``covariance`` (13, 13) of :data:`~gripmon.laser.setup.PARAMETERS` at ``setup``; ``residuals_px``
+    (n, 2) measured less predicted; ``used`` (n,); ``scale`` the residuals' standard deviation over what the spots'
+    covariances say (pixels where these are the unit); ``lens`` (p,) changes of the lens's free parameters and
+    ``lens_covariance`` (p, p), empty where it was held.
+    """
+
+    setup: LaserSetup
+    covariance: Array
+    residuals_px: Array
+    used: NDArray[np.bool_]
+    scale: float
+    degrees_of_freedom: int
+    camera: LensSettings
+    lens: Array
+    lens_covariance: Array
+
+    @property
+    def rms_px(self) -> float:
+        """Root mean square of the used residuals, u and v each."""
+        return float(np.sqrt(np.mean(np.square(self.residuals_px[self.used]))))
+
+    @property
+    def scale_px(self) -> float:
+        """The spots' noise, each axis, as the residuals show it."""
+        freedom = max(self.degrees_of_freedom, 1)
+        return self.rms_px * float(np.sqrt(2 * int(self.used.sum()) / freedom))
+
+
+@dataclass(frozen=True, slots=True)
+class _Tukey:
+    """What whitened residuals cost, and their weights; ``scale`` is one coordinate's standard deviation, by which prior
+    knowledge is weighed against the spots.
+    """
+
+    scale: float
+
+    def cost(self, sizes: Array) -> float:
+        return tukey_cost(sizes, TUKEY * self.scale)
+
+    def weights(self, sizes: Array) -> Array:
+        return tukey_weights(sizes, TUKEY * self.scale)
+
+
+@dataclass(frozen=True, slots=True)
+class _Squares:
+    """As :class:`_Tukey`: the ``used`` spots (n,) count in full, the others not at all."""
+
+    scale: float
+    used: NDArray[np.bool_]
+
+    def cost(self, sizes: Array) -> float:
+        return float(np.square(sizes[self.used]).sum())
+
+    def weights(self, _sizes: Array) -> Array:
+        return self.used.astype(float)
+
+
+def refine(problem: SpotProblem, start: LaserSetup) -> Refined:
+    """The best set-up near a start.  Raises :class:`CalibrationError` when it is not determined."""
+    state = problem.start(start)
+    scale = _scale(problem, state)
+    for _ in range(_ROUNDS):
+        state = _minimise(problem, state, _Tukey(scale), _ITERATIONS_A_ROUND)
+        newest = _scale(problem, state)
+        if newest > 0.999 * scale:
+            break
+        scale = newest
+    problem = problem.with_pose_noise(state)
+    scale = _scale(problem, state)
+    state = _minimise(problem, state, _Tukey(scale), _ITERATIONS)
+    scale = _scale(problem, state)
+    used = problem.sizes(state) <= float(np.sqrt(chi2.isf(FALSE_OUTLIERS / len(problem), 2))) * scale
+    for _ in range(_SELECTIONS):
+        _check_enough(problem, used)
+        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
+        scale = _scale_of(problem, state, used)
+        again = _consistent(problem, state, used, scale)
+        if (again == used).all():
+            break
+        used = again
+    else:  # two sets that ask for each other: what the last fit rests on
+        _check_enough(problem, used)
+        state = _minimise(problem, state, _Squares(scale, used), _ITERATIONS)
+    return _conclude(problem, state, used)
+
+
+_LEAST = 1e-9
+
+
+def _consistent(problem: SpotProblem, state: State, used: NDArray[np.bool_], scale: float) -> NDArray[np.bool_]:
+    """Spots (n,) that the fit to all others explains.
+
+    A used spot pulls the fit towards itself, one that is left out doesn't: by its leverage G its residual r has the
+    covariance s² (I - G) or s² (I + G).  With the scale of the others, rᵀ (I ∓ G)⁻¹ r / 2 s² follows F (Cook and
+    Weisberg, 1982), and is the same whether the spot is in the fit or not.  One size and one scale for all would leave
+    out twice as many good ones as it says, and make the rest look better than it is.
+    """
+    rows, values = problem.linearised(state)
+    normal, _ = _equations(problem, state, _Squares(scale, used))
+    size = np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+    leverage = np.linalg.pinv(normal / np.outer(size, size), hermitian=True)
+    pulled = np.einsum("nip,pq,njq->nij", rows / size, leverage, rows / size)
+    spread = np.eye(2) + np.where(used, -1.0, 1.0)[:, None, None] * pulled
+    # A spot that determines a parameter alone fits, however wrong it is: nothing speaks against it.
+    tested = np.linalg.eigvalsh(spread)[:, 0] > _LEAST_TESTED
+    spread[~tested] = np.eye(2)
+    sizes = np.where(tested, np.einsum("ni,ni->n", values, np.linalg.solve(spread, values[:, :, None])[:, :, 0]), 0.0)
+    whole = 2 * int(used.sum()) - len(PARAMETERS)
+    freedom = np.maximum(whole - 2.0 * used, 1.0)
+    variance = (whole * scale**2 - np.where(used, sizes, 0.0)) / freedom
+    ratio = 0.5 * sizes / np.maximum(variance, _LEAST**2)
+    limit = fisher_f.isf(FALSE_OUTLIERS / len(problem), 2, freedom)
+    out: NDArray[np.bool_] = np.isfinite(problem.sizes(state)) & ((ratio <= limit) | (whole <= 2))
+    return out
+
+
+def _scale_of(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> float:
+    """Standard deviation of one coordinate, from the used spots' residuals."""
+    freedom = 2 * int(used.sum()) - len(PARAMETERS)
+    return max(float(np.sqrt(np.square(problem.sizes(state)[used]).sum() / freedom)), _LEAST)
+
+
+def _check_enough(problem: SpotProblem, used: NDArray[np.bool_]) -> None:
+    if 2 * int(used.sum()) <= problem.unknowns:
+        raise CalibrationError(
+            f"{int(used.sum())} of {len(problem)} spots agree with each other; at least {problem.unknowns // 2 + 1}, "
+            "better 50"
+        )
+
+
+def _minimise(problem: SpotProblem, state: State, loss: _Tukey | _Squares, iterations: int) -> State:
+    def cost(at: State) -> float:
+        return loss.cost(problem.sizes(at)) + loss.scale**2 * float(np.square(problem.prior(at)[1]).sum())
+
+    def equations(at: State) -> Equations:
+        return _equations(problem, at, loss)
+
+    return minimise(state, cost, equations, State.moved, iterations=iterations).state
+
+
+def _equations(problem: SpotProblem, state: State, loss: _Tukey | _Squares) -> Equations:
+    """Of spots and of what is known beforehand, in the spots' unit."""
+    rows, values = problem.linearised(state)
+    spots = normal_equations(rows, values, loss.weights(np.linalg.norm(values, axis=1)))
+    prior = normal_equations(*problem.prior(state))
+    return spots[0] + loss.scale**2 * prior[0], spots[1] + loss.scale**2 * prior[1]
+
+
+def _conclude(problem: SpotProblem, state: State, used: NDArray[np.bool_]) -> Refined:
+    freedom = 2 * int(used.sum()) - len(PARAMETERS)
+    scale = _scale_of(problem, state, used)
+    normal, _ = _equations(problem, state, _Squares(scale, used))
+    try:
+        covariance = covariance_of(normal, scale**2)
+    except np.linalg.LinAlgError:
+        raise CalibrationError(
+            "the spots don't tell all of camera, plane and laser; more orientations, turned about two axes or more"
+        ) from None
+    k = len(PARAMETERS)
+    return Refined(
+        state.setup, covariance[:k, :k], problem.residuals_px(state), used, scale, freedom,
+        problem.camera(state).settings, state.lens, covariance[k:, k:],
+    )  # fmt: skip
+
+
+def _scale(problem: SpotProblem, state: State) -> float:
+    """Standard deviation of one coordinate, less what the parameters take of the noise."""
+    scale = robust_scale(problem.sizes(state), 2)
+    if not np.isfinite(scale):
+        raise CalibrationError("most spots don't lie before the camera; poses and spots of one set-up")
+    left = max(1.0 - len(PARAMETERS) / (2.0 * len(problem)), 0.25)
+    return max(scale / float(np.sqrt(left)), _LEAST)
+
+
+def with_held_lens(refined: Refined, problem: SpotProblem, lens: GivenCamera) -> Refined:
+    """``refined``, which held the lens that is its ``problem``'s prior: its ``covariance`` grows by what an error of
+    the lens does to the solution, to first order ("consider" parameters; Schmidt, 1966).  The set-up stays as it is.
+    """
+    state = problem.start(refined.setup)
+    rows, _ = problem.with_pose_noise(state).linearised(state)
+    rows = rows[refined.used].reshape(-1, problem.unknowns)
+    own = rows[:, : len(PARAMETERS)]
+    size = np.linalg.norm(own, axis=0)
+    # Least squares' answer (13, p) to a change of the lens's free parameters.
+    by_lens = np.linalg.lstsq(own / size, rows[:, len(PARAMETERS) :], rcond=None)[0] / size[:, None]
+    return replace(refined, covariance=refined.covariance + by_lens @ np.asarray(lens.covariance) @ by_lens.T)
+
+
+@dataclass(frozen=True, slots=True)
+class PoseNoise:
+    """Standard deviations of each pose that the arm reports: position, each axis, and rotation about each axis."""
+
+    position_m: float
+    rotation_rad: float
+
+    def covariance(self) -> Array:
+        """(6, 6), position then rotation."""
+        return np.diag(np.square([self.position_m] * 3 + [self.rotation_rad] * 3))
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """What is estimated: the set-up, and changes (p,) of the lens's free parameters (none where it is held)."""
+
+    setup: LaserSetup
+    lens: Array
+
+    def moved(self, change: Array) -> State:
+        count = len(PARAMETERS)
+        return State(self.setup.moved(change[:count]), self.lens + change[count:])
+
+
+class SpotProblem:
+    """Spots ``uv_px`` (n, 2) with ``covariance_px`` (n, 2, 2), the unit's one pixel if None, at ``base_T_ee``
+    (n, 4, 4).  Covariances are believed up to a common scale, with what the arm's noise adds to them.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        base_T_ee: Array,
+        uv_px: Array,
+        covariance_px: Array | None = None,
+        *,
+        lens: GivenCamera | None = None,
+        pose_noise: PoseNoise | None = None,
+    ):
+        self.base_T_ee, self.uv_px = base_T_ee, uv_px
+        self._camera, self._lens, self._pose_noise = camera, lens, pose_noise
+        self._spots_px2 = np.tile(np.eye(2), (len(uv_px), 1, 1)) if covariance_px is None else covariance_px
+        self._whiten = whitening(self._spots_px2)
+        self._root = np.empty((0, 0)) if lens is None else _root(lens)
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    @property
+    def unknowns(self) -> int:
+        """How many parameters are estimated."""
+        return len(PARAMETERS) + len(self._root)
+
+    def start(self, setup: LaserSetup) -> State:
+        """A state with the lens as it was calibrated."""
+        return State(setup, np.zeros(len(self._root)))
+
+    def camera(self, state: State) -> Camera:
+        """The camera of a state."""
+        return self._camera if self._lens is None else self._lens.model.camera(self._parameters(self._lens, state))
+
+    def with_pose_noise(self, state: State) -> SpotProblem:
+        """With what the arm's noise adds to the spots' covariances at a state."""
+        if self._pose_noise is None:
+            return self
+        spots, _ = spots_on_plane(state.setup, self.base_T_ee)
+        _, by_point = self.camera(state).project_with_jacobian(spots)
+        slopes = by_point @ pose_slopes(state.setup, self.base_T_ee)
+        added = slopes @ self._pose_noise.covariance() @ slopes.transpose(0, 2, 1)
+        added[~np.isfinite(added).all(axis=(1, 2))] = 0.0
+        out = SpotProblem(self._camera, self.base_T_ee, self.uv_px, self._spots_px2 + added, lens=self._lens)
+        out._pose_noise, out._spots_px2 = self._pose_noise, self._spots_px2
+        return out
+
+    def residuals_px(self, state: State) -> Array:
+        """(n, 2), measured less predicted; NaN where the set-up puts no spot before the camera."""
+        spots, _ = spots_on_plane(state.setup, self.base_T_ee)
+        return self.uv_px - self.camera(state).project(spots)
+
+    def sizes(self, state: State) -> Array:
+        """(n,) lengths of the whitened residuals; infinite where there is none."""
+        sizes = np.linalg.norm(np.einsum("nij,nj->ni", self._whiten, self.residuals_px(state)), axis=1)
+        return np.where(np.isfinite(sizes), sizes, np.inf)
+
+    def linearised(self, state: State) -> tuple[Array, Array]:
+        """Whitened rows (n, 2, p) and residuals (n, 2) at a state; zero where there is no spot."""
+        spots, slopes = spots_on_plane(state.setup, self.base_T_ee)
+        if self._lens is None:
+            uv_px, by_point = self._camera.project_with_jacobian(spots)
+            rows = by_point @ slopes
+        else:
+            uv_px, by_lens, by_point = self._lens.model.project(self._parameters(self._lens, state), spots)
+            rows = np.concatenate([by_point @ slopes, by_lens @ self._lens.free], axis=2)
+        rows = self._whiten @ rows
+        values = np.einsum("nij,nj->ni", self._whiten, self.uv_px - uv_px)
+        good = np.isfinite(values).all(axis=1) & np.isfinite(rows).all(axis=(1, 2))
+        rows[~good], values[~good] = 0.0, 0.0
+        return rows, values
+
+    def prior(self, state: State) -> tuple[Array, Array]:
+        """Whitened rows (p, unknowns) and residuals (p,) of what is known of the lens."""
+        rows = np.zeros((len(self._root), self.unknowns))
+        rows[:, len(PARAMETERS) :] = self._root
+        return rows, -self._root @ state.lens
+
+    @staticmethod
+    def _parameters(lens: GivenCamera, state: State) -> Array:
+        out: Array = lens_vector(lens.lens) + lens.free @ state.lens
+        return out
+
+
+def _root(lens: GivenCamera) -> Array:
+    """(p, p), makes changes of the lens's free parameters normal with unit variance.  :class:`CalibrationError`."""
+    try:
+        return whitening(np.asarray(lens.covariance))
+    except np.linalg.LinAlgError:
+        raise CalibrationError("the camera's covariance is no covariance (not positive definite)") from None
