@@ -41,9 +41,6 @@ class Frame:
     def shifts(self, base_T: np.ndarray) -> np.ndarray:
         return self.away + perturbation_between(base_T, BASE_T)
 
-    def free_covariance(self) -> np.ndarray:
-        return self.covariance.copy()
-
     @property
     def of_model(self) -> np.ndarray:
         return np.full((len(self.covariance), 2, 6), self.longer) * SIGMA

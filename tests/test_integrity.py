@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from gripmon.track.integrity import Doubts, Hypotheses, Separation, bounds, hypotheses_of, separate
-from gripmon.track.integrity.hypotheses import EDGE, FINGER, ONE_FINGERS_ENDS, OPENING
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, Sums, bounds, hypotheses_of
+from gripmon.track.integrity.hypotheses import EDGE, GRIPPER
 from gripmon.track.integrity.quantiles import Tails
 from gripmon.track.integrity.separation import NEAR
 
@@ -88,6 +88,19 @@ def test_bounds_grow_with_the_covariance_and_as_the_risk_falls_and_stay_finite()
 # --- refits ---
 
 
+def separate(
+    pull: np.ndarray,
+    information: np.ndarray,
+    middle: np.ndarray,
+    keep: np.ndarray,
+    known: np.ndarray,
+    known_pull: np.ndarray,
+) -> Separation:
+    """The fits under all hypotheses, with a gripper model that is exact."""
+    model = np.zeros(pull.shape), np.zeros(len(pull), dtype=np.intp), 1
+    return Sums.of_kept(pull, information, middle, model, keep, known, known_pull).fits(pull.shape[1])
+
+
 class Model:
     """A linear model of v edges with m unknowns: Jacobian rows with normal errors of known size, fitted at once."""
 
@@ -166,12 +179,17 @@ def test_a_length_is_exceeded_as_probably_as_its_risk_was():
         assert (tails.beyond(np.array([-1.0, -1e-9, 0.0, 0.0])) == 1.0).all()
 
 
+def exact_model(count: int) -> np.ndarray:
+    return np.zeros((count, 1, 6))
+
+
 def doubts_of(prior: list[float], away: list[float], sigma: list[float]) -> Doubts:
     """Of hypotheses "0", "1", ... whose fits are ``away`` along x, with errors along x alone."""
     shift, covariance = np.zeros((len(prior), 6)), np.zeros((len(prior), 6, 6))
     shift[:, 0], covariance[:, 0, 0] = away, np.square(sigma)
     covariance[:, range(3, 6), range(3, 6)] = 9.0
-    return Doubts.of(tuple(str(k) for k in range(len(prior))), np.array(prior), shift, covariance, 1.0)
+    fits = Separation(shift, covariance, exact_model(len(prior)))
+    return Doubts.of(tuple(str(k) for k in range(len(prior))), np.array(prior), fits, 1.0)
 
 
 def test_one_hypothesis_takes_all_of_the_risk():
@@ -215,7 +233,8 @@ def test_levels_take_position_and_rotation_alone():
     covariance[:, range(6), range(6)] = [4.0, 0.0, 0.0, 9.0, 9.0, 9.0]
     covariance[:, 0, 3] = covariance[:, 3, 0] = 1.0  # errors that belong together change neither part
     shift = np.array([[3.0, 0.0, 4.0, 0.0, -2.0, 0.0]])
-    position, rotation, _ = Doubts.of(("one",), np.ones(1), shift, covariance, 1.5).levels(1e-3)
+    fits = Separation(shift, covariance, exact_model(1))
+    position, rotation, _ = Doubts.of(("one",), np.ones(1), fits, 1.5).levels(1e-3)
     assert position == pytest.approx(5.0 + 1.5 * 2.0 * stats.chi2.isf(1e-3, 1) ** 0.5, rel=0.025)
     assert rotation == pytest.approx(2.0 + 1.5 * 3.0 * stats.chi2.isf(1e-3, 3) ** 0.5, rel=0.025)
 
@@ -240,8 +259,8 @@ def of_two_fingers(has_opening: bool = False) -> Hypotheses:
 
 def promised(found: Separation, hypotheses: Hypotheses, risk: float) -> float:
     """The bound of the position: the first fit is published."""
-    away = found.shift - found.shift[0]
-    return Doubts.of(hypotheses.name, hypotheses.prior, away, found.covariance, 1.0).levels(risk)[0]
+    found = found._replace(shift=found.shift - found.shift[0])
+    return Doubts.of(hypotheses.name, hypotheses.prior, found, 1.0).levels(risk)[0]
 
 
 def exceeded(model: Model, hypotheses: Hypotheses, risk: float, trials: int, bias: np.ndarray, seed: int) -> float:
@@ -336,9 +355,9 @@ def test_hypotheses_doubt_what_their_names_say():
     prior = dict(zip(found.name, found.prior.tolist(), strict=True))
     assert prior["nothing is wrong"] == prior["what looks like the fingers' ends is something else"] == 1.0
     assert {p for n, p in prior.items() if n.startswith("edge ")} == {EDGE}
-    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {ONE_FINGERS_ENDS}
-    assert {p for n, p in prior.items() if n.startswith("finger ")} == {FINGER}
-    assert prior["the jaw opening is wrong"] == OPENING
+    assert {p for n, p in prior.items() if n.startswith("the ends of")} == {EDGE}
+    assert {p for n, p in prior.items() if n.startswith("finger ")} == {GRIPPER}
+    assert prior["the jaw opening is wrong"] == GRIPPER
 
 
 def test_hypotheses_know_what_kind_they_are():

@@ -15,7 +15,7 @@ FACTOR = np.linalg.cholesky(COVARIANCE)
 
 def watched(shifts: np.ndarray, smallest_m: float = 2e-5, frames_per_s: float = FPS) -> list[Vibration | None]:
     watch = VibrationWatch(smallest_m)
-    return [watch.add(shift, index / frames_per_s, COVARIANCE) for index, shift in enumerate(shifts)]
+    return [watch.add(shift, index / frames_per_s, lambda: COVARIANCE) for index, shift in enumerate(shifts)]
 
 
 def noise(seed: int, frames: int) -> np.ndarray:
@@ -82,7 +82,7 @@ def test_one_too_small_to_matter_is_none():
     quiet = np.diag(np.square([1e-7] * 3 + [1e-5] * 3))
     watch, found = VibrationWatch(2e-5), []
     for index, shift in enumerate(wave(10.0, 400, np.array([1e-5, 0.0, 0.0]))):
-        found.append(watch.add(shift, index / FPS, quiet))
+        found.append(watch.add(shift, index / FPS, lambda: quiet))
     assert not any(found)
 
 
@@ -99,7 +99,8 @@ def test_one_that_goes_on_is_not_over_when_it_has_been_learnt_as_noise():
     learnt[0, 0] += 0.5 * 2e-4**2
     watch, found, news = VibrationWatch(2e-5), [], []
     for index, shift in enumerate(shifts):
-        found.append(watch.add(shift, index / FPS, COVARIANCE if index < 400 else learnt))
+        usual = COVARIANCE if index < 400 else learnt
+        found.append(watch.add(shift, index / FPS, usual.copy))
         news.append(watch.is_news)
     assert all(found[160:800]) and not any(found[960:])
     assert all(news[160:400]) and not any(news[440:])
@@ -108,10 +109,10 @@ def test_one_that_goes_on_is_not_over_when_it_has_been_learnt_as_noise():
 def test_what_is_forgotten_is_over():
     watch = VibrationWatch(2e-5)
     for index, shift in enumerate(noise(4, 300) + wave(10.0, 300, np.array([2e-4, 0.0, 0.0]))):
-        found = watch.add(shift, index / FPS, COVARIANCE)
+        found = watch.add(shift, index / FPS, lambda: COVARIANCE)
     assert found is not None
     watch.forget()
-    assert watch.add(np.zeros(6), 10.0, COVARIANCE) is None
+    assert watch.add(np.zeros(6), 10.0, lambda: COVARIANCE) is None
 
 
 def loud(ratio: float, frames: int) -> np.ndarray:

@@ -15,6 +15,7 @@ explains, the transform follows the frames instead.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from typing import Annotated
 
@@ -23,7 +24,8 @@ import numpy as np
 from msgspec import Meta
 from scipy.linalg.lapack import dposv
 
-from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.compiled import COMPILES, compiled
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
 
 GATE = 37.7
@@ -170,22 +172,111 @@ class PoseFilter:
         squared size in units of what is expected.  ValueError for covariances that aren't positive definite.
         """
         innovation = perturbation_between(self.mean_T, cam_T_grip)
-        # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
-        sides = np.empty((6, 7), order="F")  # as LAPACK wants it: no copy
-        sides[:, :6], sides[:, 6] = self.covariance, innovation
-        _, both, failed = dposv(self.covariance + covariance, sides)
-        if failed:
+        gain, surprise = _gain(self.covariance, covariance, innovation)
+        if not surprise >= 0.0:
             raise ValueError("a covariance that is not positive definite")
-        return innovation, both[:, :6].T, float(innovation @ both[:, 6])
+        return innovation, gain, surprise
 
     def correct(self, innovation: Array, gain: Array) -> Array:
         """Believe the measurement that was weighed; returns what is left of the innovation."""
-        way = gain @ innovation
+        way, self.covariance = _corrected(self.covariance, gain, innovation)
         self.mean_T = perturb(self.mean_T, way)
-        covariance = self.covariance - gain @ self.covariance
-        self.covariance = 0.5 * (covariance + covariance.T)
         self.frames += 1
         return innovation - way
+
+
+def _gain_numpy(mine: Array, other: Array, innovation: Array) -> tuple[Array, float]:
+    """Gain (6, 6) of a measurement with the covariance ``other`` and the ``innovation`` (6,), to a state with ``mine``;
+    and the innovation's normalised square, negative if that isn't positive definite.
+    """
+    # (P + R)^-1 (P | innovation) in one solve: gain transposed and normalised innovation.
+    sides = np.empty((6, 7), order="F")  # as LAPACK wants it: no copy
+    sides[:, :6], sides[:, 6] = mine, innovation
+    _, both, failed = dposv(mine + other, sides)
+    return both[:, :6].T, -1.0 if failed else float(innovation @ both[:, 6])
+
+
+@compiled
+def _gain_compiled(mine: Array, other: Array, innovation: Array) -> tuple[Array, float]:
+    """The same by Cholesky's decomposition."""
+    root, gain, white, surprise = np.empty((6, 6)), np.empty((6, 6)), np.empty(6), 0.0
+    for i in range(6):
+        for j in range(i + 1):
+            rest = mine[i, j] + other[i, j]
+            for k in range(j):
+                rest -= root[i, k] * root[j, k]
+            if j < i:
+                root[i, j] = rest / root[j, j]
+            elif rest > 0.0:
+                root[i, i] = math.sqrt(rest)
+            else:
+                return gain, -1.0
+    for column in range(7):
+        for i in range(6):
+            rest = mine[i, column] if column < 6 else innovation[i]
+            for k in range(i):
+                rest -= root[i, k] * white[k]
+            white[i] = rest / root[i, i]
+        if column == 6:
+            for i in range(6):
+                surprise += white[i] * white[i]
+            break
+        for i in range(5, -1, -1):
+            rest = white[i]
+            for k in range(i + 1, 6):
+                rest -= root[k, i] * gain[column, k]
+            gain[column, i] = rest / root[i, i]
+    return gain, surprise
+
+
+def _corrected_numpy(covariance: Array, gain: Array, innovation: Array) -> tuple[Array, Array]:
+    """The way (6,) of the state, and its covariance (6, 6) after that."""
+    left = covariance - gain @ covariance
+    return gain @ innovation, 0.5 * (left + left.T)
+
+
+@compiled
+def _corrected_compiled(covariance: Array, gain: Array, innovation: Array) -> tuple[Array, Array]:
+    """The same."""
+    way, left, out = np.zeros(6), covariance.copy(), np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            way[i] += gain[i, j] * innovation[j]
+            for k in range(6):
+                left[i, j] -= gain[i, k] * covariance[k, j]
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = 0.5 * (left[i, j] + left[j, i])
+    return way, out
+
+
+def _scaled_numpy(covariance: Array, share: Array) -> Array:
+    """A covariance (6, 6) with the ``share`` (6,) of its variances, as correlated as before."""
+    scale = np.sqrt(share)
+    out: Array = covariance * (scale[:, None] * scale)
+    return out
+
+
+@compiled
+def _scaled_compiled(covariance: Array, share: Array) -> Array:
+    """The same."""
+    out = np.empty((6, 6))
+    for i in range(6):
+        for j in range(6):
+            out[i, j] = covariance[i, j] * math.sqrt(share[i]) * math.sqrt(share[j])
+    return out
+
+
+_gain = _gain_compiled if COMPILES else _gain_numpy
+_corrected = _corrected_compiled if COMPILES else _corrected_numpy
+_scaled = _scaled_compiled if COMPILES else _scaled_numpy
+
+
+def warm_up() -> None:
+    """Compile what a frame needs, or load what was compiled."""
+    average = PoseAverage(SmoothingSettings())
+    for _ in range(3):
+        average.add(np.eye(4), np.eye(6))
 
 
 class PoseAverage:
@@ -226,6 +317,7 @@ class PoseAverage:
         """One measurement (4, 4) with the covariance (6, 6) of its error; ``quiet``: nothing speaks for a motion, so
         that it may be learnt from.  ValueError for a covariance that isn't positive definite.
         """
+        covariance = np.ascontiguousarray(covariance)
         self._newest.append((cam_T_grip, covariance))
         if self.cam_T_grip is None:
             self._restart()
@@ -259,9 +351,7 @@ class PoseAverage:
         """A frame's covariance (6, 6), larger on axes that vibrate: the average doesn't follow vibration."""
         if not self.learnt.vibrates:
             return covariance
-        scale = np.sqrt(1.0 + self.learnt.vibration)
-        out: Array = covariance * (scale[:, None] * scale)
-        return out
+        return _scaled(covariance, 1.0 + self.learnt.vibration)
 
     def _conclude(self, distance: Array, covariance: Array, quiet: bool, settled: bool) -> None:
         """What to stand by, ``distance`` (6,) being from the average to the frame."""
@@ -289,5 +379,4 @@ class PoseAverage:
             self.cam_T_grip = perturb(mean_T, follow * distance)
             left = 1.0 - follow
             stays = left * left * (stays + motion) + follow * (follow + 2.0 * left * stays)
-        scale = np.sqrt(stays)
-        self.claimed_covariance = covariance * (scale[:, None] * scale)
+        self.claimed_covariance = _scaled(covariance, stays)

@@ -5,6 +5,7 @@ Time is the frames' own stamps.  Some 1,700 pixels of each frame are looked at, 
 
 from __future__ import annotations
 
+import bisect
 import math
 import statistics
 from collections import deque
@@ -34,14 +35,13 @@ coded stream: of a sensor's own pixels fewer than nine in ten come again, down t
 FEWEST_INNER = 200
 """Pixels neither black nor white, of some 1,700, without which an image doesn't tell."""
 
-CODED_FRAMES = 3
-"""So many such images make sure of it."""
+SURE_FRAMES = 3
+"""Frames that make sure: images with large parts that stand, stamps that stand, before it is the clock and not a frame
+that was handed over twice, and images of another kind, before it is another camera.
+"""
 
 CALM_FRAMES = 30
 """Frames without a fault of their stamps after which the clock is right again."""
-
-STANDING_STAMPS = 3
-"""Stamps that stand still, among that many frames, before it is the clock: one may be a frame handed over twice."""
 
 JUMP_PERIODS, JUMP_NS = 50.0, 5 * _NS
 """A stamp that is so many usual periods, and so long, after the one before has jumped."""
@@ -61,8 +61,8 @@ REGULAR = 0.3
 DEPARTED, RETURNED = 1.6, 1.3
 """Factors, either way, by which the rate has departed from the usual one, and within which it is back."""
 
-KIND_FRAMES, OTHER_FRAMES = 5, 3
-"""Frames in a row of one size and type after which that is the camera's own, and of another after which it is not."""
+KIND_FRAMES = 5
+"""Frames in a row of one size and type after which that is the camera's own."""
 
 
 class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -153,12 +153,13 @@ class _Frozen:
         image = frame.image
         if not isinstance(image, np.ndarray) or image.ndim not in (2, 3):
             return None
-        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)]
+        sample = image[8 :: max(1, image.shape[0] // 36), 8 :: max(1, image.shape[1] // 48)].copy()
         number = hash(sample.tobytes())
         again = number in self._before
         self._before.append(number)
-        self._coded += not again and _stands_in_large_parts(sample, self._sample)
-        self._sample = sample.copy()
+        if self._coded < SURE_FRAMES and not again:
+            self._coded += _stands_in_large_parts(sample, self._sample)
+        self._sample = sample
         # An even image shows no noise, and is another fault.
         if not again or sample.size == 0 or sample.min() == sample.max():
             self._longest = self._longest if self._frozen else max(self._longest, self._run)
@@ -169,7 +170,7 @@ class _Frozen:
         lasted_ns = max(frame.stamp_ns - self._since_ns, self._run * (usual_ns or 0.0))
         enough = max(self._settings.frozen_frames, USUAL_RUNS * self._longest)
         settings = self._settings
-        frozen_s = settings.frozen_s if self._coded < CODED_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
+        frozen_s = settings.frozen_s if self._coded < SURE_FRAMES else max(settings.frozen_s, settings.frozen_coded_s)
         self._frozen |= self._run >= enough and lasted_ns >= _NS * frozen_s
         if not self._frozen:
             return None
@@ -181,10 +182,12 @@ def _stands_in_large_parts(sample: NDArray[Any], before: NDArray[Any] | None) ->
     """Whether two samples of images differ, but in few of the pixels; those cut off at black or white always stand."""
     if before is None or before.shape != sample.shape or before.dtype != sample.dtype:
         return False
+    stands = sample == before
+    if np.count_nonzero(stands) < STOOD_SHARE * FEWEST_INNER:
+        return False  # too few, whichever of them count
     inner = (sample > sample.min()) & (sample < sample.max())
     count = int(np.count_nonzero(inner))
-    same = int(np.count_nonzero(inner & (sample == before)))
-    return count >= FEWEST_INNER and STOOD_SHARE * count <= same
+    return count >= FEWEST_INNER and STOOD_SHARE * count <= int(np.count_nonzero(inner & stands))
 
 
 class _Clock:
@@ -217,7 +220,7 @@ class _Clock:
         if step_ns == 0:
             self._standing, self._calm = self._standing + 1, 0
             text = f"{self._standing} frames have the stamp of the one before: their clock stands still"
-            return StreamFault("clock", Cause.CLOCK, text) if self._standing >= STANDING_STAMPS else None
+            return StreamFault("clock", Cause.CLOCK, text) if self._standing >= SURE_FRAMES else None
         if step_ns > JUMP_NS and step_ns > rate.longest_ns(max(frame.seq - self._seq, 1)):
             # The frames alone don't tell which.
             text = f"no frame came for {1e-9 * step_ns:.1f} s, or the frames' clock was set ahead by so much"
@@ -235,6 +238,7 @@ class _Rate:
         self._settings = settings
         self._last: tuple[int, int] | None = None
         self._arrivals_ns: deque[int] = deque(maxlen=ARRIVALS)
+        self._in_order_ns: list[int] = []
         self._block_ns: list[float] = []
         self._blocks: deque[_Block] = deque(maxlen=MOST_BLOCKS)
         self.usual_ns: float | None = None
@@ -244,7 +248,9 @@ class _Rate:
     def frames_per_s(self) -> float | None:
         if len(self._arrivals_ns) < BLOCK:
             return None
-        return _NS / statistics.median(self._arrivals_ns)
+        half, odd = divmod(len(self._in_order_ns), 2)
+        upper_ns = self._in_order_ns[half]
+        return _NS / (upper_ns if odd else 0.5 * (self._in_order_ns[half - 1] + upper_ns))
 
     def longest_ns(self, frames: int) -> float:
         """Longest time that so many frames take as long as nothing is wrong; infinite until it is known."""
@@ -259,7 +265,10 @@ class _Rate:
         interval_ns = step_ns / max(frame.seq - last[0], 1)
         if interval_ns > JUMP_NS and interval_ns > self.longest_ns(1):
             return self._fault  # a gap
+        if len(self._arrivals_ns) == ARRIVALS:
+            self._in_order_ns.remove(self._arrivals_ns[0])
         self._arrivals_ns.append(step_ns)
+        bisect.insort(self._in_order_ns, step_ns)
         self._block_ns.append(interval_ns)
         if len(self._block_ns) == BLOCK:
             middle_ns = statistics.median(self._block_ns)
@@ -332,7 +341,7 @@ class _Kind:
         if self._own is None:
             self._own = kind if self._run >= KIND_FRAMES else None
             return None
-        if kind == self._own or self._run < OTHER_FRAMES:
+        if kind == self._own or self._run < SURE_FRAMES:
             return None
         text = f"images are now {_words(kind)}; they were {_words(self._own)}: another camera, or another setting of it"
         return StreamFault("replaced", Cause.CAMERA_REPLACED, text)

@@ -15,19 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.judge.smoothing import LEAST_KEPT, MOST_SCATTER
-from gripmon.model.geometry import perturb, perturbation_between
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array
-from gripmon.monitor.refits import INFLATION, Refits, of_fingers
-from gripmon.track.integrity import Doubts, Hypotheses
+from gripmon.monitor.refits import INFLATION, Refits
+from gripmon.track.integrity import Doubts, Hypotheses, Separation, follow, telling
 
 PRIOR_FRAMES, SCATTER_FRAMES = 10.0, 40.0
 """So many frames the belief is worth that errors don't scatter at all, and so many are remembered."""
 
-UNUSUAL = 12.6
-"""Squared normalised distance that six normal errors exceed once in twenty times (chi-square)."""
-
 DISPLACED = 33.1
-"""The same that they exceed once in 100,000 times."""
+"""Squared normalised distance that six normal errors exceed once in 100,000 times (chi-square)."""
 
 LEAST_YOUNG = 0.2
 """Least variance of the average over that of a frame: it has to follow a creep, and more than five frames would take
@@ -82,8 +79,8 @@ class Anchor:
         """``knocked``: the first pose stands elsewhere than before."""
         self._lasting, self._base_T, self.now_s = lasting, base_T, now_s
         self._to_confirm = CONFIRMED if knocked else 0
-        self._shift, self._filter, self._of_model = _chosen(fits, rows, base_T)
-        self._frames_variance = np.einsum("hii->hi", self._filter).copy()
+        self._filters = _chosen(fits, rows, base_T)
+        self._frames_variance = np.einsum("hii->hi", self._filters.covariance).copy()
         self._scatter = np.zeros((len(rows), 6))
         self._weight = PRIOR_FRAMES
         self._conclude()
@@ -99,36 +96,31 @@ class Anchor:
         """
         self.now_s = now_s
         self._to_confirm -= 1
-        shift, covariance, of_model = _chosen(fits, rows, self._base_T)
-        self._filter[:, range(6), range(6)] += creep
-        innovation = shift - self._shift
-        gain = np.linalg.solve(self._filter + covariance, self._filter).transpose(0, 2, 1)
-        self._shift = self._shift + np.einsum("hij,hj->hi", gain, innovation)
-        self._of_model = self._of_model + np.einsum("hij,hfj->hfi", gain, of_model - self._of_model)
-        left = self._filter - gain @ self._filter
-        self._filter = 0.5 * (left + left.transpose(0, 2, 1))
-        variance = np.einsum("hii->hi", covariance)
-        share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filter)), MOST_SCATTER)
+        frame = _chosen(fits, rows, self._base_T)
+        innovation, variance = frame.shift - self._filters.shift, np.einsum("hii->hi", frame.covariance)
+        self._filters, gains = follow(self._filters, frame, creep)
+        share = np.minimum(innovation**2 / (variance + np.einsum("hii->hi", self._filters.covariance)), MOST_SCATTER)
         self._weight = min(self._weight + 1.0, SCATTER_FRAMES)
         self._scatter += (share - self._scatter) / self._weight
         # A frame that leaves a direction open says little of what frames usually tell.
         worth = np.minimum((self._frames_variance / variance).min(axis=1), 1.0)
-        usual = worth**2 * np.einsum("hii->h", gain) / 6.0
+        usual = worth**2 * gains / 6.0
         self._frames_variance += usual[:, None] * (variance - self._frames_variance)
         self._conclude()
 
     def _conclude(self) -> None:
-        young = np.einsum("hii->hi", self._filter) / self._frames_variance
+        young = np.einsum("hii->hi", self._filters.covariance) / self._frames_variance
+        # The filters' own covariances, which this changes.
         scale = np.sqrt(np.maximum(LEAST_YOUNG / young, 1.0))
-        self._filter *= scale[:, :, None] * scale[:, None, :]
+        self._filters.covariance[:] *= scale[:, :, None] * scale[:, None, :]
         young = np.clip(young, LEAST_YOUNG, 1.0)
         # Of errors that last, averaging takes away less than of independent ones.
         kept = np.maximum(1.0 - (1.0 - np.sqrt(young)) * self._scatter, LEAST_KEPT * self._scatter)
         scale = np.sqrt(kept / young)
-        self._covariance = self._filter * (scale[:, :, None] * scale[:, None, :])
-        self.cam_T_grip = perturb(self._base_T, self._shift[0])
-        self.covariance = self._covariance[0]
-        self.of_model = self._of_model[0]
+        self._claimed = self._filters.covariance * (scale[:, :, None] * scale[:, None, :])
+        self.cam_T_grip = perturb(self._base_T, self._filters.shift[0])
+        self.covariance: Array = self._claimed[0]
+        self.of_model: Array = self._filters.of_model[0]
 
     def doubts(self, cam_T_grip: Array, fits: Refits, rows: NDArray[np.intp], wander: Array) -> Doubts:
         """What may have been wrong all along with a pose (4, 4) that a frame's ``fits`` gave, ``rows`` (g,) of those,
@@ -136,22 +128,16 @@ class Anchor:
 
         Under each hypothesis either the average or the frame tells: which knows more, but the frame where they differ.
         """
-        away = self._shift - perturbation_between(self._base_T, cam_T_grip)
-        covariance = self._covariance + np.diag(wander / INFLATION**2)
-        shift, own, of_model = _chosen(fits, rows, cam_T_grip)
-        apart = shift - away
-        both = np.linalg.solve(own + covariance, apart[:, :, None])[:, :, 0]
-        frame = np.einsum("hi,hi->h", apart, both) > DISPLACED
-        frame |= np.einsum("hii->h", own[:, :3, :3]) < np.einsum("hii->h", covariance[:, :3, :3])
-        away = np.where(frame[:, None], shift, away)
-        covariance = np.where(frame[:, None, None], own, covariance)
-        of_model = np.where(frame[:, None, None], of_model, self._of_model)
-        covariance += of_fingers(of_model) / INFLATION**2
-        return Doubts.of(self._lasting.name, self._lasting.prior, away, covariance, INFLATION)
+        at = perturbation_between(self._base_T, cam_T_grip)
+        frame = Separation(fits.shifts(cam_T_grip), fits.covariance, fits.of_model)
+        average = Separation(self._filters.shift, self._claimed, self._filters.of_model)
+        told = telling(average, at, wander / INFLATION**2, frame, rows, DISPLACED)
+        return Doubts.of(self._lasting.name, self._lasting.prior, told, INFLATION)
 
 
-def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> tuple[Array, Array, Array]:
-    """Shift (g, 6) from a pose (4, 4), covariance (g, 6, 6) and model's error (g, f, 6) of the fits ``rows`` (g,)."""
-    covariance = fits.free_covariance()[rows]
-    covariance[rows == NOTHING] *= UNKNOWN
-    return fits.shifts(base_T)[rows], covariance, fits.of_model[rows]
+def _chosen(fits: Refits, rows: NDArray[np.intp], base_T: Array) -> Separation:
+    """The fits ``rows`` (g,), as shifts from a pose (4, 4)."""
+    covariance, unknown = fits.covariance[rows], rows == NOTHING
+    if unknown.any():
+        covariance[unknown] *= UNKNOWN
+    return Separation(fits.shifts(base_T)[rows], covariance, fits.of_model[rows])

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from gripmon.judge.policy import Evidence, Judgement
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamFault
-from gripmon.model.geometry import invert, rotation_angle, to_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import motion_between, to_record
 from gripmon.model.records import (
     Alert,
     AlertKind,
@@ -45,9 +45,8 @@ def flat(covariance: Array) -> tuple[float, ...]:
 
 def drift_between(ref_cam_T_grip: Array, cam_T_grip: Array) -> Drift:
     """Equation (14) for the motion from a reference to now, and the TCP's way in the camera frame."""
-    motion = cam_T_grip @ invert(ref_cam_T_grip)
     x, y, z = (cam_T_grip[:3, 3] - ref_cam_T_grip[:3, 3]).tolist()
-    return Drift(float(np.sqrt(motion[:3, 3] @ motion[:3, 3])), rotation_angle(motion[:3, :3]), (x, y, z))
+    return Drift(*motion_between(ref_cam_T_grip, cam_T_grip), (x, y, z))
 
 
 def smoothed_record(average: PoseAverage, more: Array) -> Smoothed | None:

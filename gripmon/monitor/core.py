@@ -20,9 +20,10 @@ from gripmon.judge.references import CommandRefused, Keep
 from gripmon.judge.smoothing import PoseAverage
 from gripmon.judge.stream import StreamFault, StreamWatch
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import from_record, perturbation_between, to_record
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
 from gripmon.model.pixels import in_full_scale
+from gripmon.model.poses import perturbation_between, to_record
 from gripmon.model.records import (
     Alert,
     Array,

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import perturb
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturb
 from gripmon.model.records import Array, EdgeEvidence, Frame
 from gripmon.monitor.searching import GripperSearch
 from gripmon.monitor.settings import MonitorSettings

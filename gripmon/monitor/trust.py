@@ -13,8 +13,8 @@ import numpy as np
 
 from gripmon.judge.policy import past_alert_limit
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import perturbation_between
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Frame, Image, MonitorState, Protection, ReferenceRecord
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker

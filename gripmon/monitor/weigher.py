@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import from_record, perturbation_between
+from gripmon.judge.drift import USUAL_SQUARE
+from gripmon.model.geometry import from_record
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Protection, ReferenceRecord
-from gripmon.monitor.anchor import DISPLACED, UNUSUAL, Anchor, Lasting
+from gripmon.monitor.anchor import DISPLACED, Anchor, Lasting
 from gripmon.monitor.refits import UNBOUNDED_M, UNBOUNDED_RAD, Anchored, ModelError, Refits, larger, protection_of
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.monitor.tracker import Tracker
@@ -53,18 +55,27 @@ class Trust:
 
     ``protection`` of the pose that was asked about; ``proven``: the fingers' ends are seen as such; ``displaced``: the
     pose is not where the anchor has it; ``ambiguous``: something else than a knock of the mount explains that, too.
-    ``instead``: pose and covariance that the anchor and the rest of the edges give under the most probable hypothesis,
-    with its number; None where there is none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where
-    no edge is seen.
+    ``most_probable``: the fits with the anchor, and the number of the most probable hypothesis; None where there is
+    none.  ``ends``: as they were seen.  ``fits``: what it was made of; None where no edge is seen.
     """
 
     protection: Protection
     proven: bool
     displaced: bool = False
     ambiguous: bool = False
-    instead: tuple[int, Array, Array] | None = None
+    most_probable: tuple[Anchored, int] | None = None
     ends: FingerEndsSeen | None = None
     fits: Refits | None = None
+
+    @property
+    def instead(self) -> tuple[int, Array, Array] | None:
+        """Number of the most probable hypothesis, with the pose (4, 4) and covariance (6, 6) that the anchor and the
+        rest of the edges give under it; None where there is none.
+        """
+        if self.most_probable is None or self.fits is None:
+            return None
+        anchored, number = self.most_probable
+        return (number, *self.fits.solution(anchored, number))
 
 
 class Weigher:
@@ -76,7 +87,7 @@ class Weigher:
         creep = settings.smoothing
         self._creep = np.square([creep.creep_m_per_sqrt_s] * 3 + [creep.creep_rad_per_sqrt_s] * 3)
         self._jumps_per_s = settings.policy.mount_jumps_per_month / SECONDS_A_MONTH
-        self._model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+        self._model = _model_error(tracker, gripper)
         self._may_open = gripper.has_jaw and settings.jaw_sigma_m > 0.0  # else the report is said to be exact
         every = np.arange(len(gripper.edge_ids))
         self._lasting = Lasting.of(_hypotheses_about(every, gripper, tracker, self._may_open))
@@ -102,7 +113,7 @@ class Weigher:
 
     def sigma(self, now_s: float) -> Array:
         """(6,) standard deviations of where it is expected, m and rad."""
-        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor))
+        return np.asarray(np.sqrt(self.expected[1].diagonal() + self._wander(now_s) + self._floor.diagonal()))
 
     def weigh(
         self,
@@ -130,7 +141,7 @@ class Weigher:
         # What would need a knock of the mount besides is not what happened.
         holds = anchored.surprise <= DISPLACED
         displaced = not holds[0] and explained is None
-        again = bool(anchored.surprise[0] <= UNUSUAL) and (self.anchor is None or self.anchor.confirmed)
+        again = bool(anchored.surprise[0] <= USUAL_SQUARE) and (self.anchor is None or self.anchor.confirmed)
         proven = not slid and _proven(ends, displaced, again)
         kept = None if explained is None else hypotheses.keep[explained] > 0.0
         misread = 0.0 if proven else 1.0 if slid else MISREAD_END ** self.confirmations(measurement, ends, kept)
@@ -150,15 +161,15 @@ class Weigher:
         else:
             # The ends belong to where it was: what else may have been wrong all along the average knows, too.
             all_along = self.anchor.doubts(cam_T_grip, fits, self._about(edges)[1], wander)
-        possible = np.where(holds, prior, 0.0)
-        number = (1 + int(np.argmax(possible[1:]))) if displaced else hypotheses.ends if jumped else 0
-        instead = (number, *fits.solution(anchored, number)) if possible[number] > 0.0 else None
+        possible = holds * prior
+        number = (1 + int(possible[1:].argmax())) if displaced else hypotheses.ends if jumped else 0
+        most_probable = (anchored, number) if possible[number] > 0.0 else None
         since = fits.doubts(cam_T_grip, prior, anchored).among(holds)
         protection = protection_of(all_along + since, risk)
         if self._unexplained is not None:
             protection = larger(protection, self._not_as_expected(self._unexplained))
         ambiguous = displaced and bool((possible[1:] > 0.0).any())
-        return Trust(protection, proven, displaced, ambiguous, instead, ends, fits)
+        return Trust(protection, proven, displaced, ambiguous, most_probable, ends, fits)
 
     def settle(self, trust: Trust, cam_T_grip: Array, covariance: Array, now_s: float) -> None:
         """The pose (4, 4) with its covariance (6, 6) is where the gripper is: a proven one."""
@@ -199,12 +210,10 @@ class Weigher:
         """How many times the fingers' ends are seen where the pose has them: once a finger by an edge, and by each
         further corner.  ``kept`` (v,): the measured edges that count.
         """
-        fingers = len(self._gripper.finger_ids)
-        corners = np.zeros(fingers, dtype=np.intp) if ends is None else ends.seen
         edge = measurement.normal.edge if kept is None else measurement.normal.edge[kept]
         edge = edge[measurement.consensus.edge_seen[edge] & ~self._tracker.along[edge]]
-        by_edge = np.bincount(self._gripper.edge_finger[edge], minlength=fingers) > 0
-        return int((by_edge * np.maximum(corners, 1)).sum())
+        by_edge = set(self._gripper.edge_finger[edge].tolist())
+        return len(by_edge) if ends is None else sum(max(int(ends.seen[finger]), 1) for finger in by_edge)
 
     def held_across(self, measurement: Measurement) -> bool:
         """Whether enough of the fingers' sides is seen where they are expected to exclude an unseen knock across the
@@ -240,7 +249,9 @@ class Weigher:
             fits = Refits(measurement, self._about(measurement.normal.edge)[0], self._floor, self._model)
             expected_T, covariance = self.expected
             of_model = np.zeros((1, 6)) if self.anchor is None else self.anchor.of_model
-            anchored = fits.anchored(expected_T, covariance + np.diag(self._wander(now_s)), of_model)
+            covariance = covariance.copy()
+            covariance.flat[::7] += self._wander(now_s)
+            anchored = fits.anchored(expected_T, covariance, of_model)
             self._newest = measurement, now_s, fits, anchored
         return self._newest[2:]
 
@@ -271,8 +282,12 @@ def _hypotheses_about(edges: NDArray[np.intp], gripper: Gripper, tracker: Tracke
 
 
 def _floor(settings: MonitorSettings) -> Array:
-    """(6,) variances of the error that no averaging removes."""
-    return np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3)
+    """(6, 6) covariance of the error that no averaging removes."""
+    return np.diag(np.square([settings.floor_m] * 3 + [settings.floor_rad] * 3))
+
+
+def _model_error(tracker: Tracker, gripper: Gripper) -> ModelError:
+    return ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger, len(gripper.finger_ids))
 
 
 def foresee_protection(
@@ -284,6 +299,6 @@ def foresee_protection(
     hypotheses = _hypotheses_about(
         measurement.normal.edge, gripper, tracker, gripper.has_jaw and settings.jaw_sigma_m > 0.0
     )
-    model = ModelError(tracker.model_sigma_m, tracker.finger_axis, gripper.edge_finger)
+    model = _model_error(tracker, gripper)
     doubts = Refits(measurement, hypotheses, _floor(settings), model).doubts(measurement.cam_T_grip, hypotheses.prior)
     return protection_of(doubts.among(~hypotheses.sudden), settings.policy.integrity_risk)

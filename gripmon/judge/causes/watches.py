@@ -99,13 +99,13 @@ class ResidualWatch:
         if self._usual is None:
             self._first.append(residual_px)
             if len(self._first) == LEARNT:
-                self._usual = np.mean(self._first, axis=0), np.std(self._first, axis=0)
+                # Means of five frames before a background that stands still scatter as much as one.
+                allowed_px = np.maximum(RESIDUAL_PX, RESIDUAL_SIGMAS * np.std(self._first, axis=0))
+                self._usual = np.mean(self._first, axis=0), allowed_px
             return False
-        usual_px, scatter_px = self._usual
-        differs_px = np.abs(np.mean(self._newest, axis=0) - usual_px)
-        # Means of five frames before a background that stands still scatter as much as one.
-        beyond = differs_px > np.maximum(RESIDUAL_PX, RESIDUAL_SIGMAS * scatter_px)
-        return len(self._newest) == NEWEST and int(np.count_nonzero(beyond)) >= FEWEST_EDGES
+        usual_px, allowed_px = self._usual
+        beyond = np.abs(sum(self._newest) / NEWEST - usual_px) > allowed_px
+        return int(np.count_nonzero(beyond)) >= FEWEST_EDGES
 
 
 class JawWatch:

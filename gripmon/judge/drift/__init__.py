@@ -2,12 +2,13 @@
 was."""
 
 from gripmon.judge.drift.foresight import CORRELATION_FRAMES, Foresight, foresee
-from gripmon.judge.drift.motion import Baseline, MotionWatch
-from gripmon.judge.drift.sequential import Finding, SequentialTest
+from gripmon.judge.drift.motion import USUAL_SQUARE, Baseline, MotionWatch, SequentialTest
+from gripmon.judge.drift.sequential import Finding
 from gripmon.judge.drift.settings import DriftSettings
 
 __all__ = [
     "CORRELATION_FRAMES",
+    "USUAL_SQUARE",
     "Baseline",
     "DriftSettings",
     "Finding",

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
 from gripmon.model.records import Array, Creep, Vibration
 
 BLOCK_S = 0.5
-"""Frames are averaged over so many seconds."""
+"""Seconds over which frames are averaged; a change of the mean that took no longer is a step."""
 
 KEPT_BLOCKS = 256
 
@@ -26,7 +27,9 @@ BETTER = 0.6
 """A creep must explain the blocks with at most this part of the squares that a step leaves, and the other way round."""
 
 SIGNIFICANT = 4.0
-"""Standard deviations by which a rate must differ from zero."""
+"""Standard deviations that normal errors exceed once in 16,000 times: by so much a rate must differ from zero, and a
+first shift from the reference on some axis is more than the reference's error.
+"""
 
 
 class History:
@@ -68,8 +71,8 @@ class History:
             return None
         times_s, means = np.array(self._times_s), np.array(self._means)
         along = means @ towards
-        step, _ = _best(along, _steps(count))
-        ramp, onset = _best(along, _ramps(times_s))
+        step, _ = _best_step(along)
+        ramp, onset = _best_ramp(along, times_s)
         if ramp > BETTER * step:
             return None
         moving = slice(max(onset, count - 4 * FEWEST_BLOCKS), None)
@@ -82,10 +85,10 @@ class History:
         if count < FEWEST_BLOCKS:
             return False
         along = np.array(self._means) @ towards
-        step, before = _best(along, _steps(count))
+        step, before = _best_step(along)
         # Of a creep that has just begun the first block is a step, too.
         lasts = count - 1 - before >= LASTING_BLOCKS
-        return lasts and step <= BETTER * _best(along, _ramps(np.array(self._times_s)))[0]
+        return lasts and step <= BETTER * _best_ramp(along, np.array(self._times_s))[0]
 
 
 def goes_on(values: Array) -> bool:
@@ -93,28 +96,39 @@ def goes_on(values: Array) -> bool:
     count = len(values)
     if count < FEWEST_BLOCKS:
         return False
-    step, _ = _best(values, _steps(count))
-    ramp, _ = _best(values, _ramps(np.arange(float(count))))
-    return ramp < step
+    return _best_ramp(values, np.arange(float(count)))[0] < _best_step(values)[0]
 
 
-def _steps(count: int) -> Array:
-    """(count - 1, count) a step before each block but the first."""
-    return np.triu(np.ones((count, count)))[1:]
-
-
-def _ramps(times_s: Array) -> Array:
-    """(count - 2, count) nothing until a block, from there on a straight line."""
-    return np.maximum(times_s[None, :] - times_s[:-2, None], 0.0)
-
-
-def _best(values: Array, shapes: Array) -> tuple[float, int]:
-    """Smallest sum of squares (n shapes) that a constant and one multiple of a shape leave, and the shape's index."""
-    centred = shapes - shapes.mean(axis=1, keepdims=True)
+def _best_step(values: Array) -> tuple[float, int]:
+    """Smallest sum of squares of values (n,) that a constant and a step leave, and the number of the block before."""
     values = values - values.mean()
-    explained = (centred @ values) ** 2 / np.maximum((centred**2).sum(axis=1), 1e-300)
-    index = int(explained.argmax())
-    return float(max(values @ values - explained[index], 1e-12 * (values @ values))), index
+    after = np.arange(len(values) - 1, 0, -1)  # blocks after each but the last
+    return _best(values, _from_each(values)[1:], after * (1.0 - after / len(values)))
+
+
+def _best_ramp(values: Array, times_s: Array) -> tuple[float, int]:
+    """The same of a constant until a block, and from there on a straight line: by its squares, and the block."""
+    values, times_s = values - values.mean(), times_s - times_s[-1]
+    begin, after = times_s[:-2], np.arange(len(values), 2, -1.0)
+    # Of (t - t_k) over all t from t_k on: its product with the values, its sum and its squares.
+    product = _from_each(times_s * values)[:-2] - begin * _from_each(values)[:-2]
+    total = _from_each(times_s)[:-2] - begin * after
+    square = _from_each(times_s**2)[:-2] - 2.0 * begin * _from_each(times_s)[:-2] + begin**2 * after
+    return _best(values, product, square - total**2 / len(values))
+
+
+def _from_each(values: Array) -> Array:
+    """(n,) sums over values (n,) from each on."""
+    return np.cumsum(values[::-1])[::-1]
+
+
+def _best(values: Array, product: Array, square: Array) -> tuple[float, int]:
+    """Smallest sum of squares that one multiple of some shapes leaves of values (n,) about their mean, and the shape's
+    number; ``product`` of each with the values, and ``square`` of each about its mean.
+    """
+    explained = product**2 / np.maximum(square, 1e-300)
+    index, whole = int(explained.argmax()), float(values @ values)
+    return max(whole - float(explained[index]), 1e-12 * whole), index
 
 
 def _slopes(times_s: Array, means: Array, along: Array, towards: Array) -> Array | None:
@@ -169,8 +183,8 @@ class VibrationWatch:
         self._times_s.clear()
         self._found = None
 
-    def add(self, shift: Array, now_s: float, usual: Array) -> Vibration | None:
-        """One frame's shift (6,); ``usual`` (6, 6): covariance of an unmoved camera's shifts about their mean.
+    def add(self, shift: Array, now_s: float, usual: Callable[[], Array]) -> Vibration | None:
+        """One frame's shift (6,); ``usual()`` (6, 6): covariance of an unmoved camera's shifts about their mean.
 
         What is going on; None for no vibration.  One that goes on is learnt as noise sooner or later, and goes on.
         """
@@ -179,17 +193,18 @@ class VibrationWatch:
         self._since_look += 1
         if len(self._shifts) == KEPT_FRAMES and self._since_look >= LOOK_FRAMES:
             self._since_look = 0
+            learnt = usual()[:3, :3]
             if self._found is None:
-                self._before = usual[:3, :3].copy()
-            self._found = self._look(self._before, usual[:3, :3], 1.0 if self._found is None else STILL_THERE)
+                self._before = learnt.copy()
+            self._found = self._look(self._before, learnt, 1.0 if self._found is None else STILL_THERE)
         return self._found
 
     def _look(self, usual: Array, learnt: Array, ease: float) -> Vibration | None:
         shifts, times_s = np.array(self._shifts)[:, :3], np.array(self._times_s)
         # Three of four parts must show it, each about its own line: a step or a wild frame is loud in one of them.
-        parts = [_about_its_line(part) for part in np.split(shifts, PARTS)]
-        direction = _loudest(np.mean([part.T @ part / len(part) for part in parts], axis=0), usual)
-        loud = sorted(float(np.square(part @ direction).mean()) for part in parts)
+        parts = _about_its_line(shifts.reshape(PARTS, -1, 3))
+        direction = _loudest(np.einsum("pni,pnj->ij", parts, parts) / KEPT_FRAMES, usual)
+        loud = sorted(np.square(parts @ direction).mean(axis=1).tolist())
         expected = float(direction @ usual @ direction)
         if loud[1] < ease * TIMES * expected:
             return None
@@ -203,10 +218,12 @@ class VibrationWatch:
 
 
 def _about_its_line(values: Array) -> Array:
-    """(n, 3) what is left of values (n, 3) that grow evenly: a creep is no vibration."""
-    index = np.arange(len(values)) - 0.5 * (len(values) - 1)
-    line = np.column_stack([np.ones(len(values)), index])
-    return np.asarray(values - line @ np.linalg.lstsq(line, values, rcond=None)[0])
+    """(..., n, 3) what is left of values (..., n, 3) that grow evenly: a creep is no vibration."""
+    count = values.shape[-2]
+    index = np.arange(count) - 0.5 * (count - 1)
+    slope = np.einsum("n,...ni->...i", index, values) / (index @ index)
+    middle = values.mean(axis=-2)
+    return np.asarray(values - middle[..., None, :] - index[:, None] * slope[..., None, :])
 
 
 def _loudest(covariance: Array, usual: Array) -> Array:

@@ -7,16 +7,21 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gripmon.judge.drift.kinds import History, VibrationWatch, goes_on
-from gripmon.judge.drift.sequential import SequentialTest, square_beyond, whitening
+from gripmon.judge.drift.kinds import BLOCK_S, SIGNIFICANT, History, VibrationWatch, goes_on
 from gripmon.judge.drift.settings import DriftSettings
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import AlertKind, Array, Creep, Motion, Vibration
 
-ALLOWED = 4.0
-"""Standard deviations of the reference, on every axis, up to which a first shift is the reference's error."""
+if TYPE_CHECKING or not COMPILES:
+    from gripmon.judge.drift.sequential import PlainTest as SequentialTest
+else:
+    from gripmon.judge.drift.compiled import CompiledTest as SequentialTest
+
+__all__ = ["USUAL_SQUARE", "Baseline", "MotionWatch", "SequentialTest"]
 
 
 class Baseline:
@@ -31,7 +36,7 @@ class Baseline:
         """``reference_sigma`` (6,): standard deviations of the reference's error, m and rad.  ``error`` (6,) if it is
         known from before.
         """
-        self._allowed = ALLOWED * reference_sigma
+        self._allowed = SIGNIFICANT * reference_sigma
         self._frames = frames
         self._first: list[Array] = []
         self.error = error
@@ -62,17 +67,17 @@ LEVEL_FRAMES, NEWEST_FRAMES = 64, 8
 is the mean.
 """
 
-RETURNED = 12.6
-"""Squared normalised shift below which the camera counts as back: one in twenty unmoved ones exceeds it (chi-square,
-6 degrees of freedom), so that between this and the test's threshold an alert stays.
+USUAL_SQUARE = 12.6
+"""Squared normalised distance that six normal errors exceed once in twenty times (chi-square): with a shift below it
+the camera counts as back, so that between this and the test's threshold an alert stays.
 """
 
 SUSPICIOUS = 0.4
 """Part of the threshold from which the evidence is looked at more closely, before it is decided."""
 
-VIBRATING_FRAMES, VIBRATING_LEVEL = 256, 512
-"""While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone, and
-:data:`LEVEL_FRAMES` then.
+VIBRATING_FRAMES = 256
+"""While it vibrates: frames of the shortest window that decides, for over so many a vibration is nearly gone; over
+twice as many the mean tells whether the camera is back.
 """
 
 BEYOND_VIBRATION = 4.0
@@ -80,20 +85,16 @@ BEYOND_VIBRATION = 4.0
 1.4 to either side.
 """
 
-STEP_S = 0.5
-"""A change of the mean that took no longer is a step."""
-
 
 class MotionWatch:
     """The sequential test, and what follows from it for one camera."""
 
     def __init__(self, settings: DriftSettings):
         self.test = SequentialTest(settings)
-        self._tolerated = settings.tolerated
         self._vibration = VibrationWatch(settings.vibration_m)
         self._history = History()
         self._frames_per_s = settings.frames_per_s
-        self._newest: deque[Array] = deque(maxlen=4 * int(STEP_S * 240.0))
+        self._newest: deque[Array] = deque(maxlen=4 * int(BLOCK_S * 240.0))
         self._kind = AlertKind.DRIFT
         self._present = False
         self._held = 0
@@ -139,12 +140,12 @@ class MotionWatch:
         moved, stepped = bool(finding.moved[0]), bool(finding.stepped[0])
         length = int(finding.length[0])
         self._newest.append(shift)
-        at_once = stepped and length <= STEP_S * self._frames_per_s and not self._goes_on(length)
+        at_once = stepped and length <= BLOCK_S * self._frames_per_s and not self._goes_on(length)
         if stepped:
             test.restart(np.array([True]), length)
-        self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance())
+        self._vibrates = self._vibration.add(shift, now_s, test.usual_covariance)
         frames = max(int(test.windows.frames[0]), 1)
-        level, level_covariance = self._level(min(frames, VIBRATING_LEVEL if self.vibrates_anew else LEVEL_FRAMES))
+        level, level_covariance = self._level(min(frames, 2 * VIBRATING_FRAMES if self.vibrates_anew else LEVEL_FRAMES))
         before = self._present
         # Those that have shown it are forgotten if it was a difference: as many more may show it again.
         self._held = 2 * length if moved else max(self._held - 1, 0)
@@ -201,7 +202,7 @@ class MotionWatch:
         return mean[0], covariance[0]
 
     def _away(self, level: Array, covariance: Array) -> bool:
-        return bool(square_beyond(whitening(covariance), level, self._tolerated) > RETURNED)
+        return self.test.square_beyond(level, covariance) > USUAL_SQUARE
 
     def _look_back(self, level: Array, covariance: Array) -> None:
         """Step or creep, by the last minutes."""

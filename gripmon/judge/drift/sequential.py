@@ -15,10 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from gripmon.judge.drift.settings import DriftSettings
-from gripmon.judge.drift.statistics import BLOCK_FRAMES, LENGTHS, Extremes, Scatter, Windows
+from gripmon.judge.drift.statistics import BLOCK_FRAMES, COUNT, LARGEST, LENGTHS, Extremes, Scatter, Windows
 from gripmon.model.records import Array
 
 SWEEPS = 8
@@ -78,8 +78,8 @@ STUDENT_TAIL, HEAVY = 1.6, (0.25, 1.5)
 heavier, tails has this much of the logarithm of its inflation at least and at most.
 """
 
-SURGE_FRAMES, SURGE_WINDOWS, SURGE_MOST = 32, 16, 4.0
-"""Differences over the last frames, or windows, that are larger than learnt, up to so many times, count as noise."""
+SURGE_FRAMES, SURGE_WINDOWS = 32, 16
+"""Differences over the last frames, or windows, that are larger than learnt count as noise."""
 
 MARGIN = 1.55
 """Factor on the threshold: biases have heavier tails than normal ones, too, and change by more than theory has it (on
@@ -106,8 +106,6 @@ REPORTED_MEMORY = 1.0 / 64.0
 WORTH = 0.25
 """Part of its threshold from which a statistic is worth the search for the shift that may be tolerated."""
 
-_COUNT = np.array(LENGTHS, dtype=float)[:, None]
-
 
 @dataclass(frozen=True, slots=True)
 class Finding:
@@ -122,8 +120,8 @@ class Finding:
     excess: Array
 
 
-class SequentialTest:
-    """Tests ``streams`` series of shifts against a reference."""
+class PlainTest:
+    """Tests ``streams`` series of shifts against a reference, by NumPy."""
 
     def __init__(self, settings: DriftSettings, streams: int = 1):
         self._settings = settings
@@ -137,7 +135,7 @@ class SequentialTest:
         self._seen = np.zeros(streams, dtype=np.intp)
         self._reported: Array = np.zeros((streams, 6, 6))
         self._reference: Array = np.zeros((streams, 6, 6))
-        self._frames = 0
+        self._frames = self._since_restart = 0
         self.refreshes = 0
         """How often covariances and thresholds were reckoned anew."""
         self._surge = np.ones((len(LENGTHS), streams))
@@ -145,7 +143,8 @@ class SequentialTest:
         self._stale = True
         self._threshold = 1.0
         self._inflation: Array | None = None
-        self._extremes = Extremes(np.tile(np.maximum(2.0 * _COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
+        self._extremes = Extremes(np.tile(np.maximum(2.0 * COUNT[:SHORT], ALIKE_FRAMES), (2, 1)), streams)
+        self._of_extremes: tuple[float, np.ndarray, Array] | None = None
         self._limit = np.full((2, len(LENGTHS), streams), np.inf)
         self._known = np.zeros(self._limit.shape, dtype=bool)
         self._middle: Array = np.zeros((streams, 6))
@@ -171,47 +170,59 @@ class SequentialTest:
         usual = self._report(covariance)
         if self._stale or self._frames % REFRESH_FRAMES == 0:
             self._refresh()
-        self.windows.add(self._without_wild_ones(self._as_far_as_sure(shift, usual)))
-        # Of fewer than three frames there is no middle one.
-        self.windows.keep(self._seen < 3, 0)
-        self._frames += 1
+        self.windows.add(self._steady(shift, usual))
+        self._frames, self._since_restart = self._frames + 1, self._since_restart + 1
+        if self._since_restart < 3:
+            # Of fewer than three frames there is no middle one.
+            self.windows.keep(self._seen < 3, 0)
+        mean, difference = self._means()
+        beyond = self._beyond(mean, difference)
+        if self._frames % EXTREME_FRAMES == 0:
+            usable = np.stack(self.windows.full()) & (beyond[1] <= FAR).all(axis=0)
+            self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
+        if self._frames % LEARNING_FRAMES == 0:
+            # An offset that stays says nothing against what differences show.
+            usable = self.windows.full()[1] & ~(beyond[1] > 1.0).any(axis=0)
+            self._learn(difference, usable if learn is None else usable & learn)
+        return self._decide(beyond, LENGTHS.index(at_least))
+
+    def _means(self) -> tuple[Array, Array]:
+        """(k, s, 6) of the windows' means, and those less the means of the windows before."""
         mean, before = self.windows.means()
-        difference = mean - before
+        return mean, mean - before
+
+    def _beyond(self, mean: Array, difference: Array) -> Array:
+        """(2, k, s) squares of means, but for what is tolerated, and of differences, over their limits; 0 for windows
+        that reach back too far.
+        """
         mean_full, both_full = self.windows.full()
         squares = np.stack([square(self._whitening[0], mean), square(self._whitening[1], difference)])
-        full = np.stack([mean_full, both_full])
         # What is tolerated can only matter between these two.
         limit = self._limit
         surely = np.sqrt(limit[0]) + self._most_tolerated
         worth = mean_full & (squares[0] > WORTH * limit[0]) & (squares[0] <= surely * surely)
         if worth.any():
             squares[0, worth] = square_beyond(self._whitening[0, worth], mean[worth], self._tolerated)
-        beyond = np.where(full, squares / limit, 0.0)  # (2, k, s)
-        if self._frames % EXTREME_FRAMES == 0:
-            usable = full & (beyond[1] <= FAR).all(axis=0)
-            self._learn_extremes(mean, difference, usable if learn is None else usable & learn)
-        if self._frames % LEARNING_FRAMES == 0:
-            # An offset that stays says nothing against what differences show.
-            usable = both_full & ~(beyond[1] > 1.0).any(axis=0)
-            if learn is not None:
-                usable &= learn
-            normalised = square(self._learnt_whitening, difference)
-            self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
-            self._learn_surge(normalised, usable)
-            self._learn_tail(normalised, usable)
-        beyond = beyond[:, LENGTHS.index(at_least) :]
+        return np.where(np.stack([mean_full, both_full]), squares / limit, 0.0)
+
+    def _decide(self, beyond: Array, first: int) -> Finding:
+        """By windows from the number ``first`` on."""
+        beyond = beyond[:, first:]
         excess = beyond.max(axis=(0, 1))
         # The shortest window that is beyond its threshold dates the motion best.
         index = (beyond.max(axis=0) > 1.0).argmax(axis=0)
         stepped = beyond[1, index, np.arange(self._streams)] > 1.0
-        return Finding(excess > 1.0, np.array(LENGTHS)[LENGTHS.index(at_least) :][index], stepped, excess)
+        return Finding(excess > 1.0, np.array(LENGTHS)[first:][index], stepped, excess)
 
     def level(self, frames: int) -> tuple[Array, Array]:
         """Mean shift (s, 6) over the last ``frames`` frames, and its covariance (s, 6, 6) (that of the next shorter
-        window of :data:`LENGTHS`).
+        window of :data:`LENGTHS`, which are the powers of two).
         """
-        index = int(np.searchsorted(LENGTHS, frames, side="right")) - 1
-        return self.windows.mean_of_last(frames), self._mean_covariance[index]
+        return self.windows.mean_of_last(frames), self._mean_covariance[frames.bit_length() - 1]
+
+    def square_beyond(self, shift: Array, covariance: Array) -> float:
+        """Normalised square of what of a shift (6,) with a covariance (6, 6) isn't tolerated."""
+        return float(square_beyond(whitening(covariance), shift, self._tolerated))
 
     def noticed(self) -> Array | None:
         """(6,) constant shifts, each alone on its axis, that the first stream's windows that are full show by their
@@ -232,12 +243,7 @@ class SequentialTest:
         """Forget the frames of some streams (s,) but the last ``keep``; what was learnt about the noise stays."""
         self.windows.keep(streams, keep)
         self._seen = np.where(streams & (np.asarray(keep) == 0), 0, self._seen)
-
-    def _as_far_as_sure(self, shift: Array, usual: Array) -> Array:
-        """A frame that claims more error than usual (s,) moves the series by that much less."""
-        fresh = self._seen == 0
-        self._sure = np.where(fresh[:, None], shift, self._sure + usual[:, None] * (shift - self._sure))
-        return self._sure
+        self._since_restart = 0
 
     def _report(self, covariance: Array) -> Array:
         """Follow the reported covariances; the usual variances over this frame's, 1 at most, on average (s,)."""
@@ -249,13 +255,16 @@ class SequentialTest:
         variances = np.einsum("sii->si", covariance) / np.einsum("sii->si", self._reported)
         return 1.0 / np.maximum(variances.mean(axis=1), 1.0)
 
-    def _without_wild_ones(self, shift: Array) -> Array:
-        """Median of three frames: no single frame can decide, and a step is late by one.
+    def _steady(self, shift: Array, usual: Array) -> Array:
+        """Median of three frames: no single frame can decide, and a step is late by one.  A frame that claims more
+        error than usual (s,) moves the series by that much less.
 
         In axes in which errors are independent: medians of axes whose errors belong together need not be a shift that
         any of the frames makes likely.
         """
-        last = np.where((self._seen == 0)[:, None], shift, self._last_two)
+        fresh = (self._seen == 0)[:, None]
+        shift = self._sure = np.where(fresh, shift, self._sure + usual[:, None] * (shift - self._sure))
+        last = np.where(fresh, shift, self._last_two)
         self._last_two = np.stack([last[1], shift])
         self._seen += 1
         one, two = (times(self._to_reported, each) for each in last)
@@ -263,56 +272,73 @@ class SequentialTest:
         middle = np.maximum(np.minimum(one, two), np.minimum(np.maximum(one, two), three))
         return times(self._from_reported, middle)
 
+    def _learn(self, difference: Array, usable: np.ndarray) -> None:
+        """What differences (k, s, 6) show of the noise, where they are usable (k, s)."""
+        normalised = square(self._learnt_whitening, difference)
+        self.scatter.learn(difference, normalised, usable, LEARNING_FRAMES)
+        self._learn_surge(normalised, usable)
+        self._learn_tail(normalised, usable)
+
     def _learn_surge(self, normalised: Array, usable: np.ndarray) -> None:
         """Whether differences (k, s) are larger just now than in the long run: noise comes in bursts."""
-        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * _COUNT), 0.0)
-        self._surge += rate * (np.minimum(normalised / 6.0, SURGE_MOST) - self._surge)
+        rate = np.where(usable, LEARNING_FRAMES / np.maximum(SURGE_FRAMES, SURGE_WINDOWS * COUNT), 0.0)
+        self._surge += rate * (np.minimum(normalised / 6.0, LARGEST) - self._surge)
 
     def _learn_tail(self, normalised: Array, usable: np.ndarray) -> None:
         """Follow the size of differences (k, s) that one in a hundred exceeds (Robbins and Monro), over that of normal
         ones.
         """
-        share = np.minimum(LEARNING_FRAMES / (2.0 * _COUNT), 1.0) / TAIL_WINDOWS
+        share = np.minimum(LEARNING_FRAMES / (2.0 * COUNT), 1.0) / TAIL_WINDOWS
         beyond = (normalised > self._tail * NORMAL_SQUARE) / TAIL - 1.0
         self._tail = np.maximum(self._tail * np.exp(np.where(usable, share * beyond, 0.0)), 1.0)
 
     def _learn_extremes(self, mean: Array, difference: Array, usable: np.ndarray) -> None:
         """Means about that of the longest window: an offset that stays is no noise, and a creep is hardly any."""
-        values = np.stack([mean[:SHORT] - self._middle, difference[:SHORT]])
-        most = np.where(self._known[:, :SHORT], FAR * self._limit[:, :SHORT], np.inf)
-        squares = np.minimum(square(self._plain, values), most)
+        squares = self._extreme_squares(mean, difference)
         usable = usable[:, :SHORT].copy()
         # The longest window was full already when its mean was taken last.
         usable[0] &= self.windows.frames >= LENGTHS[-1] + REFRESH_FRAMES
         kinds = (2 * SHORT, self._streams)
         if self._extremes.add(squares.reshape(kinds), usable.reshape(kinds), EXTREME_FRAMES):
             self._stale = True
+            self._learnt_limits()  # what the next frame's refresh wants, so that no frame pays for both
+
+    def _extreme_squares(self, mean: Array, difference: Array) -> Array:
+        """(2, k, s) of the short windows, up to :data:`FAR` times the limit where that is known."""
+        values = np.stack([mean[:SHORT] - self._middle, difference[:SHORT]])
+        most = np.where(self._known[:, :SHORT], FAR * self._limit[:, :SHORT], np.inf)
+        return np.minimum(square(self._plain, values), most)
 
     def _refresh(self) -> None:
         fitted, self._stale = self._stale, False
         self.refreshes += 1
-        self._from_reported = np.linalg.cholesky(self._reported)
-        self._to_reported = np.linalg.inv(self._from_reported)
         # Slow to compute, slow to change.
         if self._inflation is None or self._frames % (16 * REFRESH_FRAMES) == 0:
             self._threshold, self._inflation = rarity(
                 self._settings.false_alarms_per_day, self._frames_per_s, self.scatter.windows
             )
+        self._middle = self.windows.mean_of_last(LENGTHS[-1])
+        if fitted:
+            self._limit, self._known = self._limits()
         heavy = np.clip((self._tail - 1.0) / (STUDENT_TAIL - 1.0), *HEAVY)
         surge = np.maximum(self._surge, 1.0)
         # What is told of a mean is its standard deviation, not what would be too rare.
-        each = np.stack([self._inflation**heavy * surge, np.ones_like(surge), surge])
+        self._whiten(np.stack([self._inflation**heavy * surge, np.ones_like(surge), surge]))
+        self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
+
+    def _whiten(self, each: Array) -> None:
+        """Covariances of means and differences, and their whitening, where the variance of what was seen counts so
+        many times, ``each`` (3, k, s): for limits that are assumed, standard deviations, and limits that are learnt.
+        """
+        self._from_reported = np.linalg.cholesky(self._reported)
+        self._to_reported = np.linalg.inv(self._from_reported)
         of_mean, of_difference = self.scatter.covariances(self._reported, each)
         self._plain = whitening(np.stack([of_mean[2, :SHORT], of_difference[2, :SHORT]]))
         of_mean += self._reference
         self._mean_covariance = of_mean[1]
-        self._middle = self.windows.mean_of_last(LENGTHS[-1])
-        if fitted:
-            self._limit, self._known = self._limits()
         known = self._known[..., None, None]
         of_both = np.stack([of_mean[::2], of_difference[::2]])  # (2 statistics, assumed and learnt, k, s, 6, 6)
         self._whitening = whitening(np.where(known, of_both[:, 1], of_both[:, 0]))
-        self._most_tolerated = np.linalg.norm(np.abs(self._whitening[0]) @ self._tolerated, axis=-1)
         self._learnt_whitening = whitening(self.scatter.of_differences)
 
     def _limits(self) -> tuple[Array, np.ndarray]:
@@ -321,17 +347,23 @@ class SequentialTest:
         None is below what normal errors ask for.  A bias that a stream has never been seen to change within so many
         frames may do so for the first time, but once in as many frames at most.
         """
-        chance = self._settings.false_alarms_per_day / (86_400.0 * self._frames_per_s)
-        learnt = self._extremes.limits(min(chance * BLOCK_FRAMES / (2 * SHORT), 0.1)).reshape(2, SHORT, -1)
-        blocks = self._extremes.blocks.reshape(2, SHORT, -1)
-        normal = stats.chi2.isf(min(chance / (2 * SHORT), 0.1), 6)
-        changes = 6.0 * stats.f.isf(np.clip(chance * BLOCK_FRAMES * blocks[1], 1e-12, 0.5), 6.0, BIAS_FREEDOM)
+        learnt = self._learnt_limits()
         limit = np.full((2, len(LENGTHS), self._streams), self._threshold)
         known = np.zeros(limit.shape, dtype=bool)
         known[:, :SHORT] = np.isfinite(learnt)
-        least = np.stack([np.full(changes.shape, normal), changes])
-        limit[:, :SHORT] = np.where(known[:, :SHORT], np.maximum(learnt, least), self._threshold)
+        limit[:, :SHORT] = np.where(known[:, :SHORT], learnt, self._threshold)
         return limit, known
+
+    def _learnt_limits(self) -> Array:
+        """(2, SHORT, s) by the extremes of the blocks so far; infinite where too few are known."""
+        chance, blocks = self._settings.false_alarms_per_day / (86_400.0 * self._frames_per_s), self._extremes.blocks
+        if self._of_extremes is None or self._of_extremes[0] != chance or self._of_extremes[1] is not blocks:
+            learnt = self._extremes.limits(min(chance * BLOCK_FRAMES / (2 * SHORT), 0.1)).reshape(2, SHORT, -1)
+            seen = np.clip(chance * BLOCK_FRAMES * blocks.reshape(2, SHORT, -1)[1], 1e-12, 0.5)
+            changes = 6.0 * special.fdtri(6.0, BIAS_FREEDOM, 1.0 - seen)
+            normal = np.full(changes.shape, special.chdtri(6, min(chance / (2 * SHORT), 0.1)))
+            self._of_extremes = chance, blocks, np.maximum(learnt, np.stack([normal, changes]))
+        return self._of_extremes[2]
 
 
 def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> tuple[float, Array]:
@@ -343,6 +375,6 @@ def rarity(false_alarms_per_day: float, frames_per_s: float, windows: Array) -> 
     Student's distribution, with its degrees of freedom: both count.
     """
     chance = false_alarms_per_day / (86_400.0 * frames_per_s * 2 * len(LENGTHS))
-    freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * _COUNT**FREEDOM_GROWTH))
-    threshold = float(stats.chi2.isf(chance, 6))
-    return MARGIN * threshold, np.asarray(stats.f.isf(chance, 6.0, freedom) * 6.0 / threshold)
+    freedom = 1.0 / (1.0 / windows + 1.0 / (FREEDOM * COUNT**FREEDOM_GROWTH))
+    threshold = float(special.chdtri(6, chance))
+    return MARGIN * threshold, np.asarray(special.fdtri(6.0, freedom, 1.0 - chance) * 6.0 / threshold)

@@ -47,6 +47,11 @@ class Windows:
         """(s,) frames in the windows of each stream."""
         return self._frames
 
+    @property
+    def sums(self) -> tuple[Array, int]:
+        """Ring (n, s, 6) of the sums over all frames until each of the last n, and the newest one's number in it."""
+        return self._ring, self._newest
+
     def add(self, values: Array) -> None:
         """One frame's values (s, 6)."""
         following = (self._newest + 1) % len(self._ring)
@@ -95,8 +100,10 @@ MEMORY_FRAMES, MEMORY_WINDOWS = 36_000, 200
 LARGEST = 4.0
 """Normalised square of a difference, over its expectation, beyond which it counts as that much only."""
 
-_COUNT = np.array(LENGTHS, dtype=float)[:, None]
-_RARE = [min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)]
+COUNT = np.array(LENGTHS, dtype=float)[:, None]
+"""(k, 1) the lengths, for what is reckoned for all of them at once."""
+RARE = np.array([min(k + LONGER[length >= LONG], len(LENGTHS)) for k, length in enumerate(LENGTHS)])
+"""(k,) number of the first length in which noise is rare to each."""
 
 
 class Scatter:
@@ -120,8 +127,8 @@ class Scatter:
         """Differences (k, s, 6) of neighbouring windows after ``frames`` more of them, their squares ``normalised``
         (k, s) to a mean of 6, and which of them to learn from.
         """
-        share = np.minimum(0.5 * frames / _COUNT, 1.0)  # of an independent pair of windows
-        most = np.maximum(0.5 * MEMORY_FRAMES / _COUNT, MEMORY_WINDOWS)
+        share = np.minimum(0.5 * frames / COUNT, 1.0)  # of an independent pair of windows
+        most = np.maximum(0.5 * MEMORY_FRAMES / COUNT, MEMORY_WINDOWS)
         self._windows = np.where(usable, np.minimum(self._windows + share, most), self._windows)
         tame = np.minimum(1.0, 6.0 * LARGEST / np.maximum(normalised, 1e-12))
         gain = np.where(usable, share / self._windows, 0.0)
@@ -146,7 +153,7 @@ class Scatter:
         # What was only assumed has not been seen.
         learnt = (1.0 - PRIOR_WINDOWS / self._windows)[..., None, None]
         seen = np.cumsum((learnt * parts)[::-1], axis=0)[::-1]
-        rare = np.concatenate([seen, np.zeros_like(seen[:1])])[_RARE]
+        rare = np.concatenate([seen, np.zeros_like(seen[:1])])[RARE]
         # All lengths at once: what is missing of the claim altogether, and of what is seen often enough.
         missing = _what_is_missing(np.concatenate([seen[:1], seen[:1] - rare]), reported)
         return total + missing[0], inflated * self._of_difference + 2.0 * missing[1:]
@@ -176,6 +183,8 @@ FEWEST_BLOCKS = 32
 UPPER = 0.25
 """Part of the blocks that is the tail."""
 
+_LEFT_OUT = -1.0  # below the root of any square
+
 
 class Extremes:
     """Limits of statistics (kinds, streams), each by its own extremes.
@@ -185,7 +194,7 @@ class Extremes:
 
     def __init__(self, frames: Array, streams: int):
         shape = (len(frames), streams)
-        self._ring = np.full((KEPT_BLOCKS, *shape), np.nan)
+        self._ring = np.full((*shape, KEPT_BLOCKS), _LEFT_OUT)
         self._largest = np.zeros(shape)
         self._usable = np.zeros(shape, dtype=np.intp)
         self._frames = 0
@@ -204,24 +213,24 @@ class Extremes:
             return False
         enough = 2 * self._usable >= BLOCK_FRAMES
         place = (self._frames // BLOCK_FRAMES - 1) % KEPT_BLOCKS
-        self._ring[place] = np.where(enough, np.sqrt(self._largest), np.nan)
+        self._ring[..., place] = np.where(enough, np.sqrt(self._largest), _LEFT_OUT)
         self._largest[:] = 0.0
         self._usable[:] = 0
-        self.blocks = np.isfinite(self._ring).sum(axis=0)
+        self.blocks = (self._ring != _LEFT_OUT).sum(axis=-1)
         return True
 
     def limits(self, chance: float) -> Array:
         """(kinds, streams) squares that a block exceeds with this chance; infinite where too little is known."""
-        shown = self._ring[: min(self._frames // BLOCK_FRAMES, KEPT_BLOCKS)]
+        count = min(self._frames // BLOCK_FRAMES, KEPT_BLOCKS)
         enough = self.blocks >= FEWEST_BLOCKS * self._alike
         if not enough.any():
             return np.full(enough.shape, np.inf)
         tail = (UPPER * self.blocks).astype(np.intp)
-        # Those that are missing come first.
-        ordered = np.sort(np.where(np.isnan(shown), -1.0, shown), axis=0)
-        rank = len(shown) - np.arange(len(shown))[:, None, None]
-        start = np.take_along_axis(ordered, (len(shown) - tail - 1).clip(0)[None], axis=0)[0]
-        scale = np.where(rank <= tail, ordered, 0.0).sum(axis=0) / np.maximum(tail, 1) - start
+        # Those that are left out come first; only the upper ones need be in order.
+        ordered = np.sort(self._ring[..., :count], axis=-1)
+        start = np.take_along_axis(ordered, (count - tail - 1).clip(0)[..., None], axis=-1)[..., 0]
+        rank = count - np.arange(count)
+        scale = np.where(rank <= tail[..., None], ordered, 0.0).sum(axis=-1) / np.maximum(tail, 1) - start
         # An exponential law whose scale is the mean of n values: (1 + x / (n scale))^-n is the chance of the next.
         known = np.maximum(tail / self._alike, 1.0)
         reach = known * np.expm1(math.log(UPPER / chance) / known)

@@ -110,6 +110,7 @@ class Policy:
     def __init__(self, settings: PolicySettings, may_recalibrate: bool = True):
         self._settings = settings
         self._may_recalibrate = may_recalibrate
+        self._worth_a_warning = np.array([settings.warn_m] * 3 + [settings.warn_rad] * 3)
         self.alerts = AlertBook(settings.update_alert_s, settings.clear_alert_s)
         self.state = State.ACQUIRING
         self._since_jump = 0
@@ -269,7 +270,7 @@ class Policy:
     @property
     def worth_a_warning(self) -> Array:
         """(6,) shifts of the TCP and turns from which a drift is a warning, m and rad."""
-        return np.array([self._settings.warn_m] * 3 + [self._settings.warn_rad] * 3)
+        return self._worth_a_warning
 
     @property
     def still_frames(self) -> int:

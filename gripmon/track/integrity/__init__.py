@@ -2,6 +2,17 @@
 
 from gripmon.track.integrity.hypotheses import Hypotheses, hypotheses_of
 from gripmon.track.integrity.quantiles import bounds
-from gripmon.track.integrity.separation import Doubts, Separation, separate
+from gripmon.track.integrity.separation import Doubts, Separation, Sums, follow, normalised_squares, telling, warm_up
 
-__all__ = ["Doubts", "Hypotheses", "Separation", "bounds", "hypotheses_of", "separate"]
+__all__ = [
+    "Doubts",
+    "Hypotheses",
+    "Separation",
+    "Sums",
+    "bounds",
+    "follow",
+    "hypotheses_of",
+    "normalised_squares",
+    "telling",
+    "warm_up",
+]

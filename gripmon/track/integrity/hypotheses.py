@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 from gripmon.model.records import Array
 
 EDGE = 1e-2
-"""Probability a frame that an edge that agrees belongs to something else: a border parallel to it, a pad, a shadow."""
+"""Probability a frame that an edge that agrees belongs to something else, a border parallel to it, a pad, a shadow; or
+that the ends of one finger do, together.
+"""
 
-ONE_FINGERS_ENDS = 1e-2
-"""Probability that the ends of one finger do."""
-
-FINGER = 1e-3
-"""That a finger isn't where the model has it: bent, shifted in its holder, exchanged."""
-
-OPENING = 1e-3
-"""That the reported jaw opening is wrong by more than its stated standard deviation allows."""
+GRIPPER = 1e-3
+"""Probability that the gripper isn't as it is said to be: a finger bent, shifted in its holder or exchanged, or the jaw
+opening off by more than the report's standard deviation allows.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +55,11 @@ def hypotheses_of(
         own = finger == number
         if (own & ~along).sum() > 1:
             what = f"the ends of finger {name} belong to something else"
-            rows.append((what, ONE_FINGERS_ENDS, ~(own & ~along), False, False))
+            rows.append((what, EDGE, ~(own & ~along), False, False))
         if own.any() and not own.all():
-            rows.append((f"finger {name} is not where its model says", FINGER, ~own, False, True))
+            rows.append((f"finger {name} is not where its model says", GRIPPER, ~own, False, True))
     if has_opening:
-        rows.append(("the jaw opening is wrong", OPENING, whole, True, False))
+        rows.append(("the jaw opening is wrong", GRIPPER, whole, True, False))
     ends = len(rows)
     rows.append(("what looks like the fingers' ends is something else", 1.0, along, False, True))
     names, prior, keep, opening, sudden = zip(*rows, strict=True)

@@ -9,11 +9,17 @@ from scipy import stats
 
 from gripmon.model.records import Array
 
-_LOG_RISK = np.linspace(-14.0, 0.0, 281)
-_SQUARES = stats.chi2.isf(10.0**_LOG_RISK, np.array([[1.0], [3.0]]))
+LOG_RISK_SPACING = 0.05
+_LOG_RISK = -LOG_RISK_SPACING * np.arange(281.0)
+SQUARES = stats.chi2.isf(10.0**_LOG_RISK, np.array([[1.0], [3.0]]))
+"""(2, 281) squares that normal errors along one axis, and along three equal ones, exceed with the probabilities 1 to
+1e-14, in even steps of their logarithm.
+"""
 
-LARGEST_LOG_FACTOR = 14.0
-"""By how much two equal axes would raise the tail of the third, as a power of ten: more than any risk has."""
+GUIDE_STEP = 0.25
+_STEPS = np.arange(0.0, SQUARES.max(), GUIDE_STEP)
+GUIDE = np.stack([np.searchsorted(row, _STEPS, side="right").clip(1, len(row) - 1) - 1 for row in SQUARES])
+"""(2, n) where a square's place in the table is found from on, for each :data:`GUIDE_STEP`."""
 
 
 class Tails(NamedTuple):
@@ -36,21 +42,21 @@ class Tails(NamedTuple):
         variance = np.maximum(np.linalg.eigvalsh(covariance), 0.0)
         largest = np.maximum(variance[..., 2], 1e-300)
         left = np.maximum(1.0 - variance[..., :2] / largest[..., None], 1e-12)
-        return cls(np.sqrt(largest), np.minimum(-0.5 * np.log10(left).sum(axis=-1), LARGEST_LOG_FACTOR))
+        return cls(np.sqrt(largest), -0.5 * np.log10(left).sum(axis=-1))
 
     def radius(self, risk: Array) -> Array:
         """Lengths that are exceeded with the probabilities ``risk``."""
         log_risk = np.log10(np.maximum(risk, 1e-300))
-        one = np.interp(log_risk - self.factor, _LOG_RISK, _SQUARES[0])
-        three = np.interp(log_risk, _LOG_RISK, _SQUARES[1])
+        # The tables run from the certain to the improbable.
+        one = np.interp(self.factor - log_risk, -_LOG_RISK, SQUARES[0])
+        three = np.interp(-log_risk, -_LOG_RISK, SQUARES[1])
         return np.asarray(self.sigma * np.sqrt(np.minimum(one, three)))
 
     def beyond(self, radius: Array) -> Array:
         """Probabilities of lengths above ``radius``; 1 for a negative one."""
         square = np.square(np.maximum(radius, 0.0) / self.sigma)
-        # The tables run from the improbable to the certain: their squares fall.
-        one = np.interp(square, _SQUARES[0, ::-1], _LOG_RISK[::-1]) + self.factor
-        three = np.interp(square, _SQUARES[1, ::-1], _LOG_RISK[::-1])
+        one = np.interp(square, SQUARES[0], _LOG_RISK) + self.factor
+        three = np.interp(square, SQUARES[1], _LOG_RISK)
         return np.asarray(10.0 ** np.minimum(one, three))
 
 

@@ -7,47 +7,113 @@ covariance allows.  The protection level PL is the length that all hypotheses to
 user algorithm", 2015):
 
     sum over k of p_k P(|x_0 - x_k| + |e_k| > PL) = r,   e_k normal with the covariance of x_k
+
+The arithmetic is compiled (:mod:`~gripmon.track.integrity.kernel`), or NumPy's where nothing compiles.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import compress
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gripmon.model.compiled import COMPILES
 from gripmon.model.records import Array
-from gripmon.track.integrity.quantiles import Tails
+from gripmon.track.integrity import kernel, plain
+from gripmon.track.integrity.quantiles import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
 
 NEAR = 1.02
 """Factor within which a protection level is found; the larger end counts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Separation:
-    """Fits under all hypotheses: ``shift`` (h, m) of the unknowns against those that the sums are of, ``covariance``
-    (h, m, m) of that, ``inverse`` (h, m, m) of the normal matrices.
+class Separation(NamedTuple):
+    """Fits under all hypotheses: ``shift`` (h, n) of the first n unknowns against those that the sums are of,
+    ``covariance`` (h, n, n) of that, and ``of_model`` (h, f, n): how they are off where one of the gripper's f parts is
+    off by its standard deviation.
     """
 
     shift: Array
     covariance: Array
-    inverse: Array
+    of_model: Array
 
 
-def separate(
-    pull: Array, information: Array, middle: Array, keep: Array, known: Array, known_pull: Array
-) -> Separation:
-    """Fits from the normal equations of the kept edges.
-
-    ``pull`` (v, m), ``information`` and ``middle`` (v, m, m) as the fit has them at its solution; ``keep`` (h, v) of 0
-    and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull at the solution.  Where
-    nothing determines a direction, ``known`` must: LinAlgError otherwise.
+class Sums(NamedTuple):
+    """Normal equations under all hypotheses: ``pull`` (h, m), ``normal`` matrices and covariances of the pulls, their
+    ``spread`` (h, m, m), and ``of_model`` (h, f, m), the pulls of the gripper's f parts.
     """
-    m = pull.shape[1]
-    inverse = np.linalg.inv((keep @ information.reshape(len(information), -1)).reshape(-1, m, m) + known)
-    shift = np.einsum("hij,hj->hi", inverse, keep @ pull + known_pull)
-    spread = (keep @ middle.reshape(len(middle), -1)).reshape(-1, m, m) + known
-    return Separation(shift, inverse @ spread @ inverse, inverse)
+
+    pull: Array
+    normal: Array
+    spread: Array
+    of_model: Array
+
+    @classmethod
+    def of_kept(
+        cls,
+        pull: Array,
+        information: Array,
+        middle: Array,
+        model: tuple[Array, NDArray[np.intp], int],
+        keep: Array,
+        known: Array,
+        known_pull: Array,
+    ) -> Sums:
+        """Of the kept edges among v.
+
+        ``pull`` (v, m), ``information`` and ``middle`` (v, m, m) as the fit has them at its solution; ``model``: how
+        each edge pulls (v, m) where its part of the gripper is off, which part (v,) that is, and how many there are;
+        ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
+        """
+        add_up = kernel.add_up if COMPILES else plain.add_up
+        return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
+
+    def with_pose(self, at: Array, covariance: Array, of_model: Array) -> Sums:
+        """With the first six unknowns known to be ``at`` (6,) but for a ``covariance`` (6, 6), and off by ``of_model``
+        (f, 6), or (1, 6) of zeros.
+        """
+        return Sums(*_first_that_can(kernel.with_pose, plain.with_pose, *self, at, covariance, of_model))
+
+    def fits(self, unknowns: int = 6) -> Separation:
+        """The fits' first ``unknowns``.  Where nothing determines a direction, ``known`` must: LinAlgError else."""
+        return Separation(*_first_that_can(kernel.separate, plain.separate, *self, unknowns))
+
+
+def normalised_squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> Array:
+    """(h,) of shifts (h, 6) from ``at`` (6,), by ``times`` the covariances (h, 6, 6) and ``more`` (6, 6)."""
+    [squares] = _first_that_can(kernel.squares, plain.squares, shift, at, covariance, times, more)
+    return squares
+
+
+def follow(averages: Separation, frame: Separation, creep: Array) -> tuple[Separation, Array]:
+    """A bank of g Kalman filters, the same average once under each hypothesis, after one more measurement, the pose
+    having crept by the variances ``creep`` (6,) since the one before; and the traces (g,) of the gains.
+    """
+    *after, gains = _first_that_can(kernel.follow, plain.follow, *averages, *frame, creep)
+    return Separation(*after), gains
+
+
+def telling(
+    averages: Separation, at: Array, wander: Array, frame: Separation, rows: NDArray[np.intp], limit: float
+) -> Separation:
+    """Under each hypothesis what knows more by the position's variances, the average, from ``at`` (6,) and after a way
+    with the variances ``wander`` (6,), or the frame's fit ``rows`` (g,); but the frame's where they differ by more than
+    a normalised square of ``limit``.  A negative row is no fit.
+    """
+    of = *averages, at, wander, *frame, rows, limit
+    return Separation(*_first_that_can(kernel.telling, plain.telling, *of))
+
+
+def _first_that_can(compiled: Callable[..., Any], by_numpy: Callable[..., Any], *of: Any) -> Sequence[Array]:
+    """What the compiled function gives; NumPy's where nothing compiles, or a matrix isn't positive definite."""
+    if COMPILES:
+        found, *result = compiled(*of)
+        if found:
+            return result
+    return by_numpy(*of)[1:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,21 +128,20 @@ class Doubts:
     tails: Tails
 
     @classmethod
-    def of(cls, name: tuple[str, ...], prior: Array, shift: Array, covariance: Array, inflation: float) -> Doubts:
-        """``shift`` (h, 6) from the published pose to the other fits, ``covariance`` (h, 6, 6) of those.
+    def of(cls, name: tuple[str, ...], prior: Array, fits: Separation, inflation: float) -> Doubts:
+        """``fits`` with shifts (h, 6) from the published pose to the others.
 
         ``inflation``: factor on standard deviations with which a normal distribution bounds the tails of real errors.
         """
-        parts = shift.reshape(-1, 2, 3)
-        blocks = np.stack([covariance[:, :3, :3], covariance[:, 3:, 3:]])
-        away = np.sqrt(np.einsum("hpi,hpi->ph", parts, parts))
-        return cls(name, prior, away, Tails.of(inflation**2 * blocks))
+        away, sigma, factor = (kernel.tails if COMPILES else plain.tails)(*fits, inflation)
+        return cls(name, prior, away, Tails(sigma, factor))
 
     def among(self, chosen: NDArray[np.bool_]) -> Doubts:
         """Those that are ``chosen`` (h,)."""
-        names = tuple(name for name, one in zip(self.name, chosen.tolist(), strict=True) if one)
+        if chosen.all():
+            return self
         tails = Tails(self.tails.sigma[:, chosen], self.tails.factor[:, chosen])
-        return Doubts(names, self.prior[chosen], self.away[:, chosen], tails)
+        return Doubts(tuple(compress(self.name, chosen.tolist())), self.prior[chosen], self.away[:, chosen], tails)
 
     def __add__(self, other: Doubts) -> Doubts:
         tails = Tails(*(np.concatenate(both, axis=1) for both in zip(self.tails, other.tails, strict=True)))
@@ -92,20 +157,24 @@ class Doubts:
 
         What is together less probable than the risk isn't bounded by a length: it takes its part of the risk.
         """
-        share = risk / max(len(self.prior), 1)
-        counted = self.prior > share
-        if not counted.any():
-            return 0.0, 0.0, ""
-        left = risk - float(self.prior[~counted].sum())
-        some = self.among(counted)
-        away, tails, prior = some.away, some.tails, some.prior
-        # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
-        least = (away + tails.radius(np.broadcast_to(left / prior, away.shape))).max(axis=1)
-        most = (away + tails.radius(np.broadcast_to(left / len(prior) / prior, away.shape))).max(axis=1)
-        least = np.maximum(least, 1e-3 * most)
-        while (most > NEAR * least).any():
-            middle = np.sqrt(least * most)
-            enough = (prior * tails.beyond(middle[:, None] - away)).sum(axis=1) <= left
-            least, most = np.where(enough, least, middle), np.where(enough, middle, most)
-        owed = prior * tails.beyond(most[:, None] - away)[0]
-        return float(most[0]), float(most[1]), some.name[int(np.argmax(owed))]
+        of = self.prior, self.away, *self.tails, risk, NEAR
+        if COMPILES:
+            position, rotation, number = kernel.levels(*of, SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP)
+        else:
+            position, rotation, number = plain.levels(*of)
+        return position, rotation, self.name[number] if number >= 0 else ""
+
+
+def warm_up() -> None:
+    """Compile what a frame needs, or load what was compiled."""
+    whole, none = np.ones((2, 2)), np.zeros(6)
+    for m in (6, 7):
+        each = np.tile(np.eye(m), (2, 1, 1))
+        model = np.zeros((2, m)), np.zeros(2, dtype=np.intp), 1
+        alone = Sums.of_kept(np.zeros((2, m)), each, each, model, whole, each, np.zeros((2, m)))
+        fits = alone.fits()
+        fits = alone.with_pose(none, np.eye(6), fits.of_model[0]).fits()
+    normalised_squares(fits.shift, none, fits.covariance, 1.0, np.eye(6))
+    averages, _ = follow(fits, fits, none)
+    told = telling(averages, none, none, fits, np.arange(2), 1.0)
+    Doubts.of(("", ""), np.ones(2), told, 1.0).levels(1e-5)

@@ -1,0 +1,394 @@
+"""The arithmetic of the sequential test, compiled: k lengths of windows, s streams, six axes.
+
+What the quantities mean, and the same by NumPy, stands in :mod:`~gripmon.judge.drift.sequential` and
+:mod:`~gripmon.judge.drift.statistics`, in functions of the same names.  What is learnt is changed in place.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+ROUNDS = 30
+"""Sweeps of Jacobi's rotations, of which some six suffice: each squares what is left."""
+
+
+@compiled
+def _root(matrix: Array, root: Array) -> bool:
+    """Cholesky's lower ``root`` (6, 6); False for a matrix that isn't positive definite."""
+    root[:] = 0.0
+    for i in range(6):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= root[i, k] * root[j, k]
+            if j < i:
+                root[i, j] = rest / root[j, j]
+            elif rest > 0.0:
+                root[i, i] = math.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@compiled
+def _invert_root(root: Array, inverse: Array) -> None:
+    """``inverse`` (6, 6) of a lower triangle."""
+    inverse[:] = 0.0
+    for j in range(6):
+        inverse[j, j] = 1.0 / root[j, j]
+        for i in range(j + 1, 6):
+            total = 0.0
+            for k in range(j, i):
+                total -= root[i, k] * inverse[k, j]
+            inverse[i, j] = total / root[i, i]
+
+
+@compiled
+def _whiten(matrix: Array, root: Array, whitening: Array) -> bool:
+    """W with ``W C W' = 1``, lower triangular."""
+    if not _root(matrix, root):
+        return False
+    _invert_root(root, whitening)
+    return True
+
+
+@compiled
+def _square(whitening: Array, values: Array) -> float:
+    """Normalised square of ``values`` (6,) by a lower triangle."""
+    total = 0.0
+    for i in range(6):
+        white = 0.0
+        for j in range(i + 1):
+            white += whitening[i, j] * values[j]
+        total += white * white
+    return total
+
+
+@compiled
+def squares(whitening: Array, values: Array) -> Array:
+    """(k, s) normalised squares of values (k, s, 6), by lower triangles (k, s, 6, 6)."""
+    out = np.empty(values.shape[:2])
+    for k in range(values.shape[0]):
+        for s in range(values.shape[1]):
+            out[k, s] = _square(whitening[k, s], values[k, s])
+    return out
+
+
+@compiled
+def _square_beyond(whitening: Array, shift: Array, tolerated: Array, sweeps: int) -> float:
+    """Smallest normalised square of ``shift`` (6,) less what lies within ``tolerated`` (6,), by coordinate descent."""
+    precision, left, best = np.zeros((6, 6)), np.empty(6), math.inf
+    for i in range(6):
+        for j in range(6):
+            for k in range(max(i, j), 6):
+                precision[i, j] += whitening[k, i] * whitening[k, j]
+    for start in range(2):
+        for i in range(6):
+            taken = min(max(shift[i], -tolerated[i]), tolerated[i]) if start == 1 else 0.0
+            left[i] = shift[i] - taken
+        for _ in range(sweeps):
+            for axis in range(6):
+                pull = 0.0
+                for j in range(6):
+                    pull += precision[axis, j] * left[j]
+                taken = shift[axis] - left[axis] + pull / precision[axis, axis]
+                left[axis] = shift[axis] - min(max(taken, -tolerated[axis]), tolerated[axis])
+        best = min(best, _square(whitening, left))
+    return best
+
+
+@compiled
+def square_beyond(covariance: Array, shift: Array, tolerated: Array, sweeps: int) -> tuple[bool, float]:
+    """Normalised square of what of a shift (6,) isn't tolerated; and False before it where there is no root."""
+    root, whitening = np.empty((6, 6)), np.empty((6, 6))
+    if not _whiten(covariance, root, whitening):
+        return False, 0.0
+    return True, _square_beyond(whitening, shift, tolerated, sweeps)
+
+
+@compiled
+def report(reported: Array, covariance: Array, memory: float) -> Array:
+    """Follow the reported covariances (s, 6, 6); the usual variances over this frame's, 1 at most, on average (s,)."""
+    usual = np.empty(len(reported))
+    for s in range(len(reported)):
+        share = 0.0
+        for i in range(6):
+            for j in range(6):
+                reported[s, i, j] += memory * (covariance[s, i, j] - reported[s, i, j])
+            share += covariance[s, i, i] / reported[s, i, i]
+        usual[s] = 1.0 / max(share / 6.0, 1.0)
+    return usual
+
+
+@compiled
+def steady(
+    shift: Array, usual: Array, seen: Ints, sure: Array, last_two: Array, to_reported: Array, from_reported: Array
+) -> Array:
+    """Shifts (s, 6) as far as they are sure; of those the median of three frames, in axes that err independently."""
+    out, white = np.zeros((len(shift), 6)), np.zeros((3, 6))
+    for s in range(len(shift)):
+        for i in range(6):
+            if seen[s] == 0:
+                sure[s, i] = last_two[0, s, i] = last_two[1, s, i] = shift[s, i]
+            else:
+                sure[s, i] += usual[s] * (shift[s, i] - sure[s, i])
+        for i in range(6):
+            white[:, i] = 0.0
+            for j in range(6):
+                white[0, i] += to_reported[s, i, j] * last_two[0, s, j]
+                white[1, i] += to_reported[s, i, j] * last_two[1, s, j]
+                white[2, i] += to_reported[s, i, j] * sure[s, j]
+        for i in range(6):
+            low, high = min(white[0, i], white[1, i]), max(white[0, i], white[1, i])
+            middle = max(low, min(high, white[2, i]))
+            for j in range(6):
+                out[s, j] += from_reported[s, j, i] * middle
+            last_two[0, s, i], last_two[1, s, i] = last_two[1, s, i], sure[s, i]
+        seen[s] += 1
+    return out
+
+
+@compiled
+def means(ring: Array, newest: int, lengths: Ints) -> tuple[Array, Array]:
+    """Means (k, s, 6) over the last n frames, and those less the means over the n before, from a ring of sums."""
+    streams = ring.shape[1]
+    mean, difference = np.empty((len(lengths), streams, 6)), np.empty((len(lengths), streams, 6))
+    for k in range(len(lengths)):
+        n = lengths[k]
+        once, twice = (newest - n) % len(ring), (newest - 2 * n) % len(ring)
+        for s in range(streams):
+            for i in range(6):
+                mean[k, s, i] = (ring[newest, s, i] - ring[once, s, i]) / n
+                difference[k, s, i] = mean[k, s, i] - (ring[once, s, i] - ring[twice, s, i]) / n
+    return mean, difference
+
+
+@compiled
+def beyond(
+    mean: Array,
+    difference: Array,
+    frames: Ints,
+    lengths: Ints,
+    whitening: Array,
+    limit: Array,
+    most_tolerated: Array,
+    tolerated: Array,
+    worth: float,
+    sweeps: int,
+) -> Array:
+    """(2, k, s) squares of means, but for what is tolerated, and of differences, over their limits; 0 for windows that
+    reach back too far.
+    """
+    out = np.zeros(limit.shape)
+    for k in range(len(lengths)):
+        for s in range(len(frames)):
+            if frames[s] >= lengths[k]:
+                found, least = _square(whitening[0, k, s], mean[k, s]), limit[0, k, s]
+                surely = math.sqrt(least) + most_tolerated[k, s]
+                # What is tolerated can only matter between these two.
+                if worth * least < found <= surely * surely:
+                    found = _square_beyond(whitening[0, k, s], mean[k, s], tolerated, sweeps)
+                out[0, k, s] = found / least
+            if frames[s] >= 2 * lengths[k]:
+                out[1, k, s] = _square(whitening[1, k, s], difference[k, s]) / limit[1, k, s]
+    return out
+
+
+@compiled
+def decide(beyond: Array, first: int, lengths: Ints) -> tuple[Bools, Ints, Bools, Array]:
+    """What a :class:`~gripmon.judge.drift.sequential.Finding` holds, by windows from the number ``first`` on."""
+    streams = beyond.shape[2]
+    moved, stepped = np.zeros(streams, dtype=np.bool_), np.zeros(streams, dtype=np.bool_)
+    length, excess = np.full(streams, lengths[first]), np.zeros(streams)
+    for s in range(streams):
+        # The shortest window that is beyond its threshold dates the motion best.
+        for k in range(len(lengths) - 1, first - 1, -1):
+            largest = max(beyond[0, k, s], beyond[1, k, s])
+            excess[s] = max(excess[s], largest)
+            if largest > 1.0:
+                moved[s], length[s], stepped[s] = True, lengths[k], beyond[1, k, s] > 1.0
+    return moved, length, stepped, excess
+
+
+@compiled
+def extremes(
+    mean: Array, difference: Array, middle: Array, whitening: Array, limit: Array, known: Bools, far: float
+) -> Array:
+    """(2, k, s) squares of the short windows' means about the ``middle`` (s, 6), and of their differences, each up to
+    ``far`` times the limit where that is known.
+    """
+    lengths, streams = whitening.shape[1], whitening.shape[2]
+    out = np.empty((2, lengths, streams))
+    for k in range(lengths):
+        for s in range(streams):
+            out[0, k, s] = _square(whitening[0, k, s], mean[k, s] - middle[s])
+            out[1, k, s] = _square(whitening[1, k, s], difference[k, s])
+            for kind in range(2):
+                if known[kind, k, s]:
+                    out[kind, k, s] = min(out[kind, k, s], far * limit[kind, k, s])
+    return out
+
+
+@compiled
+def learn(
+    difference: Array,
+    normalised: Array,
+    usable: Bools,
+    of_difference: Array,
+    windows: Array,
+    share: Array,
+    most_windows: Array,
+    largest: float,
+) -> None:
+    """Covariances of differences (k, s, 6, 6) and the ``windows`` (k, s) that they rest on, after one difference more
+    of the usable ones, of which ``share`` (k, 1) is a window that is independent.
+    """
+    for k in range(usable.shape[0]):
+        for s in range(usable.shape[1]):
+            if not usable[k, s]:
+                continue
+            windows[k, s] = min(windows[k, s] + share[k, 0], most_windows[k, 0])
+            tame, gain = min(1.0, largest / max(normalised[k, s], 1e-12)), share[k, 0] / windows[k, s]
+            for i in range(6):
+                for j in range(6):
+                    outer = tame * difference[k, s, i] * difference[k, s, j]
+                    of_difference[k, s, i, j] += gain * (outer - of_difference[k, s, i, j])
+
+
+@compiled
+def _exceeding(matrix: Array, vectors: Array, out: Array) -> None:
+    """The positive part ``out`` of a symmetric (6, 6) matrix, which is overwritten: by Jacobi's rotations."""
+    vectors[:] = 0.0
+    for i in range(6):
+        vectors[i, i] = 1.0
+    for _ in range(ROUNDS):
+        rest, whole = 0.0, 0.0
+        for i in range(6):
+            whole += matrix[i, i] * matrix[i, i]
+            for j in range(i):
+                rest += matrix[i, j] * matrix[i, j]
+        if rest <= 1e-30 * whole:
+            break
+        for p in range(5):
+            for q in range(p + 1, 6):
+                if matrix[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (matrix[q, q] - matrix[p, p]) / matrix[p, q]
+                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                c = 1.0 / math.sqrt(t * t + 1.0)
+                s = t * c
+                for i in range(6):
+                    a, b = matrix[i, p], matrix[i, q]
+                    matrix[i, p], matrix[i, q] = c * a - s * b, s * a + c * b
+                for i in range(6):
+                    a, b = matrix[p, i], matrix[q, i]
+                    matrix[p, i], matrix[q, i] = c * a - s * b, s * a + c * b
+                    a, b = vectors[i, p], vectors[i, q]
+                    vectors[i, p], vectors[i, q] = c * a - s * b, s * a + c * b
+    out[:] = 0.0
+    for k in range(6):
+        if matrix[k, k] > 0.0:
+            for i in range(6):
+                for j in range(6):
+                    out[i, j] += matrix[k, k] * vectors[i, k] * vectors[j, k]
+
+
+@compiled
+def _between_triangles(root: Array, matrix: Array, between: Array, out: Array) -> None:
+    """``out`` = L M L' with a lower triangle, (6, 6) each."""
+    for i in range(6):
+        for j in range(6):
+            total = 0.0
+            for k in range(i + 1):
+                total += root[i, k] * matrix[k, j]
+            between[i, j] = total
+    for i in range(6):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(j + 1):
+                total += between[i, k] * root[j, k]
+            out[i, j] = out[j, i] = total
+
+
+@compiled
+def _missing(seen: Array, root: Array, inverse: Array, out: Array) -> None:
+    """The part ``out`` of a claimed covariance, with its ``root`` and that one's ``inverse``, direction by direction,
+    that exceeds what was ``seen``, (6, 6) each.
+    """
+    short, part, between = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    _between_triangles(inverse, seen, between, short)
+    for i in range(6):
+        for j in range(6):
+            short[i, j] = (1.0 if i == j else 0.0) - short[i, j]
+    if _root(short, part):  # all of it exceeds
+        part[:] = short
+    else:
+        _exceeding(short, between, part)
+    _between_triangles(root, part, between, out)
+
+
+@compiled
+def refresh(
+    reported: Array,
+    of_difference: Array,
+    learnt: Array,
+    times: Array,
+    rare: Ints,
+    reference: Array,
+    known: Bools,
+    plain: Array,
+    mean_covariance: Array,
+    whitening: Array,
+    learnt_whitening: Array,
+    to_reported: Array,
+    from_reported: Array,
+) -> bool:
+    """Covariances and their whitening anew: see ``SequentialTest._refresh`` and ``Scatter.covariances``.
+
+    ``times`` (3, k, s): by how much the variance of what was seen counts for the limits that are assumed, for standard
+    deviations, and for the limits that are learnt; ``learnt`` (k, s): part of it that the stream has shown; ``rare``
+    (k,): length from which on noise is rare.  The rest is overwritten.  False if rounding leaves no root.
+    """
+    lengths, streams = learnt.shape
+    total, seen = np.zeros((3, lengths, 6, 6)), np.zeros((lengths + 1, 6, 6))
+    root, part = np.empty((6, 6)), np.empty((6, 6))
+    never, missing = np.empty((6, 6)), np.empty((6, 6))
+    for s in range(streams):
+        for k in range(lengths - 1, -1, -1):
+            # Beyond the longest, windows count as independent.
+            part[:] = (0.5 if k == lengths - 1 else 0.25) * of_difference[k, s]
+            seen[k] = seen[k + 1] + learnt[k, s] * part
+            for way in range(3):
+                total[way, k] = times[way, k, s] * part
+                if k < lengths - 1:
+                    total[way, k] += total[way, k + 1]
+        if not _root(reported[s], from_reported[s]):
+            return False
+        _invert_root(from_reported[s], to_reported[s])
+        _missing(seen[0], from_reported[s], to_reported[s], never)
+        for k in range(lengths):
+            _missing(seen[0] - seen[rare[k]], from_reported[s], to_reported[s], missing)
+            mean_covariance[k, s] = total[1, k] + never + reference[s]
+            way = 2 if known[0, k, s] else 0
+            if not _whiten(total[way, k] + never + reference[s], root, whitening[0, k, s]):
+                return False
+            way = 2 if known[1, k, s] else 0
+            if not _whiten(times[way, k, s] * of_difference[k, s] + 2.0 * missing, root, whitening[1, k, s]):
+                return False
+            if not _whiten(of_difference[k, s], root, learnt_whitening[k, s]):
+                return False
+            if k < plain.shape[1]:
+                if not _whiten(total[2, k] + never, root, plain[0, k, s]):
+                    return False
+                if not _whiten(times[2, k, s] * of_difference[k, s] + 2.0 * missing, root, plain[1, k, s]):
+                    return False
+    return True

@@ -1,0 +1,393 @@
+"""The arithmetic of a frame's protection level, compiled: fits under h hypotheses, alone and with the anchor, the bank
+of filters behind the anchor, and the root of the sum over the hypotheses' tails.
+
+The same by NumPy stands in :mod:`~gripmon.track.integrity.plain`, function by function; what they are for, in
+:mod:`~gripmon.track.integrity.separation`.  Where rounding leaves a covariance that isn't positive definite ``False``
+comes first of what is returned: then NumPy's is taken.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gripmon.model.compiled import compiled
+from gripmon.model.records import Array
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+
+@compiled
+def _root(matrix: Array, root: Array) -> bool:
+    """Cholesky's lower ``root`` (m, m), its diagonal inverted; False for a matrix that isn't positive definite."""
+    for i in range(len(root)):
+        for j in range(i + 1):
+            rest = matrix[i, j]
+            for k in range(j):
+                rest -= root[i, k] * root[j, k]
+            if j < i:
+                root[i, j] = rest * root[j, j]
+            elif rest > 0.0:
+                root[i, i] = 1.0 / math.sqrt(rest)
+            else:
+                return False
+    return True
+
+
+@compiled
+def _invert(root: Array, inverse: Array, upper: Array) -> None:
+    """``inverse`` (m, m) of the matrix that has the ``root``; ``upper`` (m, m) for what is between."""
+    m = len(root)
+    for j in range(m):
+        upper[j, j] = root[j, j]
+        for i in range(j + 1, m):
+            total = 0.0
+            for k in range(j, i):
+                total -= root[i, k] * upper[j, k]
+            upper[j, i] = total * root[i, i]
+    for i in range(m):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, m):
+                total += upper[i, k] * upper[j, k]
+            inverse[i, j] = inverse[j, i] = total
+
+
+@compiled
+def _square(root: Array, values: Array, white: Array) -> float:
+    """Normalised square of ``values`` (m,) by the root of their covariance; ``white`` (m,) is overwritten."""
+    total = 0.0
+    for i in range(len(root)):
+        rest = values[i]
+        for k in range(i):
+            rest -= root[i, k] * white[k]
+        white[i] = rest * root[i, i]
+        total += white[i] * white[i]
+    return total
+
+
+@compiled
+def add_up(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    finger: Ints,
+    fingers: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Sums over the kept edges and what is known besides: pull (h, m), normal matrix and spread (h, m, m), and pulls by
+    the model (h, f, m).
+    """
+    count, (edges, m) = len(keep), pull.shape
+    sums, normal, spread = known_pull.copy(), known.copy(), known.copy()
+    of_model = np.zeros((count, fingers, m))
+    for h in range(count):
+        for v in range(edges):
+            if keep[h, v] == 0.0:
+                continue
+            for i in range(m):
+                sums[h, i] += pull[v, i]
+                of_model[h, finger[v], i] += model[v, i]
+                for j in range(i + 1):
+                    normal[h, i, j] += information[v, i, j]
+                    spread[h, i, j] += middle[v, i, j]
+        for i in range(m):
+            for j in range(i):
+                normal[h, j, i], spread[h, j, i] = normal[h, i, j], spread[h, i, j]
+    return sums, normal, spread, of_model
+
+
+@compiled
+def separate(
+    sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int
+) -> tuple[bool, Array, Array, Array]:
+    """The fits from their sums, n = ``unknowns`` of the first: shift (h, n), covariance (h, n, n), and error by the
+    model (h, f, n).
+    """
+    (count, m), n, fingers = sums.shape, unknowns, of_model.shape[1]
+    shift, covariance, off = np.zeros((count, n)), np.empty((count, n, n)), np.zeros((count, fingers, n))
+    root, inverse, between = np.empty((m, m)), np.empty((m, m)), np.empty((m, m))
+    for h in range(count):
+        if not _root(normal[h], root):
+            return False, shift, covariance, off
+        _invert(root, inverse, between)
+        for i in range(n):
+            for j in range(m):
+                shift[h, i] += inverse[i, j] * sums[h, j]
+                for f in range(fingers):
+                    off[h, f, i] += inverse[i, j] * of_model[h, f, j]
+                total = 0.0
+                for k in range(m):
+                    total += inverse[i, k] * spread[h, k, j]
+                between[i, j] = total
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(m):
+                    total += between[i, k] * inverse[j, k]
+                covariance[h, i, j] = covariance[h, j, i] = total
+    return True, shift, covariance, off
+
+
+@compiled
+def with_pose(
+    sums: Array, normal: Array, spread: Array, of_model: Array, at: Array, covariance: Array, off: Array
+) -> tuple[bool, Array, Array, Array, Array]:
+    """The sums with a pose that is known besides: ``at`` (6,), its ``covariance`` (6, 6), ``off`` (f or 1, 6) by the
+    model.
+    """
+    sums, normal, spread, of_model = sums.copy(), normal.copy(), spread.copy(), of_model.copy()
+    root, information, between = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    if not _root(covariance, root):
+        return False, sums, normal, spread, of_model
+    _invert(root, information, between)
+    for i in range(6):
+        pull = 0.0
+        for j in range(6):
+            pull += information[i, j] * at[j]
+        for h in range(len(sums)):
+            sums[h, i] += pull
+            for j in range(6):
+                normal[h, i, j] += information[i, j]
+                spread[h, i, j] += information[i, j]
+        for f in range(of_model.shape[1]):
+            pull = 0.0
+            for j in range(6):
+                pull += off[min(f, len(off) - 1), j] * information[j, i]
+            for h in range(len(sums)):
+                of_model[h, f, i] += pull
+    return True, sums, normal, spread, of_model
+
+
+@compiled
+def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[bool, Array]:
+    """Normalised squares (h,) of shifts (h, 6) from ``at`` (6,), by ``times`` the covariances (h, 6, 6) and ``more``
+    (6, 6).
+    """
+    out, root, white = np.empty(len(shift)), np.empty((6, 6)), np.empty(6)
+    for h in range(len(shift)):
+        if not _root(times * covariance[h] + more, root):
+            return False, out
+        out[h] = _square(root, shift[h] - at, white)
+    return True, out
+
+
+@compiled
+def _tail(xx: float, yy: float, zz: float, xy: float, xz: float, yz: float) -> tuple[float, float]:
+    """Standard deviation along the longest axis of a covariance, and the factor of the two others on that one's tail.
+
+    The eigenvalues of B = (C - q) / p, with p so that B has the determinant 2 r and the squares 6, are
+    2 cos(phi + 2 pi k / 3), cos(3 phi) = r (Smith 1961); the product of the largest one's distances to the others is
+    3 (x² - 1), the derivative of the characteristic polynomial.
+    """
+    q = (xx + yy + zz) / 3.0
+    a, b, c = xx - q, yy - q, zz - q
+    p = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    x = 0.0
+    if p > 0.0:
+        a, b, c, d, e, f = a / p, b / p, c / p, xy / p, xz / p, yz / p
+        half_determinant = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
+        x = 2.0 * math.cos(math.acos(min(max(half_determinant, -1.0), 1.0)) / 3.0)
+    largest = max(q + p * x, 1e-300)
+    if q <= 0.0:
+        return math.sqrt(largest), 0.0
+    left = min(max(3.0 * (p / largest) ** 2 * (x * x - 1.0), 1e-24), 1.0)
+    return math.sqrt(largest), -0.5 * math.log10(left)
+
+
+@compiled
+def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
+    """Lengths (2, h) of shifts (h, 6), in position and in rotation, and the tails of their errors: sigma and factor
+    (2, h), with the covariances (h, 6, 6) and errors by the model (h, f, 6).
+    """
+    count = len(shift)
+    away, sigma, factor = np.empty((2, count)), np.empty((2, count)), np.empty((2, count))
+    block = np.empty((3, 3))
+    for part in range(2):
+        first = 3 * part
+        for h in range(count):
+            total = 0.0
+            for i in range(3):
+                total += shift[h, first + i] ** 2
+                for j in range(i + 1):
+                    block[i, j] = inflation**2 * covariance[h, first + i, first + j]
+                    for f in range(of_model.shape[1]):
+                        block[i, j] += of_model[h, f, first + i] * of_model[h, f, first + j]
+            away[part, h] = math.sqrt(total)
+            sigma[part, h], factor[part, h] = _tail(
+                block[0, 0], block[1, 1], block[2, 2], block[1, 0], block[2, 0], block[2, 1]
+            )
+    return away, sigma, factor
+
+
+@compiled
+def _radius(log_risk: float, factor: float, squares: Array, spacing: float) -> float:
+    """Length over sigma that is exceeded with a probability (power of ten)."""
+    last = squares.shape[1] - 1
+    out = math.inf
+    for table in range(2):
+        place = -(log_risk - factor if table == 0 else log_risk) / spacing
+        if place >= last:
+            value = squares[table, last]
+        elif place <= 0.0:
+            value = squares[table, 0]
+        else:
+            k = int(place)
+            value = squares[table, k] + (place - k) * (squares[table, k + 1] - squares[table, k])
+        out = min(out, value)
+    return math.sqrt(out)
+
+
+@compiled
+def _beyond(square: float, factor: float, squares: Array, spacing: float, guide: Ints, step: float) -> float:
+    """Probability of a normalised square: ``guide`` (2, n) is where to begin in the table for each ``step``."""
+    last = squares.shape[1] - 1
+    out = 0.0
+    for table in range(2):
+        place = float(last)
+        if square < squares[table, last]:
+            k = guide[table, int(square / step)]
+            while squares[table, k + 1] <= square:
+                k += 1
+            place = k + (square - squares[table, k]) / (squares[table, k + 1] - squares[table, k])
+        log_tail = -spacing * place
+        out = min(out, log_tail + factor) if table == 0 else min(out, log_tail)
+    return math.exp(out * math.log(10.0))
+
+
+@compiled
+def levels(
+    prior: Array,
+    away: Array,
+    sigma: Array,
+    factor: Array,
+    risk: float,
+    near: float,
+    squares: Array,
+    spacing: float,
+    guide: Ints,
+    step: float,
+) -> tuple[float, float, int]:
+    """Protection levels of position and of rotation, and the number of the hypothesis that the position's owes most to;
+    -1 where all together are less probable than the risk.
+    """
+    share, left, count = risk / len(prior), risk, 0
+    for h in range(len(prior)):
+        if prior[h] > share:
+            count += 1
+        else:
+            left -= prior[h]
+    if not count:
+        return 0.0, 0.0, -1
+    least, most = np.zeros(2), np.zeros(2)
+    for h in range(len(prior)):
+        if prior[h] <= share:
+            continue
+        alone = math.log10(max(left / prior[h], 1e-300))
+        equally = math.log10(max(left / count / prior[h], 1e-300))
+        for part in range(2):
+            s, f = sigma[part, h], factor[part, h]
+            least[part] = max(least[part], away[part, h] + s * _radius(alone, f, squares, spacing))
+            most[part] = max(most[part], away[part, h] + s * _radius(equally, f, squares, spacing))
+    for part in range(2):
+        least[part] = max(least[part], 1e-3 * most[part])
+    while most[0] > near * least[0] or most[1] > near * least[1]:
+        for part in range(2):
+            middle = math.sqrt(least[part] * most[part])
+            total = 0.0
+            for h in range(len(prior)):
+                if prior[h] > share:
+                    length = max(middle - away[part, h], 0.0) / sigma[part, h]
+                    total += prior[h] * _beyond(length * length, factor[part, h], squares, spacing, guide, step)
+            if total <= left:
+                most[part] = middle
+            else:
+                least[part] = middle
+    largest, owed = -1.0, -1
+    for h in range(len(prior)):
+        if prior[h] > share:
+            length = max(most[0] - away[0, h], 0.0) / sigma[0, h]
+            part_of_it = prior[h] * _beyond(length * length, factor[0, h], squares, spacing, guide, step)
+            if part_of_it > largest:
+                largest, owed = part_of_it, h
+    return most[0], most[1], owed
+
+
+@compiled
+def follow(
+    mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
+) -> tuple[bool, Array, Array, Array, Array]:
+    """One more measurement for each of g Kalman filters: their means (g, 6), covariances (g, 6, 6) and errors by the
+    model (g, f, 6) after it, and the traces of their gains (g,).
+    """
+    count = len(mean)
+    new_mean, new_covariance, new_off, taken = mean.copy(), np.empty((count, 6, 6)), off.copy(), np.zeros(count)
+    both, root, between, inverse = np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6)), np.empty((6, 6))
+    before, gain = np.empty((6, 6)), np.empty((6, 6))
+    for g in range(count):
+        for i in range(6):
+            for j in range(6):
+                before[i, j] = covariance[g, i, j] + (creep[i] if i == j else 0.0)
+                both[i, j] = before[i, j] + of_frame[g, i, j]
+        if not _root(both, root):
+            return False, mean, covariance, off, taken
+        _invert(root, inverse, between)
+        for i in range(6):
+            for j in range(6):
+                total = 0.0
+                for k in range(6):
+                    total += before[i, k] * inverse[k, j]
+                gain[i, j] = total
+                new_mean[g, i] += total * (shift[g, j] - mean[g, j])
+                for f in range(off.shape[1]):
+                    new_off[g, f, i] += total * (of_model[g, f, j] - off[g, f, j])
+            taken[g] += gain[i, i]
+        for i in range(6):
+            for j in range(6):
+                total = before[i, j]
+                for k in range(6):
+                    total -= gain[i, k] * before[k, j]
+                between[i, j] = total
+        for i in range(6):
+            for j in range(6):
+                new_covariance[g, i, j] = 0.5 * (between[i, j] + between[j, i])
+    return True, new_mean, new_covariance, new_off, taken
+
+
+@compiled
+def telling(
+    mean: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    wander: Array,
+    shift: Array,
+    of_frame: Array,
+    of_model: Array,
+    rows: Ints,
+    limit: float,
+) -> tuple[bool, Array, Array, Array]:
+    """Of g averages, from ``at`` (6,) and after a way with the variances ``wander`` (6,), and the fits of a frame that
+    are their ``rows`` (g,) the ones that know more, but the frame where they differ by more than a normalised square of
+    ``limit``: shift (g, 6), covariance (g, 6, 6) and error by the model (g, f, 6).  A negative row is none.
+    """
+    away, spread, error = mean - at, covariance.copy(), off.copy()
+    root, white = np.empty((6, 6)), np.empty(6)
+    for g in range(len(mean)):
+        for i in range(6):
+            spread[g, i, i] += wander[i]
+        h = rows[g]
+        if h < 0:
+            continue
+        if not _root(of_frame[h] + spread[g], root):
+            return False, away, spread, error
+        own = of_frame[h, 0, 0] + of_frame[h, 1, 1] + of_frame[h, 2, 2]
+        surer = own < spread[g, 0, 0] + spread[g, 1, 1] + spread[g, 2, 2]
+        if surer or _square(root, shift[h] - away[g], white) > limit:
+            away[g], spread[g], error[g] = shift[h], of_frame[h], of_model[h]
+    return True, away, spread, error

@@ -1,0 +1,118 @@
+"""What :mod:`~gripmon.track.integrity.kernel` does, function by function, by NumPy: what it is tested against, and what
+does the work where nothing compiles.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gripmon.model.records import Array
+from gripmon.track.integrity.kernel import Ints
+from gripmon.track.integrity.quantiles import Tails
+
+
+def add_up(
+    pull: Array,
+    information: Array,
+    middle: Array,
+    model: Array,
+    finger: Ints,
+    fingers: int,
+    keep: Array,
+    known: Array,
+    known_pull: Array,
+) -> tuple[Array, Array, Array, Array]:
+    (edges, m), own = pull.shape, finger == np.arange(fingers)[:, None]
+    normal = (keep @ information.reshape(edges, -1)).reshape(-1, m, m) + known
+    spread = (keep @ middle.reshape(edges, -1)).reshape(-1, m, m) + known
+    return keep @ pull + known_pull, normal, spread, np.einsum("hv,fvi->hfi", keep, own[:, :, None] * model)
+
+
+def separate(
+    sums: Array, normal: Array, spread: Array, of_model: Array, unknowns: int
+) -> tuple[bool, Array, Array, Array]:
+    inverse = np.linalg.inv(normal)[:, :unknowns]
+    covariance = inverse @ spread @ inverse.transpose(0, 2, 1)
+    return True, np.einsum("hij,hj->hi", inverse, sums), covariance, np.einsum("hij,hfj->hfi", inverse, of_model)
+
+
+def with_pose(
+    sums: Array, normal: Array, spread: Array, of_model: Array, at: Array, covariance: Array, off: Array
+) -> tuple[bool, Array, Array, Array, Array]:
+    sums, normal, spread, of_model = sums.copy(), normal.copy(), spread.copy(), of_model.copy()
+    information = np.linalg.inv(covariance)
+    sums[:, :6] += information @ at
+    normal[:, :6, :6] += information
+    spread[:, :6, :6] += information
+    of_model[:, :, :6] += off @ information
+    return True, sums, normal, spread, of_model
+
+
+def squares(shift: Array, at: Array, covariance: Array, times: float, more: Array) -> tuple[bool, Array]:
+    away = shift - at
+    return True, np.einsum("hi,hi->h", away, np.linalg.solve(times * covariance + more, away[:, :, None])[:, :, 0])
+
+
+def tails(shift: Array, covariance: Array, of_model: Array, inflation: float) -> tuple[Array, Array, Array]:
+    parts = shift.reshape(-1, 2, 3)
+    covariance = inflation**2 * covariance + np.einsum("hfi,hfj->hij", of_model, of_model)
+    blocks = np.stack([covariance[:, :3, :3], covariance[:, 3:, 3:]])
+    return np.sqrt(np.einsum("hpi,hpi->ph", parts, parts)), *Tails.of(blocks)
+
+
+def levels(
+    prior: Array, away: Array, sigma: Array, factor: Array, risk: float, near: float
+) -> tuple[float, float, int]:
+    share = risk / max(len(prior), 1)
+    counted = np.flatnonzero(prior > share)
+    if not len(counted):
+        return 0.0, 0.0, -1
+    left = risk - float(prior[prior <= share].sum())
+    prior, away, tails = prior[counted], away[:, counted], Tails(sigma[:, counted], factor[:, counted])
+    # Each needs as much as if it had the whole risk alone; an equal share is enough for all.
+    least = (away + tails.radius(np.broadcast_to(left / prior, away.shape))).max(axis=1)
+    most = (away + tails.radius(np.broadcast_to(left / len(prior) / prior, away.shape))).max(axis=1)
+    least = np.maximum(least, 1e-3 * most)
+    while (most > near * least).any():
+        middle = np.sqrt(least * most)
+        enough = (prior * tails.beyond(middle[:, None] - away)).sum(axis=1) <= left
+        least, most = np.where(enough, least, middle), np.where(enough, middle, most)
+    owed = prior * tails.beyond(most[:, None] - away)[0]
+    return float(most[0]), float(most[1]), int(counted[np.argmax(owed)])
+
+
+def follow(
+    mean: Array, covariance: Array, off: Array, shift: Array, of_frame: Array, of_model: Array, creep: Array
+) -> tuple[bool, Array, Array, Array, Array]:
+    before = covariance + np.diag(creep)
+    gain = np.linalg.solve(before + of_frame, before).transpose(0, 2, 1)
+    mean = mean + np.einsum("gij,gj->gi", gain, shift - mean)
+    off = off + np.einsum("gij,gfj->gfi", gain, of_model - off)
+    left = before - gain @ before
+    return True, mean, 0.5 * (left + left.transpose(0, 2, 1)), off, np.einsum("gii->g", gain)
+
+
+def telling(
+    mean: Array,
+    covariance: Array,
+    off: Array,
+    at: Array,
+    wander: Array,
+    shift: Array,
+    of_frame: Array,
+    of_model: Array,
+    rows: Ints,
+    limit: float,
+) -> tuple[bool, Array, Array, Array]:
+    mean, covariance = mean - at, covariance + np.diag(wander)
+    shift, of_frame, of_model = shift[rows], of_frame[rows], of_model[rows]
+    frame = squares(shift - mean, np.zeros(6), of_frame + covariance, 1.0, np.zeros((6, 6)))[1] > limit
+    frame |= np.einsum("gii->g", of_frame[:, :3, :3]) < np.einsum("gii->g", covariance[:, :3, :3])
+    frame &= rows >= 0
+    each = frame[:, None, None]
+    return (
+        True,
+        np.where(frame[:, None], shift, mean),
+        np.where(each, of_frame, covariance),
+        np.where(each, of_model, off),
+    )

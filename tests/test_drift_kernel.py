@@ -1,0 +1,110 @@
+"""The compiled sequential test against NumPy's, frame by frame on several kinds of noise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from support.drift_noise import COVARIANCE, autocorrelated, claimed, vibrating, white
+
+from gripmon.judge.drift import DriftSettings, kernel
+from gripmon.judge.drift.compiled import CompiledTest
+from gripmon.judge.drift.sequential import PlainTest, square_beyond, whitening
+from gripmon.judge.drift.statistics import Scatter
+from gripmon.model.compiled import COMPILES
+
+pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
+
+STREAMS, FRAMES = 3, 5000
+STEP = np.linalg.cholesky(COVARIANCE) @ np.ones(6)
+
+
+def pair(settings: DriftSettings, streams: int = STREAMS) -> tuple[CompiledTest, PlainTest]:
+    return CompiledTest(settings, streams), PlainTest(settings, streams)
+
+
+def assert_alike(found: PlainTest, expected: PlainTest) -> None:
+    """What either has learnt."""
+    np.testing.assert_allclose(found.scatter.of_differences, expected.scatter.of_differences, rtol=1e-9, atol=1e-22)
+    np.testing.assert_allclose(found.scatter.windows, expected.scatter.windows, rtol=1e-12)
+    (level, covariance), (known, of_known) = found.level(64), expected.level(64)
+    np.testing.assert_allclose(level, known, rtol=1e-9, atol=1e-14)
+    np.testing.assert_allclose(covariance, of_known, rtol=1e-9, atol=1e-22)
+    np.testing.assert_allclose(found.usual_covariance(), expected.usual_covariance(), rtol=1e-9, atol=1e-22)
+
+
+@pytest.mark.parametrize("noise", [white, autocorrelated, vibrating])
+def test_each_frame_is_found_alike(noise: Callable[..., np.ndarray]):
+    """With a drift that grows from within the tolerance on, doubtful frames, frames that claim more, restarts and a
+    reference that is uncertain.
+    """
+    rng = np.random.default_rng(3)
+    found, expected = pair(DriftSettings(false_alarms_per_day=1000.0, frames_per_s=10.0))
+    shifts = noise(rng, FRAMES, STREAMS)
+    shifts[3000:] += np.linspace(0.0, 15.0, FRAMES - 3000)[:, None, None] * STEP
+    moved = 0
+    for number, shift in enumerate(shifts):
+        covariance = rng.uniform(0.5, 3.0, (STREAMS, 1, 1)) * claimed(STREAMS)
+        learn = rng.uniform(size=STREAMS) < 0.9
+        at_least = 1 if number % 7 else 16
+        one, other = (test.add(shift, covariance, learn, at_least) for test in (found, expected))
+        np.testing.assert_array_equal(one.moved, other.moved)
+        np.testing.assert_array_equal(one.length[one.moved], other.length[other.moved])
+        np.testing.assert_array_equal(one.stepped, other.stepped)
+        np.testing.assert_allclose(one.excess, other.excess, rtol=1e-9, atol=1e-12)
+        moved += int(one.moved.sum())
+        if number in (1000, 4500):
+            for test in (found, expected):
+                test.restart(np.array([True, False, True]), np.array([0, 0, 5]))
+                test.set_reference_covariance(0.1 * COVARIANCE)
+    assert 100 < moved < STREAMS * (FRAMES - 3000), "of both kinds"
+    assert_alike(found, expected)
+
+
+@pytest.mark.slow("30 s; the same with limits that are assumed is in the default run")
+def test_learnt_limits_are_alike():
+    found, expected = pair(DriftSettings(), 1)
+    for shift in autocorrelated(np.random.default_rng(4), 20_000, 1):
+        one, other = (test.add(shift, claimed(1)) for test in (found, expected))
+        assert one.moved == other.moved
+        np.testing.assert_allclose(one.excess, other.excess, rtol=1e-9, atol=1e-12)
+    assert_alike(found, expected)
+    np.testing.assert_allclose(found.noticed(), expected.noticed(), rtol=1e-9)
+
+
+@pytest.mark.parametrize("seen", [0.0, 0.3, 1.0, 3.0])
+def test_covariances_are_those_of_numpy_however_much_of_the_claim_was_seen(seen: float):
+    """Less of it in some directions, more in others: what is missing is the part of a matrix that is positive."""
+    rng = np.random.default_rng(5)
+    scatter = Scatter(2)
+    scatter.begin(claimed(2))
+    mix = np.eye(6) + 0.2 * rng.normal(size=(13, 2, 6, 6))
+    scatter.of_differences[:] = seen * mix @ COVARIANCE @ mix.swapaxes(-1, -2) + 1e-3 * COVARIANCE
+    scatter.windows[:] = rng.uniform(12.0, 200.0, scatter.windows.shape)
+    found, expected = pair(DriftSettings(), 2)
+    each = rng.uniform(1.0, 3.0, (3, 13, 2))
+    known = rng.uniform(size=(2, 13, 2)) < 0.5
+    for test in (found, expected):
+        test.scatter, test._reported, test._known = scatter, claimed(2), known
+        test._whiten(each)
+    for name in ("_plain", "_whitening", "_learnt_whitening", "_mean_covariance", "_to_reported", "_from_reported"):
+        one, other = getattr(found, name), getattr(expected, name)
+        assert (np.abs(one - other) <= 1e-9 * np.abs(other).max(axis=(-2, -1), keepdims=True)).all(), name
+
+
+def test_a_shift_beyond_what_is_tolerated_is_measured_alike():
+    rng = np.random.default_rng(6)
+    found, expected = pair(DriftSettings(tolerated_m=2e-5, tolerated_rad=1e-3), 1)
+    white_of = whitening(COVARIANCE)
+    for size in (0.1, 1.0, 5.0, 50.0):
+        shift = size * STEP * rng.normal(size=6)
+        known = float(square_beyond(white_of, shift, DriftSettings(tolerated_m=2e-5, tolerated_rad=1e-3).tolerated))
+        assert found.square_beyond(shift, COVARIANCE) == pytest.approx(known, rel=1e-9, abs=1e-12)
+        assert expected.square_beyond(shift, COVARIANCE) == known
+
+
+def test_what_has_no_root_is_left_to_numpy():
+    assert not kernel.square_beyond(-np.eye(6), np.ones(6), np.ones(6), 8)[0]
+    with pytest.raises(np.linalg.LinAlgError):
+        CompiledTest(DriftSettings()).square_beyond(np.ones(6), -np.eye(6))

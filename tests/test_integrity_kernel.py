@@ -1,0 +1,180 @@
+"""The compiled arithmetic of protection levels against NumPy's, at random and on a simulated camera's frames."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gripmon.daemon.config import builtin_config, load_config
+from gripmon.model.compiled import COMPILES
+from gripmon.model.geometry import from_record
+from gripmon.model.records import FrameRecord
+from gripmon.monitor import Monitor
+from gripmon.simulate import Scenario, Simulator
+from gripmon.simulate.scenario import Bump
+from gripmon.track.integrity import Doubts, Separation, kernel, plain, separation
+from gripmon.track.integrity.quantiles import GUIDE, GUIDE_STEP, LOG_RISK_SPACING, SQUARES, Tails
+
+pytestmark = pytest.mark.skipif(not COMPILES, reason="nothing compiles here")
+
+SIZE = np.array([2e-5, 3e-5, 2e-4, 2e-3, 1e-3, 5e-4, 3e-5])  # of a pose's errors and a jaw opening's, m and rad
+HYPOTHESES, EDGES, FINGERS = 14, 8, 2
+
+
+def covariances(rng: np.random.Generator, count: int, m: int = 6) -> np.ndarray:
+    """(count, m, m), of different sizes, their axes' errors belonging together."""
+    mix = np.eye(m) + 0.5 * rng.normal(size=(count, m, m))
+    return SIZE[:m, None] * (mix @ mix.transpose(0, 2, 1)) * SIZE[:m] * rng.uniform(0.1, 10.0, (count, 1, 1))
+
+
+def shifts(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.normal(size=(count, 6)) * SIZE[:6]
+
+
+def of_the_model(rng: np.random.Generator, count: int) -> np.ndarray:
+    return rng.normal(size=(count, FINGERS, 6)) * SIZE[:6]
+
+
+def fits(rng: np.random.Generator, count: int = HYPOTHESES) -> Separation:
+    return Separation(shifts(rng, count), covariances(rng, count), of_the_model(rng, count))
+
+
+def agree(found: tuple, expected: tuple, unit: np.ndarray = SIZE) -> None:
+    """Each axis in its unit, by the shape: vectors and matrices of six or seven axes, or plain numbers."""
+    for one, other in zip(found, expected, strict=True):
+        scale = np.ones(np.shape(other))
+        if np.ndim(other) > 1 and other.shape[-1] in (6, 7):
+            scale = np.broadcast_to(unit[: other.shape[-1]], other.shape)
+            if other.shape[-2] == other.shape[-1]:
+                scale = scale * unit[: other.shape[-1], None]
+        np.testing.assert_allclose(one / scale, other / scale, rtol=1e-9, atol=1e-9 * np.abs(other / scale).max())
+
+
+def normal_equations(rng: np.random.Generator, m: int) -> tuple:
+    """Of edges that each see one direction well, as kept under hypotheses that leave out some, and a prior."""
+    rows = rng.normal(size=(EDGES, 5, m)) / SIZE[:m]
+    information = np.einsum("vri,vrj->vij", rows, rows)
+    pull, model = np.einsum("vri,vr->vi", rows, rng.normal(size=(EDGES, 5))), rng.normal(size=(EDGES, m)) / SIZE[:m]
+    keep = (rng.uniform(size=(HYPOTHESES, EDGES)) < 0.8).astype(float)
+    keep[0], keep[1] = 1.0, 0.0
+    known = np.tile(np.diag(0.1 / SIZE[:m] ** 2), (HYPOTHESES, 1, 1))
+    finger = rng.integers(0, FINGERS, EDGES)
+    middle = information * rng.uniform(0.5, 3.0, (EDGES, 1, 1))
+    known_pull = rng.normal(size=(HYPOTHESES, m)) / SIZE[:m]
+    return pull, information, middle, model, finger, FINGERS, keep, known, known_pull
+
+
+@pytest.mark.parametrize("m", [6, 7])
+@pytest.mark.parametrize("seed", range(10))
+def test_fits_are_those_of_numpy(m: int, seed: int):
+    rng = np.random.default_rng(seed)
+    of = normal_equations(rng, m)
+    sums = plain.add_up(*of)
+    agree(kernel.add_up(*of), sums, 1.0 / SIZE)
+    agree(kernel.separate(*sums, 6)[1:], plain.separate(*sums, 6)[1:])
+    agree(kernel.separate(*sums, m)[1:], plain.separate(*sums, m)[1:])
+    anchor = shifts(rng, 1)[0], covariances(rng, 1)[0]
+    for off in (of_the_model(rng, 1)[0], np.zeros((1, 6))):
+        agree(kernel.with_pose(*sums, *anchor, off)[1:], plain.with_pose(*sums, *anchor, off)[1:], 1.0 / SIZE)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_averages_are_those_of_numpy(seed: int):
+    rng = np.random.default_rng(seed)
+    average, frame, at, wander = fits(rng), fits(rng), shifts(rng, 1)[0], rng.uniform(size=6) * SIZE[:6] ** 2
+    agree(kernel.follow(*average, *frame, wander)[1:], plain.follow(*average, *frame, wander)[1:])
+    rows = rng.integers(-1, HYPOTHESES, HYPOTHESES)
+    told = plain.telling(*average, at, wander, *frame, rows, 12.0)
+    agree(kernel.telling(*average, at, wander, *frame, rows, 12.0)[1:], told[1:])
+    by_frame = (told[2] == frame.covariance[rows]).all(axis=(1, 2))
+    assert 0 < by_frame.sum() < HYPOTHESES and not by_frame[rows < 0].any()
+    of = frame.shift, at, frame.covariance, 1.44, covariances(rng, 1)[0]
+    agree(kernel.squares(*of)[1:], plain.squares(*of)[1:])
+
+
+def levels_of(prior: np.ndarray, away: np.ndarray, tails: Tails, risk: float) -> tuple:
+    """Of the kernel."""
+    return kernel.levels(prior, away, *tails, risk, 1.02, SQUARES, LOG_RISK_SPACING, GUIDE, GUIDE_STEP)
+
+
+@pytest.mark.parametrize("risk", [1e-1, 1e-3, 1e-5, 1e-9, 1e-13])
+@pytest.mark.parametrize("seed", range(5))
+def test_levels_are_those_of_numpy(seed: int, risk: float):
+    rng = np.random.default_rng(seed)
+    prior = 10.0 ** rng.uniform(-7.0, 0.0, HYPOTHESES)
+    away, sigma, factor = plain.tails(*fits(rng), 1.2)
+    for priors in (prior, np.append(1.0, prior[1:]), 1e-3 * prior):
+        *found, number = levels_of(priors, away, Tails(sigma, factor), risk)
+        *expected, owed = plain.levels(priors, away, sigma, factor, risk, 1.02)
+        np.testing.assert_allclose(found, expected, rtol=1e-9)
+        assert number == owed
+
+
+SHAPES = [(1, 0.5, 0.1), (1, 1, 1), (1, 1, 0), (1, 0, 0), (0, 0, 0), (1, 1 - 1e-9, 0.3), (1, 1e-12, 1e-13), (3, 2, 2)]
+
+
+@pytest.mark.parametrize("variances", SHAPES)
+def test_tails_of_every_shape_are_those_of_numpy(variances: tuple[float, ...]):
+    """By the lengths: the factor of two axes that are all but equal is rounding, and has no effect.  How much longer
+    the longer one of them is takes half of the digits.
+    """
+    rng = np.random.default_rng(4)
+    equal = variances[0] > 0.0 and variances[1] > (1.0 - 1e-6) * variances[0]
+    tolerance = 1e-8 if equal else 1e-9
+    risks = 10.0 ** np.linspace(-16.0, 0.5, 60)
+    for size in (1e-12, 1e-4, 1e3):
+        axes, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        covariance = np.zeros((1, 6, 6))
+        covariance[0, :3, :3] = covariance[0, 3:, 3:] = size * (axes * variances) @ axes.T
+        of = np.zeros((1, 6)), covariance, np.zeros((1, 0, 6)), 1.0
+        away, sigma, factor = kernel.tails(*of)
+        expected = Tails(*plain.tails(*of)[1:])
+        assert not away.any()
+        np.testing.assert_allclose(sigma, expected.sigma, rtol=tolerance, atol=1e-140)
+        for risk in risks:
+            [[length], _] = expected.radius(np.full((2, 1), risk))
+            found = Tails(sigma, factor).radius(np.full((2, 1), risk))[0, 0]
+            assert found == pytest.approx(length, rel=tolerance, abs=1e-140)
+
+
+def test_what_no_root_has_is_left_to_numpy():
+    rng = np.random.default_rng(5)
+    average, frame = fits(rng), fits(rng)
+    frame.covariance[3] *= -1.0
+    rows, none = np.arange(HYPOTHESES), np.zeros(6)
+    assert not kernel.squares(frame.shift, none, frame.covariance, 1.0, np.zeros((6, 6)))[0]
+    assert not kernel.follow(*average, *Separation(frame.shift, 3.0 * frame.covariance, frame.of_model), none)[0]
+    bad = Separation(frame.shift, 1e3 * frame.covariance, frame.of_model)
+    assert not kernel.telling(*average, none, none, *bad, rows, 12.0)[0]
+    told = separation.telling(average, none, none, bad, rows, 12.0)
+    agree(told, plain.telling(*average, none, none, *bad, rows, 12.0)[1:])
+
+
+def records(compiled: bool, monkeypatch: pytest.MonkeyPatch, seed: int) -> list[FrameRecord]:
+    """Of the demo's camera over half a second, with a knock in the middle."""
+    monkeypatch.setattr(separation, "COMPILES", compiled)
+    config = load_config(builtin_config("demo.yaml"), check_source=False)
+    start = from_record(config.reference.cam_T_grip)
+    knock = Bump(at_s=0.25, translation_m=(0.0, 1e-3, 2e-3))
+    scenario = Scenario(name="kernel", duration_s=1.0, fps=60.0, mount=(knock,))
+    simulator = Simulator(config.camera, config.gripper, start, scenario, seed=seed)
+    monitor = Monitor(config.camera, config.gripper, config.settings.monitor, config.reference)
+    return [monitor.process(simulator.frame(k)) for k in range(30)]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_frames_are_judged_alike_with_either(monkeypatch: pytest.MonkeyPatch, seed: int):
+    found, expected = records(True, monkeypatch, seed), records(False, monkeypatch, seed)
+    assert {record.verdict for record in expected} >= {"valid", "suspect"}
+    for one, other in zip(found, expected, strict=True):
+        assert (one.verdict, one.state, one.reason) == (other.verdict, other.state, other.reason)
+        assert [alert.text for alert in one.alerts] == [alert.text for alert in other.alerts]
+        assert one.protection.hypothesis == other.protection.hypothesis
+        assert one.protection.position_m == pytest.approx(other.protection.position_m, rel=1e-9)
+        assert one.protection.rotation_rad == pytest.approx(other.protection.rotation_rad, rel=1e-9)
+        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-9, atol=1e-20)
+
+
+def test_doubts_of_none_bound_nothing():
+    none = Separation(np.zeros((0, 6)), np.zeros((0, 6, 6)), np.zeros((0, 0, 6)))
+    assert Doubts.of((), np.zeros(0), none, 1.0).levels(1e-5) == (0.0, 0.0, "")
