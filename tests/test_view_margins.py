@@ -19,7 +19,7 @@ from gripmon.daemon.config.checks import FEWEST_CORNERS_IN_VIEW
 from gripmon.model.camera import LensSettings, make_camera
 from gripmon.model.gripper import Gripper
 from gripmon.monitor import MonitorSettings
-from gripmon.teach.forecast import (
+from gripmon.teach.visibility import (
     FEWEST_CORNERS,
     Rig,
     behind_another_finger,

@@ -13,8 +13,8 @@ from msgspec import Meta
 
 from gripmon.model.camera import Camera
 from gripmon.model.compiled import compiled
-from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.consensus import (
     AGAIN_PX,
