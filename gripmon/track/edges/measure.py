@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gripmon.model.geometry import perturbation_between
+from gripmon.model.poses import perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.consensus import (
     Consensus,

@@ -12,8 +12,8 @@ import numpy as np
 from msgspec import Meta
 
 from gripmon.model.camera import Camera
-from gripmon.model.geometry import perturb, perturbation_between
 from gripmon.model.gripper import Gripper
+from gripmon.model.poses import perturb, perturbation_between
 from gripmon.model.records import Array, Image
 from gripmon.track.edges.consensus import (
     AGAIN_PX,

@@ -144,12 +144,14 @@ class Doubts:
         return Doubts(tuple(compress(self.name, chosen.tolist())), self.prior[chosen], self.away[:, chosen], tails)
 
     def __add__(self, other: Doubts) -> Doubts:
-        tails = Tails(*(np.concatenate(both, axis=1) for both in zip(self.tails, other.tails, strict=True)))
         return Doubts(
             self.name + other.name,
             np.concatenate([self.prior, other.prior]),
             np.concatenate([self.away, other.away], axis=1),
-            tails,
+            Tails(
+                np.concatenate([self.tails.sigma, other.tails.sigma], axis=1),
+                np.concatenate([self.tails.factor, other.tails.factor], axis=1),
+            ),
         )
 
     def levels(self, risk: float) -> tuple[float, float, str]:
