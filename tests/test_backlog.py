@@ -6,19 +6,19 @@ import threading
 
 import numpy as np
 import pytest
-from support.loopback import wait_until
 from support.meters import box_gripper
 from support.simulated import PAPER_LENS, nominal_cam_T_grip
 from support.watched import frames_of, new_monitor, rendered, replaced
 
 from gripmon.model.camera import make_camera
-from gripmon.model.records import Verdict, to_json
+from gripmon.model.records import Origin, to_json
 from gripmon.monitor import Tracker
 from gripmon.monitor.backlog import RESULT_AFTER_S, Backlog
 from gripmon.monitor.settings import MonitorSettings
 from gripmon.simulate import Scenario
 from gripmon.simulate.scenario import JawScript
 from gripmon.track.edges import FingertipMeter
+from gripmon.track.edges.search import search_poses
 
 
 def test_results_come_in_order_when_they_are_due_and_not_before():
@@ -85,31 +85,29 @@ def test_a_thread_beside_the_frames_changes_no_record(scene: str):
     assert sum(busy) >= 2, "the thread had something to do"
 
 
-def test_a_lost_gripper_is_searched_for_beside_the_frames(monkeypatch: pytest.MonkeyPatch):
-    """Not one frame runs the search itself while another thread does; it is found when the result is due."""
-    frames, truths = frames_of("bump")
-    bumped = next(t.index for t in truths if "bumped" in t.events)
+def test_a_lost_gripper_is_searched_for_at_once_and_then_beside_the_frames(monkeypatch: pytest.MonkeyPatch):
+    frames, _ = frames_of("static")
+    noise = np.random.default_rng(1).integers(0, 256, frames[0].image.shape, dtype=np.uint8)
     monitor, ran_in = new_monitor(), []
-    search = __import__("gripmon.monitor.searching", fromlist=["search_poses"]).search_poses
 
     def watched(*args: object) -> np.ndarray:
         ran_in.append(threading.current_thread().name)
-        return search(*args)
+        return search_poses(*args)
 
     monkeypatch.setattr("gripmon.monitor.searching.search_poses", watched)
-    for frame in frames[: bumped + 12]:
-        record = monitor.process(frame)
+    for number, frame in enumerate(frames[:40]):
+        record = monitor.process(frame if number < 5 else replaced(frame, image=noise))
+        assert (record.source is Origin.HELD) == (number >= 5)
         if monitor.pending:
             worker = threading.Thread(target=monitor.run_pending, name="worker")
             worker.start()
-            wait_until(lambda worker=worker: not worker.is_alive(), "the search")
-    assert set(ran_in) == {"worker"}
-    assert record.verdict is Verdict.VALID
+            worker.join()
+    assert ran_in[0] == "MainThread" and len(ran_in) >= 3 and set(ran_in[1:]) == {"worker"}
 
 
 @pytest.mark.parametrize("opening_m", [0.022, 0.045])
 def test_an_opening_that_nobody_reports_is_looked_for_once(opening_m: float, monkeypatch: pytest.MonkeyPatch):
-    """The jaw stands where neither the gripper file nor anybody says: found in the first frames, expected there then."""
+    """The jaw stands where neither the gripper file nor anybody says: found at first, expected there then."""
     jaw = JawScript(knots=((0.0, opening_m),), reported=False)
     frames, _ = rendered(Scenario(name="unreported", duration_s=0.5, fps=30.0, jaw=jaw))
     assert all(frame.jaw_opening_m is None for frame in frames)

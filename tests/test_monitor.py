@@ -162,16 +162,14 @@ def test_a_bump_is_a_jump_then_a_recalibration_near_the_truth(measurement: str):
     seen = watched("bump", measurement)
     bumped = next(t.index for t in seen.truths if "bumped" in t.events)
     kinds = seen.alerts()
-    assert kinds[0] == (bumped, AlertKind.OCCLUDED), "it is out of the search lines' reach"
-    assert kinds[1][1] is AlertKind.STEP
-    assert bumped + 4 <= kinds[1][0] <= bumped + 7, "a search takes 0.1 s, and then it has to prove itself as it rings"
+    assert kinds[0][1] is AlertKind.STEP
+    assert bumped + 1 <= kinds[0][0] <= bumped + 4, "no single frame decides: it has to prove itself, while it rings"
     assert seen.records[bumped].verdict is Verdict.SUSPECT, "but its first frame isn't trusted"
     assert all(seq >= bumped for seq, _ in kinds)
     [recalibrated] = [seq for seq, kind in kinds if kind is AlertKind.RECALIBRATED]
     assert bumped + 20 <= recalibrated <= bumped + 45, "after the ringing and twenty frames of rest"
     states = [r.state for r in seen.records]
-    assert set(states[bumped + 4 : bumped + 10]) <= {State.RECALIBRATING, State.DRIFTING}
-    assert set(states[bumped + 10 : recalibrated]) == {State.RECALIBRATING}
+    assert set(states[bumped + 4 : recalibrated]) == {State.RECALIBRATING}
     assert set(states[recalibrated + 1 :]) == {State.TRACKING}
     record = seen.records[recalibrated]
     assert record.source is Origin.RECALIBRATION

@@ -15,7 +15,8 @@ NOWHERE = np.zeros((0, 4, 4))
 
 
 class GripperSearch:
-    """One search at a time: begun with one frame's image, tried in a later frame.
+    """One search at a time: begun with one frame's image, tried in a later frame.  Only the first one for a gripper that
+    was seen until then is done in its frame: what was knocked away is found at once, for one frame that is late.
 
     A doubtful fit pays for looking further from a credit that good frames refill slowly; a lost gripper is searched for
     some times one after the other, then in one of several frames.
@@ -52,15 +53,20 @@ class GripperSearch:
             when_lost=eager or self._untrusted % self._settings.patient_every == 0,
         )
 
-    def poses(self, image: Image, cam_T_grip: Array, jaw_opening_m: float) -> Array:
-        """Poses (s, 4, 4) to try in this frame: what was found in an earlier one; else none, and a search about
-        ``cam_T_grip`` (4, 4) begins with a copy of the image.
+    def poses(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, lost: bool) -> Array:
+        """Poses (s, 4, 4) to try in this frame about ``cam_T_grip`` (4, 4): what was found in an earlier one, or here
+        if the gripper is just ``lost``; else none, and a search begins with a copy of the image.
         """
         if self._found is not None:
             return self._found
-        kept, camera, gripper, settings = image.copy(), self._camera, self._gripper, self._settings
+        camera, gripper, settings = self._camera, self._gripper, self._settings
         self._searches += 1
-        self._backlog.add(lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s)
+        if lost and self._searches == 1:
+            return search_poses(image, camera, gripper, cam_T_grip, jaw_opening_m, settings)
+        kept = image.copy()
+        self._backlog.add(
+            lambda: search_poses(kept, camera, gripper, cam_T_grip, jaw_opening_m, settings), self._now_s
+        )
         return NOWHERE
 
     def end_frame(self, measurement: Measurement) -> None:

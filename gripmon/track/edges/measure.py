@@ -63,8 +63,10 @@ class Patience:
     when_lost: bool
 
 
-Search = Callable[[Image, Array, float], Array]
-"""From an image, an expected pose (4, 4) and opening to poses (s, 4, 4) at which the gripper may be, best first."""
+Search = Callable[[Image, Array, float, bool], Array]
+"""From an image, an expected pose (4, 4) and opening, and whether the gripper is lost there, to poses (s, 4, 4) at which
+it may be, best first.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +152,7 @@ class FingertipMeter(FingerMeter):
             if effort is Effort.GRID:
                 places = self._near_places(image, expected)
             else:
-                poses = search(image, expected.cam_T_grip, expected.jaw_opening_m)
+                poses = search(image, expected.cam_T_grip, expected.jaw_opening_m, not best.trusted)
                 places = self._far_places(image, expected, poses, usual_share)
             again = [self._tried(image, place.expected) for place in _best(places)]
             for place in _promising(again, PROMISING * max(beat, least)):
@@ -245,7 +247,7 @@ class FingertipMeter(FingerMeter):
                 best = max(best, other, key=lambda m: _completeness(m.consensus, m.prediction))
         return best
 
-    def _search(self, image: Image, cam_T_grip: Array, jaw_opening_m: float) -> Array:
+    def _search(self, image: Image, cam_T_grip: Array, jaw_opening_m: float, _lost: bool) -> Array:
         return search_poses(image, self._camera, self._gripper, cam_T_grip, jaw_opening_m, self._settings.search)
 
     def _near_places(self, image: Image, expected: Expected) -> list[_Place]:
