@@ -69,8 +69,8 @@ class Sums(NamedTuple):
         ``keep`` (h, v) of 0 and 1; ``known`` (h, m, m) information from elsewhere and ``known_pull`` (h, m) its pull.
         """
         add_up = kernel.add_up if COMPILES else plain.add_up
-        of_edges = (np.ascontiguousarray(each) for each in (pull, information, middle, model[0]))
-        return cls(*add_up(*of_edges, *model[1:], keep, known, known_pull))
+        pull, information, middle = (np.ascontiguousarray(each) for each in (pull, information, middle))
+        return cls(*add_up(pull, information, middle, *model, keep, known, known_pull))
 
     def with_pose(self, at: Array, covariance: Array, of_model: Array) -> Sums:
         """With the first six unknowns known to be ``at`` (6,) but for a ``covariance`` (6, 6), and off by ``of_model``
